@@ -1,0 +1,37 @@
+"""Packages of trl_suite, with the data folders xml/ and mocap/ shipped inside the wheel."""
+
+from setuptools import find_packages, setup
+
+setup(
+    name='trl_suite',
+    version='0.1.0',
+    description='Terrain RL Simulator on MuJoCo: locomotion over random terrain, as a suite',
+    python_requires='>=3.11',
+    packages=[
+        *find_packages(include=['trl_suite', 'trl_suite.*']),
+        'trl_suite.xml',
+        'trl_suite.mocap',
+    ],
+    package_dir={'trl_suite.xml': 'xml', 'trl_suite.mocap': 'mocap'},
+    package_data={
+        'trl_suite': ['py.typed'],
+        'trl_suite.terrain': ['*.json'],
+        'trl_suite.xml': ['*.xml'],
+        'trl_suite.mocap': ['*.npz', '*.md'],
+    },
+    install_requires=[
+        # MuJoCo 4.0.0 breaks dm_control 1.0.50 when a Physics is made.
+        'mujoco>=3.17,<4',
+        'dm-control>=1.0.50',
+        'dm-env',
+        'numpy>=2.0',
+        'lxml',
+        'trimesh',
+    ],
+    extras_require={
+        'video': ['imageio[ffmpeg]', 'matplotlib'],
+        'test': ['absl-py', 'pytest', 'pytest-xdist', 'build', 'imageio[ffmpeg]', 'matplotlib', 'scipy'],
+        'dev': ['ruff==0.17.5', 'mypy==2.4.1'],
+    },
+    entry_points={'console_scripts': ['trl-suite = trl_suite.cli:main']},
+)

@@ -1,0 +1,30 @@
+"""Locomotion environments over random terrain: Terrain RL Simulator on MuJoCo and dm_control.
+
+    from trl_suite import suite
+
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1})
+    time_step = environment.reset()
+"""
+
+import importlib
+import os
+import sys
+from typing import Any
+
+if sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
+    # dm_control would choose GLFW, which cannot draw without a display. This creates no context.
+    os.environ.setdefault('MUJOCO_GL', 'egl')
+
+__version__ = '0.1.0'
+
+_FROM_SUITE = ('ALL_IDS', 'ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN', 'build', 'load', 'make')
+__all__ = ['suite', *_FROM_SUITE]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    # Imported on first use: `import trl_suite` stays fast, and terrain and motion need no engine.
+    if name in _FROM_SUITE:
+        return getattr(importlib.import_module('trl_suite.suite'), name)
+    if name == 'suite':
+        return importlib.import_module('trl_suite.suite')
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

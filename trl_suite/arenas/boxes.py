@@ -1,0 +1,143 @@
+"""Collision boxes for a planar height profile: exact vertical faces, no ghost edges.
+
+A profile is cut into pieces: level runs become one box each, sloped stretches become tilted boxes
+as long as the profile stays within a tolerance of them. Cuts depend on absolute vertex numbers
+only, so the surface under a character does not change when the window of boxes moves on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.terrain import SPACING
+
+PIECE = 4  # cells of the shortest tilted piece: 0.1 m
+DOUBLINGS = 3  # tilted pieces grow to at most PIECE * 2**DOUBLINGS cells: 0.8 m
+TOLERANCE = 0.004  # m; how far the profile may stray from a piece that is doubled
+LEVEL_THICKNESS = 4.0  # m; level boxes face the sides of the deepest gaps (2.5 m)
+TILTED_THICKNESS = 1.0  # m
+OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
+LEAN = 0.03  # m; how far the end of a tilted box may lean out behind the post at a face
+HALF_WIDTH = 1.0  # m; the strip is 2 m wide
+EPSILON = 1e-9
+
+
+class Boxes(NamedTuple):
+    """Static boxes in the x-z plane, in order of x."""
+
+    position: np.ndarray  # (k, 3) m
+    half_size: np.ndarray  # (k, 3) m
+    quaternion: np.ndarray  # (k, 4) w, x, y, z
+
+
+def _cuts(start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float) -> np.ndarray:
+    """Returns a mask over vertices: True where a piece ends and the next begins."""
+    count = len(heights)
+    level = np.zeros(count + 1, dtype=bool)  # of cell i, between vertices i-1 and i
+    level[1:count] = np.abs(np.diff(heights)) < EPSILON
+    face = np.zeros(count + 1, dtype=bool)
+    face[1:count] = vertical[1:]
+    level &= ~face
+    left, right = level[:count], level[1:]
+    cut = (left != right) | face[:count] | face[1:]
+    cut[[0, -1]] = True
+    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
+    sloped = ~level & ~face
+    post = np.zeros(count, dtype=bool)
+    post[1:] |= face[: count - 1] & sloped[1:count]
+    post[:-1] |= face[2:] & sloped[1:count]
+    cut |= post
+    grid = (np.arange(start, start + count) % PIECE == 0) & ~(left & right)
+    mandatory = cut.copy()
+    cut |= grid
+    for doubling in range(1, DOUBLINGS + 1):
+        span = PIECE << doubling
+        first = np.arange(-start % span, count - span, span)
+        if not len(first):
+            break
+        inner = first[:, None] + np.arange(1, span)
+        # A span may be one piece if its halves are, nothing must be cut inside, and the profile
+        # stays close to the chord.
+        halves = cut[inner]
+        halves[:, span // 2 - 1] = False
+        free = ~halves.any(1) & ~mandatory[inner].any(1)
+        a, b = heights[first], heights[first + span]
+        chord = a[:, None] + (b - a)[:, None] * (np.arange(1, span) / span)
+        free &= np.abs(heights[inner] - chord).max(1) < tolerance
+        cut[first[free] + span // 2] = False
+    return cut
+
+
+def from_profile(
+    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float = TOLERANCE
+) -> Boxes:
+    """Cuts a window of a profile into boxes.
+
+    Args:
+      start: number of the first vertex; vertex i stands at x = i * SPACING.
+      heights: heights of the vertices, m, shape (m,).
+      vertical: True where the cell before a vertex is a vertical face, shape (m,).
+      tolerance: largest deviation of the profile from a tilted box longer than 0.1 m, m.
+
+    Returns:
+      Boxes whose upper faces follow the profile; their sides stand in the middle of the vertical
+      cells.
+    """
+    count = len(heights)
+    knots = np.flatnonzero(_cuts(start, heights, vertical, tolerance))
+    face = np.zeros(count + 1, dtype=bool)
+    face[1:count] = vertical[1:]
+    # Pieces between knots, except those that are a vertical cell; and lone vertices between two
+    # vertical cells, which are pieces of their own.
+    a, b = knots[:-1], knots[1:]
+    keep = ~(face[b] & (b - a == 1))
+    lone = knots[face[knots] & face[knots + 1]]
+    a, b = np.concatenate([a[keep], lone]), np.concatenate([b[keep], lone])
+    order = np.argsort(a + b, kind='stable')
+    a, b = a[order], b[order]
+
+    at_left, at_right = face[a], face[b + 1]
+    x0 = (start + a - 0.5 * at_left) * SPACING
+    x1 = (start + b + 0.5 * at_right) * SPACING
+    z0, z1 = heights[a], heights[b]
+    # Posts are level; the height is that of the vertex at the face.
+    post = (b - a <= 1) & (at_left | at_right)
+    z0, z1 = np.where(post & at_right & ~at_left, z1, z0), np.where(post & at_left, z0, z1)
+    slope = (z1 - z0) / (x1 - x0)
+    tilted = np.abs(slope) > EPSILON
+
+    # At a valley both pieces run on below the surface of the other, so that a sliding foot meets
+    # no end face.
+    joined = (b[:-1] == a[1:]) & ~at_right[:-1]
+    valley = joined & (slope[1:] > slope[:-1] + EPSILON)
+    length = x1 - x0
+    run_on_right = np.zeros(len(a))
+    run_on_left = np.zeros(len(a))
+    run_on_right[:-1] = np.where(valley, np.minimum(OVERLAP, length[1:]), 0)
+    run_on_left[1:] = np.where(valley, np.minimum(OVERLAP, length[:-1]), 0)
+    x0, z0 = x0 - run_on_left, z0 - run_on_left * slope
+    x1, z1 = x1 + run_on_right, z1 + run_on_right * slope
+
+    angle = np.arctan(slope)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    thickness = np.where(tilted, TILTED_THICKNESS, LEVEL_THICKNESS)
+    # The ends of a tilted box lean; next to a post they must not lean out behind it.
+    beside = np.zeros(len(a), dtype=bool)
+    beside[:-1] |= post[1:] & joined
+    beside[1:] |= post[:-1] & joined
+    thickness = np.where(
+        beside & tilted, np.minimum(thickness, LEAN / np.maximum(np.abs(sine), EPSILON)), thickness
+    )
+    position = np.zeros((len(a), 3))
+    position[:, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
+    position[:, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine
+    half_size = np.empty((len(a), 3))
+    half_size[:, 0] = 0.5 * np.hypot(x1 - x0, z1 - z0)
+    half_size[:, 1] = HALF_WIDTH
+    half_size[:, 2] = 0.5 * thickness
+    quaternion = np.zeros((len(a), 4))
+    quaternion[:, 0] = np.cos(0.5 * angle)
+    quaternion[:, 2] = -np.sin(0.5 * angle)
+    return Boxes(position, half_size, quaternion)

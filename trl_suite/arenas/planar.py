@@ -1,0 +1,170 @@
+"""An arena whose planar terrain is drawn anew every episode and never ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dm_control import composer, mjcf
+
+from trl_suite.arenas import boxes
+from trl_suite.terrain import SPACING, Strip, Terrain
+from trl_suite.world import World
+
+BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
+ADVANCE = 6.0  # m; travel after which the window is laid anew
+POOL_LEVEL = 96  # boxes for terrain of level pieces
+POOL_SLOPED = 288  # boxes where pieces are tilted
+FRICTION = (0.81, 0.005, 0.0001)  # 0.9 * 0.9: the original multiplies, MuJoCo takes the larger
+SOLREF = (0.005, 1)
+SOLIMP = (0.95, 0.99, 0.001)
+PARKED = -60.0  # m; depth at which unused boxes lie
+
+_BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
+_WINDOW = _BEHIND + _AHEAD + 1  # vertices
+
+
+class PlanarTerrain(composer.Arena):
+    """Planar terrain realised by a pool of static boxes that are posed anew, never recompiled.
+
+    After compiling, `bind` ties the arena to a world of n simulations. Each has its own strip;
+    height and slope queries answer from the strips' arrays, never from the collision geometry.
+    """
+
+    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+        super()._build(name=name)
+        self.terrain = terrain
+        root = self._mjcf_root
+        # composer's arena brings an elliptic cone and noslip iterations; neither is wanted.
+        root.option.cone = 'pyramidal'
+        root.option.noslip_iterations = 0
+        root.option.integrator = 'implicitfast'
+        root.option.gravity = (0, 0, -9.8)
+        root.compiler.boundmass = 0
+        root.compiler.boundinertia = 0
+        _decorate(root)
+        ground = root.worldbody.add('body', name='terrain')
+        sloped = 'slopes' in terrain.type or 'bumps' in terrain.type
+        self.boxes = [
+            ground.add(
+                'geom', name=f'terrain_{i}', type='box', size=(0.1, boxes.HALF_WIDTH, 0.1),
+                # Laid out along x, so that the bounding volumes made by the compiler fit.
+                pos=(0.1 * i, 0, PARKED), friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
+                condim=3, material='ground',
+            )
+            for i in range(POOL_SLOPED if sloped else POOL_LEVEL)
+        ]  # fmt: skip
+
+    @property
+    def ground_body(self) -> str:
+        """Name of the body that carries the ground, for contact sensors."""
+        return 'terrain'
+
+    def bind(self, world: World) -> None:
+        """Resolves the arena's geoms in a world and makes room for its n strips."""
+        self._world = world
+        self._geoms = world.geom_ids([geom.full_identifier for geom in self.boxes])
+        self.strips: list[Strip | None] = [None] * world.n
+        self._start = np.zeros(world.n, dtype=np.int64)  # vertex number of a window's first vertex
+        self._heights = np.zeros((world.n, _WINDOW))
+        self._offset = np.arange(world.n) * _WINDOW
+        self._lay_from = np.full(world.n, np.inf)  # m; beyond these the window is laid anew
+        self._lay_to = np.full(world.n, -np.inf)
+
+    def begin_episode(self, row: int, strip: Strip) -> None:
+        """Replaces the ground of one simulation; the caller forwards the world afterwards."""
+        self.strips[row] = strip
+        self._lay(row, 0)
+
+    def follow(self, x: np.ndarray) -> None:
+        """Keeps ground under and ahead of characters whose roots are at x, m, shape (n,)."""
+        moved = (x < self._lay_from) | (x > self._lay_to)
+        if moved.any():
+            for row in np.flatnonzero(moved):
+                # The window starts at multiples of the advance, however far a row has jumped.
+                self._lay(row, round(float(x[row]) / ADVANCE) * _ADVANCE)
+
+    def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
+        u = x * (1 / SPACING) - self._start[rows, None]
+        np.minimum(np.maximum(u, 0, out=u), _WINDOW - 1.000001, out=u)
+        cell = u.astype(np.int64)
+        u -= cell
+        cell += self._offset[rows, None]
+        flat = self._heights.ravel()
+        low = flat[cell]
+        cell += 1
+        return low + u * (flat[cell] - low)
+
+    def slope(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+        """Slopes dh/dx of the ground at x (rows, k) m."""
+        u = np.clip(x * (1 / SPACING) - self._start[rows, None], 0, _WINDOW - 1.000001)
+        cell = u.astype(np.int64) + self._offset[rows, None]
+        flat = self._heights.ravel()
+        return (flat[cell + 1] - flat[cell]) / SPACING
+
+    def state(self, row: int) -> dict[str, Any]:
+        """What is needed to restore the ground of one simulation exactly."""
+        strip = self.strips[row]
+        return {
+            'strip': None if strip is None else strip.state(),
+            'centre': int(self._start[row]) + _BEHIND,
+        }
+
+    def restore(self, row: int, state: dict[str, Any]) -> None:
+        """Restores the ground of one simulation; the caller forwards the world afterwards."""
+        if state['strip'] is not None:
+            self.strips[row] = Strip.from_state(state['strip'])
+            self._lay(row, state['centre'])
+
+    def _lay(self, row: int, centre: int) -> None:
+        """Realises the strip around a vertex as boxes."""
+        strip = self.strips[row]
+        assert strip is not None
+        start = centre - _BEHIND
+        heights, vertical = strip.window(start, _WINDOW)
+        self._start[row] = start
+        self._heights[row] = heights
+        self._lay_from[row] = (centre - 0.5 * _ADVANCE - 1) * SPACING
+        self._lay_to[row] = (centre + 0.5 * _ADVANCE + 1) * SPACING
+        tolerance = boxes.TOLERANCE
+        pieces = boxes.from_profile(start, heights, vertical, tolerance)
+        while len(pieces.position) > len(self._geoms):  # coarser, rather than with holes
+            tolerance *= 2
+            pieces = boxes.from_profile(start, heights, vertical, tolerance)
+        used, unused = np.split(self._geoms, [len(pieces.position)])
+        model = self._world.models[row]
+        model.geom_pos[used] = pieces.position
+        model.geom_size[used] = pieces.half_size
+        model.geom_quat[used] = pieces.quaternion
+        model.geom_pos[unused] = ((centre + _AHEAD) * SPACING, 0, PARKED)
+        model.geom_size[unused] = 0.1
+        self._world.set_const(row)
+
+
+def _decorate(root: mjcf.RootElement) -> None:
+    """Light, sky and ground, cheap enough that one model serves pictures and physics."""
+    root.visual.quality.shadowsize = 1024
+    root.visual.quality.offsamples = 0
+    getattr(root.visual, 'global').offwidth = 1920
+    getattr(root.visual, 'global').offheight = 1080
+    root.visual.map.znear = 0.01
+    root.visual.headlight.set_attributes(
+        ambient=(0.35, 0.35, 0.35), diffuse=(0.45, 0.45, 0.45), specular=(0.1, 0.1, 0.1)
+    )
+    root.asset.add(
+        'texture', name='sky', type='skybox', builtin='gradient', rgb1=(0.62, 0.76, 0.92),
+        rgb2=(0.95, 0.97, 1.0), width=64, height=64,
+    )  # fmt: skip
+    root.asset.add(
+        'texture', name='ground', type='2d', builtin='checker', rgb1=(0.42, 0.46, 0.40),
+        rgb2=(0.36, 0.40, 0.35), width=64, height=64,
+    )  # fmt: skip
+    root.asset.add(
+        'material', name='ground', texture='ground', texrepeat=(2, 2), texuniform=True,
+        reflectance=0, specular=0,
+    )  # fmt: skip
+    root.worldbody.add(
+        'light', name='sun', mode='trackcom', pos=(-2, -3, 6), dir=(0.3, 0.45, -1), directional=True,
+        diffuse=(0.5, 0.5, 0.48), specular=(0.1, 0.1, 0.1), castshadow=True,
+    )  # fmt: skip

@@ -1,0 +1,165 @@
+"""Every environment as one row of data: ids of the paper, aliases, tags, one-line descriptions.
+
+Rows marked 'original' are registered in the original simulator; 'completion' rows are combinations
+that its papers name and its registry lacks. Source: the registry of Terrain RL Simulator (Berseth,
+Peng, van de Panne 2018).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+STEP_LIMIT = 256  # control steps after which an episode is cut
+PLAID_SAMPLES = 50  # heights that a PLAiD environment sees, unless it is blind
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One environment.
+
+    Attributes:
+      id: id in the paper's manner.
+      domain: family, for `suite.load`.
+      task: name within the family, for `suite.load`.
+      character: name in `trl_suite.characters.CHARACTERS`.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`.
+      terrain: preset, file, or mapping that `trl_suite.terrain.load` takes.
+      rules: which task class makes it (see `trl_suite.suite`).
+      clip: clip in mocap/, or None where the rules need none.
+      options: keyword arguments of the task class, where they differ from its defaults.
+      description: one line.
+      tags: for selection.
+      aliases: other ids.
+      step_limit: control steps after which an episode is cut.
+    """
+
+    id: str
+    domain: str
+    task: str
+    character: str
+    actuation: str
+    terrain: Any
+    description: str
+    rules: str = 'imitation'
+    clip: str | None = None
+    options: Mapping[str, Any] = dataclasses.field(default_factory=lambda: MappingProxyType({}))
+    tags: frozenset[str] = frozenset()
+    aliases: tuple[str, ...] = ()
+    step_limit: int = STEP_LIMIT
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return _row, ({**values, 'options': dict(self.options)},)
+
+
+def _row(values: dict[str, Any]) -> Row:
+    return Row(**{**values, 'options': MappingProxyType(values['options'])})
+
+
+# The original's name of each character in ids, and the words for descriptions.
+_IN_ID = {'biped2d': 'Biped2D', 'biped2d_full': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D'}
+_GAIT = {
+    'biped2d_walk': 'walk', 'biped2d_run': 'run', 'biped2d_full_walk': 'walk', 'dog_bound': 'bound',
+    'raptor_run_050': 'run', 'raptor_run_066': 'run',
+}  # fmt: skip
+_PREFIX = {'position': 'PD', 'torque': 'Torque', 'muscle': 'MTU', 'velocity': 'Vel'}
+_BY = {
+    'position': 'PD targets', 'torque': 'joint torques', 'muscle': 'muscle excitations',
+    'velocity': 'joint velocity targets',
+}  # fmt: skip
+_PLAID_CHARACTERS = {
+    'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound', 'raptor': 'raptor_run_050',
+}  # fmt: skip
+# Name in ids, preset, words.
+_PLAID_TERRAINS = (
+    ('Flat', 'flat', 'flat ground'),
+    ('Incline', 'inclines', 'a steady ramp of about 10 degrees'),
+    ('Steps', 'steps_humanoid', 'ever ascending steps of 5 to 15 cm'),
+    ('Slopes', 'slopes_humanoid', 'rough rolling slopes'),
+    ('Gaps', 'gaps_humanoid', 'gaps 25 to 30 cm wide'),
+    ('Walls', 'walls_humanoid', 'walls 5 to 25 cm high'),
+    ('Mixed', 'mixed_humanoid', 'a mix of gaps, walls and steps'),
+    ('Slopes_Mixed', 'slopes_mixed_humanoid', 'gaps, walls and steps on rolling slopes'),
+)  # fmt: skip
+_NOT_REGISTERED = {
+    'PD_Dog2D_Flat_Terrain-v0', 'PD_Raptor2D_Flat_Terrain-v0', 'PD_Biped2D_Mixed_Terrain-v0',
+    'PD_Dog2D_Mixed_Terrain-v0', 'PD_Raptor2D_Mixed_Terrain-v0', 'PD_Dog2D_Flat-v0',
+    'PD_Raptor2D_Flat-v0',
+}  # fmt: skip
+
+
+def _status(id_: str, original: bool) -> str:
+    return 'original' if original and id_ not in _NOT_REGISTERED else 'completion'
+
+
+def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> Row:
+    clip = _PLAID_CHARACTERS[character]
+    id_ = f'PD_{_IN_ID[character]}_{name}{"" if blind else "_Terrain"}-v0'
+    figure = _IN_ID[character][:-2].lower()
+    sight = 'without seeing the ground' if blind else 'seeing 3 m of ground ahead'
+    return Row(
+        id=id_,
+        domain='plaid',
+        task=f'{figure}_{name.lower()}{"_blind" if blind else ""}',
+        character=character,
+        actuation='position',
+        terrain=preset,
+        clip=clip,
+        options=MappingProxyType({} if blind else {'terrain_samples': PLAID_SAMPLES}),
+        description=f'The {figure} tracks a {_GAIT[clip]} over {words}, {sight}.',
+        tags=frozenset({'planar', _status(id_, True), *(['blind'] if blind else [])}),
+    )
+
+
+def _imitation(character: str, model: str, clip: str, original: bool) -> Row:
+    run = '_Run' if clip == 'biped2d_run' else ''
+    id_ = f'{_PREFIX[model]}_{_IN_ID[character]}_LLC_Imitate{run}_Flat-v0'
+    figure = _IN_ID[character][:-2].lower()
+    return Row(
+        id=id_,
+        domain='imitation',
+        task=f'{_PREFIX[model].lower()}_{figure}{run.lower()}',
+        character=character,
+        actuation=model,
+        terrain='flat',
+        clip=clip,
+        options=MappingProxyType({'target': True}),
+        description=f'The {figure} tracks a {_GAIT[clip]} on flat ground by {_BY[model]}.',
+        tags=frozenset({'planar', 'flat', _status(id_, original)}),
+    )
+
+
+_BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
+
+ROWS: tuple[Row, ...] = (
+    *(
+        _plaid(character, *terrain, blind=False)
+        for character in _PLAID_CHARACTERS
+        for terrain in _PLAID_TERRAINS
+    ),
+    *(_plaid(character, *_PLAID_TERRAINS[i], blind=True) for character, i in _BLIND),
+    *(
+        _imitation(character, model, clip, original=model != 'velocity')
+        for character, clips in (
+            ('biped2d', ('biped2d_walk', 'biped2d_walk')),
+            ('dog', ('dog_bound', 'dog_bound')),
+            # The original tracks another run of the raptor with PD than with the other models.
+            ('raptor', ('raptor_run_050', 'raptor_run_066')),
+        )
+        for model, clip in (
+            ('position', clips[0]), ('torque', clips[1]), ('muscle', clips[1]),
+            ('velocity', clips[1]),
+        )
+    ),
+    _imitation('biped2d', 'position', 'biped2d_run', original=False),
+    _imitation('biped2d', 'muscle', 'biped2d_run', original=False),
+)  # fmt: skip
+
+BY_ID: dict[str, Row] = {row.id: row for row in ROWS}
+BY_TASK: dict[tuple[str, str], Row] = {(row.domain, row.task): row for row in ROWS}
+ALIASES: dict[str, Row] = {
+    alias: row for row in ROWS for alias in (*row.aliases, f'{row.domain}/{row.task}')
+}

@@ -1,0 +1,25 @@
+"""Characters: articulated figures as composer entities."""
+
+from __future__ import annotations
+
+from trl_suite import errors
+from trl_suite.characters.character import Character, CharacterRow, Joint, body_figures
+from trl_suite.characters.rows import CHARACTERS
+
+__all__ = ('CHARACTERS', 'Character', 'CharacterRow', 'Joint', 'body_figures', 'make')
+
+
+def make(character: str | CharacterRow) -> Character:
+    """Builds a character entity.
+
+    Args:
+      character: a name in `CHARACTERS`, or a user's own row.
+
+    Raises:
+      ValueError: an unknown name, or an MJCF file that lacks a link or joint of the row.
+    """
+    if isinstance(character, str):
+        if character not in CHARACTERS:
+            raise ValueError(errors.unknown('character', character, CHARACTERS))
+        character = CHARACTERS[character]
+    return Character(character)

@@ -1,0 +1,239 @@
+"""A character: its links and joints from an MJCF file, and the figures that no MJCF file holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
+
+from trl_suite import resources
+
+GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is drawn
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """Figures of one actuated joint that its MJCF element does not hold.
+
+    Attributes:
+      kp: position gain, N m/rad.
+      kd: damping gain, N m s/rad.
+      weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
+      target: working posture of position control, rad.
+    """
+
+    kp: float
+    kd: float
+    weight: float
+    target: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class CharacterRow:
+    """One character as a row of data.
+
+    Attributes:
+      name: name of the character and of its MJCF file under xml/.
+      joints: joints by name in link order; link i+1 hangs on joint i and has its name.
+      fall_links: links whose contact with the ground is a fall.
+      end_effectors: links whose joints the imitation reward follows.
+      stumble_exempt: links that may touch the ground without a stumble.
+      root_weight: weight of the root in the imitation reward.
+      description: one line.
+    """
+
+    name: str
+    joints: Mapping[str, Joint]
+    fall_links: tuple[str, ...]
+    end_effectors: tuple[str, ...]
+    stumble_exempt: tuple[str, ...]
+    description: str
+    root_weight: float = 1.0
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of all links, root first, in the order of every per-link block."""
+        return ('root', *self.joints)
+
+    @property
+    def mirror(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of right and left joints."""
+        return tuple(
+            (name, name.replace('right_', 'left_', 1))
+            for name in self.joints
+            if name.startswith('right_')
+        )
+
+    @functools.cached_property
+    def weights(self) -> np.ndarray:
+        """Normalised reward weights of root and joints, shape (number of links,)."""
+        raw = np.array([self.root_weight, *(joint.weight for joint in self.joints.values())])
+        return raw / raw.sum()
+
+
+class Character(composer.Entity):
+    """A planar articulated figure that can be attached to any arena.
+
+    The entity owns its MJCF tree and its observables. Gains, limits and muscles become actuators
+    only when an actuation model is added (see `trl_suite.actuation`).
+    """
+
+    def _build(self, row: CharacterRow, name: str | None = None) -> None:  # type: ignore[override]
+        self.row = row
+        path = resources.directory('xml') / f'{row.name}.xml'
+        self._mjcf_root = mjcf.from_path(str(path))
+        if name is not None:
+            self._mjcf_root.model = name
+
+    def _build_observables(self) -> CharacterObservables:
+        return CharacterObservables(self)
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        return self._mjcf_root
+
+    def create_root_joints(self, frame: mjcf.Element) -> tuple[mjcf.Element, ...]:
+        """Lets an attached character move in the x-z plane.
+
+        Args:
+          frame: the attachment frame that `arena.attach(character)` returned.
+
+        Returns:
+          The joints root_x (m), root_z (m) and root_pitch (rad, positive lifts the front).
+        """
+        root = dict(limited=False, damping=0, armature=0)
+        return (
+            frame.add('joint', name='root_x', type='slide', axis=(1, 0, 0), **root),
+            frame.add('joint', name='root_z', type='slide', axis=(0, 0, 1), **root),
+            frame.add('joint', name='root_pitch', type='hinge', axis=(0, -1, 0), **root),
+        )
+
+    @property
+    def root_body(self) -> mjcf.Element:
+        return self._mjcf_root.find('body', 'root')
+
+    @property
+    def bodies(self) -> list[mjcf.Element]:
+        """Bodies in link order, the root body first."""
+        return [self._find('body', name) for name in self.row.links]
+
+    @property
+    def joints(self) -> list[mjcf.Element]:
+        """Actuated joints in link order."""
+        return [self._find('joint', name) for name in self.row.joints]
+
+    @property
+    def end_effectors(self) -> list[mjcf.Element]:
+        return [self._find('body', name) for name in self.row.end_effectors]
+
+    @property
+    def collision_geoms(self) -> list[mjcf.Element]:
+        """The geoms that can touch the ground, one per link that has any."""
+        geoms = [self._find('geom', name) for name in self.row.links]
+        return [geom for geom in geoms if geom.dclass.dclass != 'group0']
+
+    @property
+    def torque_limits(self) -> np.ndarray:
+        """Largest joint torques in N m, shape (number of joints,)."""
+        return np.array([joint.actuatorfrcrange[1] for joint in self.joints])
+
+    @property
+    def joint_ranges(self) -> np.ndarray:
+        """Joint limits in rad, shape (number of joints, 2); infinite where a joint turns freely."""
+        free = (-np.inf, np.inf)
+        return np.array([free if joint.range is None else joint.range for joint in self.joints])
+
+    def _find(self, namespace: str, name: str) -> mjcf.Element:
+        element = self._mjcf_root.find(namespace, name)
+        if element is None:
+            raise ValueError(
+                f'character {self.row.name!r}: xml/{self.row.name}.xml has no {namespace} named '
+                f'{name!r}'
+            )
+        return element
+
+
+class CharacterObservables(composer.Observables):
+    """What a task or a user may observe of a character; all disabled until asked for."""
+
+    @composer.observable
+    def joints_pos(self) -> observable.MJCFFeature:
+        """Joint angles, rad, shape (number of joints,)."""
+        return observable.MJCFFeature('qpos', self._entity.joints)
+
+    @composer.observable
+    def joints_vel(self) -> observable.MJCFFeature:
+        """Joint rates, rad/s, shape (number of joints,)."""
+        return observable.MJCFFeature('qvel', self._entity.joints)
+
+    @composer.observable
+    def root_pos(self) -> observable.MJCFFeature:
+        """World position of the root, m, shape (3,)."""
+        return observable.MJCFFeature('xpos', self._entity.root_body)
+
+    @composer.observable
+    def root_mat(self) -> observable.MJCFFeature:
+        """Orientation of the root as a flat rotation matrix, shape (9,)."""
+        return observable.MJCFFeature('xmat', self._entity.root_body)
+
+    @composer.observable
+    def bodies_pos(self) -> observable.Generic:
+        """Link centres of mass relative to the root, world axes, m, shape (links, 3)."""
+
+        def relative(physics: mjcf.Physics) -> np.ndarray:
+            bodies = physics.bind(self._entity.bodies)
+            return np.asarray(bodies.xipos) - np.asarray(bodies.xpos)[0]
+
+        return observable.Generic(relative)
+
+    @composer.observable
+    def end_effectors_pos(self) -> observable.Generic:
+        """End effectors' joints relative to the root, world axes, m, shape (effectors, 3)."""
+
+        def relative(physics: mjcf.Physics) -> np.ndarray:
+            effectors = np.asarray(physics.bind(self._entity.end_effectors).xpos)
+            return effectors - np.asarray(physics.bind(self._entity.root_body).xpos)
+
+        return observable.Generic(relative)
+
+
+def body_figures(character: Character) -> dict[str, Any]:
+    """Compiles a character alone and returns its whole-body figures in the zero pose.
+
+    Returns:
+      A dict of total `mass` (kg), `com` relative to the root (m, (3,)), `inertia` about the centre
+      of mass (kg m^2, diagonal (3,)) and `standing_height` of the root above the sole (m).
+    """
+    physics = mjcf.Physics.from_mjcf_model(character.mjcf_model)
+    model, data = physics.model, physics.data
+    mass = model.body_mass[1:]
+    centres = data.xipos[1:]
+    com = mass @ centres / mass.sum()
+    inertia = np.zeros((3, 3))
+    for m, centre, frame, principal in zip(
+        mass, centres - com, data.ximat[1:].reshape(-1, 3, 3), model.body_inertia[1:], strict=True
+    ):
+        inertia += frame @ np.diag(principal) @ frame.T
+        inertia += m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    lowest = min(
+        lowest_point(physics.data.geom_xpos[i], physics.data.geom_xmat[i], model.geom_size[i])
+        for i in range(model.ngeom)
+        if model.geom_group[i] == GROUP_COLLISION
+    )
+    return {
+        'mass': float(mass.sum()),
+        'com': com,
+        'inertia': np.diag(inertia).copy(),
+        'standing_height': -float(lowest),
+    }
+
+
+def lowest_point(position: np.ndarray, matrix: np.ndarray, half_size: np.ndarray) -> float:
+    """Height of the lowest corner of a box, m."""
+    return float(position[2] - np.abs(matrix.reshape(3, 3)[2]) @ half_size)
+

@@ -1,0 +1,245 @@
+"""A single environment: dm_env timesteps, fused substeps, save and restore, pickling."""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_control import composer
+from dm_control.composer import observation as composer_observation
+from dm_env import specs
+
+from trl_suite.tasks.task import Task
+
+FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
+_SUBSTEP_HOOKS = ('before_substep', 'after_substep')
+_NO_SUBSTEPS = 'substeps run fused in C; use a plain composer.Environment with this task'
+
+
+class Environment(composer.Environment):
+    """`composer.Environment` with all substeps of a control step in one call.
+
+    What differs from composer: substeps run in C (`before_substep` and `after_substep` hooks are
+    refused), observation blocks bypass the observation updater, divergence ends the episode instead
+    of raising, and the full state can be saved and restored.
+
+    `TimeStep.discount` is 0 where the task failed and 1 where the step or time limit cut the
+    episode, as dm_env has it.
+    """
+
+    _task: Task
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        step_limit: int | None = None,
+        time_limit: float = float('inf'),
+        random: int | Sequence[int] | np.random.RandomState | None = None,
+        flat_observation: bool = False,
+    ) -> None:
+        """Compiles the task.
+
+        Args:
+          task: a task that nothing else uses.
+          step_limit: control steps after which an episode is cut.
+          time_limit: simulated time in s after which an episode is cut.
+          random: seed; drawn from the system if None.
+          flat_observation: give one vector, all blocks side by side, under the key 'observations'.
+
+        Raises:
+          ValueError: a limit that is not positive, a bad seed, or substep hooks.
+        """
+        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
+            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
+        if not time_limit > 0:
+            raise ValueError(f'time_limit is {time_limit}; expected a positive number of seconds')
+        if isinstance(random, int) and not 0 <= random < 2**32:
+            raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
+        self._flat_observation = flat_observation
+        self._step_limit = step_limit
+        self._steps = 0
+        self._recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
+        super().__init__(
+            task,
+            time_limit=time_limit,
+            random_state=random,
+            strip_singleton_obs_buffer_dim=True,
+            recompile_mjcf_every_episode=False,
+        )
+        # The constructor has compiled already; composer would do it again at the first reset.
+        self._mjcf_never_compiled = False
+        for name in _SUBSTEP_HOOKS:
+            hook = getattr(self._hooks, f'_{name}')
+            overridden = getattr(type(task), name) is not getattr(composer.Task, name)
+            if hook.entity_hooks or overridden:
+                raise ValueError(f'the task or an entity in it has a {name} hook: {_NO_SUBSTEPS}')
+
+    def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
+        if hook_name in _SUBSTEP_HOOKS:
+            raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
+        super().add_extra_hook(hook_name, hook_callable)
+
+    def _make_observation_updater(self) -> composer_observation.Updater:
+        # One substep: the updater must see a control step as a single update.
+        self._extra_observables = [
+            name
+            for name, item in self._task.observables.items()
+            if item.enabled and name not in self._task.blocks
+        ]
+        return composer_observation.Updater(self._task.observables, 1, True, False)
+
+    def reset(self) -> dm_env.TimeStep:
+        self._steps = 0
+        self._reset_next_step = False
+        self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+        if self._extra_observables:
+            self._observation_updater.reset(self._physics_proxy, self._random_state)
+        return dm_env.restart(self._observe())
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Takes one action.
+
+        Args:
+          action: numbers in [-1, 1] (clipped there), shape of `action_spec()`.
+
+        Raises:
+          ValueError: an action of another shape, or with NaN or infinity.
+        """
+        action = self._checked(action)
+        if self._reset_next_step:
+            return self.reset()
+        task, physics = self._task, self._physics_proxy
+        self._hooks.before_step(physics, action, self._random_state)
+        task.simulate()
+        self._hooks.after_step(physics, self._random_state)
+        self._steps += 1
+        if self._extra_observables:
+            self._observation_updater.update()
+        observation = self._observe()
+        reward = task.get_reward(physics)
+        self._reset_next_step = (
+            task.should_terminate_episode(physics)
+            or (self._step_limit is not None and self._steps >= self._step_limit)
+            or self._physics.data.time >= self._time_limit
+        )
+        step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
+        return dm_env.TimeStep(step_type, reward, task.get_discount(physics), observation)
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        size = len(self._task.action_map)
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'action is not an array of numbers: {error}') from None
+        if action.shape != (size,):
+            raise ValueError(f'action has shape {action.shape}; expected ({size},)')
+        if not np.isfinite(action).all():
+            i = int(np.flatnonzero(~np.isfinite(action))[0])
+            name = self._task.action_map.names[i]
+            raise ValueError(f'action[{i}] ({name}) is {action[i]}; expected finite numbers')
+        return action
+
+    def _observe(self) -> collections.OrderedDict[str, np.ndarray]:
+        row = self._task.observation[0]
+        observation: collections.OrderedDict[str, np.ndarray] = collections.OrderedDict()
+        if self._flat_observation:
+            observation[FLAT_OBSERVATION_KEY] = row.copy()
+        else:
+            for name, part in self._task.blocks.items():
+                observation[name] = row[part].copy()
+        if self._extra_observables:
+            updated = self._observation_updater.get_observation()
+            extra = {name: np.asarray(updated[name], float) for name in self._extra_observables}
+            if self._flat_observation:
+                parts = [observation[FLAT_OBSERVATION_KEY], *(v.ravel() for v in extra.values())]
+                observation[FLAT_OBSERVATION_KEY] = np.concatenate(parts)
+            else:
+                observation.update(extra)
+        return observation
+
+    def observation_spec(self) -> collections.OrderedDict[str, specs.Array]:
+        return collections.OrderedDict(
+            (name, specs.Array(value.shape, value.dtype, name))
+            for name, value in self._observe().items()
+        )
+
+    def reward_spec(self) -> specs.Array:
+        return specs.Array((), float, 'reward')
+
+    def discount_spec(self) -> specs.BoundedArray:
+        return specs.BoundedArray((), float, 0.0, 1.0, 'discount')
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """Where each observation block lies in the flat vector."""
+        return dict(self._task.blocks)
+
+    @property
+    def action_map(self) -> Any:
+        """The map from actions to physical units (`trl_suite.actuation.ActionMap`)."""
+        return self._task.action_map
+
+    @property
+    def step_limit(self) -> int | None:
+        return self._step_limit
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What happened in the last step beyond the time step: see the task's `info`."""
+        return self._task.info(0)
+
+    # State.
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns everything that the future depends on: physics, task, terrain, randomness.
+
+        The dict holds arrays and plain values; it can be pickled and set on any environment built
+        in the same way.
+        """
+        return {
+            'world': self._task.world.get_state(0),
+            'task': self._task.get_state(0),
+            'random': self._random_state.get_state(),
+            'steps': self._steps,
+            'reset_next_step': self._reset_next_step,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_state` returned; the future then repeats bit for bit.
+
+        Raises:
+          ValueError: the state belongs to another environment.
+        """
+        expected = self._task.world.get_state(0).shape
+        if np.shape(state.get('world')) != expected:
+            raise ValueError(
+                f'the state has a world of shape {np.shape(state.get("world"))}; this environment '
+                f'needs {expected}'
+            )
+        self._task.set_state(0, state['task'])
+        self._task.world.set_state(0, state['world'])
+        self._random_state.set_state(state['random'])
+        self._steps = state['steps']
+        self._reset_next_step = state['reset_next_step']
+        if self._extra_observables:
+            self._observation_updater.reset(self._physics_proxy, self._random_state)
+
+    def observation(self) -> collections.OrderedDict[str, np.ndarray]:
+        """Returns the observation of the current state, e.g. after `set_state`."""
+        return self._observe()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._recipe is None:
+            raise TypeError(
+                'this environment was not made by trl_suite.suite, so nothing tells how to build '
+                'it again; pickle env.get_state() instead'
+            )
+        build, arguments = self._recipe
+        return build, arguments, self.get_state()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.set_state(state)

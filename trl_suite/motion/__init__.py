@@ -1,0 +1,4 @@
+
+from trl_suite.motion.clip import Clip, load, names
+
+__all__ = ['Clip', 'load', 'names']

@@ -1,0 +1,52 @@
+"""Unit quaternions (w, x, y, z) as arrays with a last axis of four."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_SMALL = 1e-8  # rad; below it sin(x)/x is 1 to double precision
+
+
+def slerp(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Returns the rotation a share `u` of the shorter way from `a` to `b`, normalised.
+
+    Args:
+      a: shape (..., 4).
+      b: shape (..., 4).
+      u: shares, shape (...).
+    """
+    b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -b, b)
+    # Twice the half-angle between the 4-vectors; unlike arccos exact for small angles.
+    angle = 2 * np.arctan2(np.linalg.norm(b - a, axis=-1), np.linalg.norm(b + a, axis=-1))
+    near = angle < _SMALL
+    sine = np.where(near, 1, np.sin(angle))
+    to = np.where(near, u, np.sin(u * angle) / sine)
+    back = np.where(near, 1 - u, np.sin((1 - u) * angle) / sine)
+    q = back[..., None] * a + to[..., None] * b
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def conjugate(q: np.ndarray) -> np.ndarray:
+    """Returns the inverse rotation, shape (..., 4)."""
+    return q * np.array([1, -1, -1, -1])
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the Hamilton product (first `b`, then `a` in fixed axes), shape (..., 4)."""
+    aw, av = a[..., :1], a[..., 1:]
+    bw, bv = b[..., :1], b[..., 1:]
+    w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    return np.concatenate([w, aw * bv + bw * av + np.cross(av, bv)], axis=-1)
+
+
+def rotation_vector(q: np.ndarray) -> np.ndarray:
+    """Returns axis times angle of the shorter way, rad, shape (..., 3)."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return q[..., 1:] * np.where(sine < _SMALL, 2, angle / np.maximum(sine, _SMALL))
+
+
+def reflect(q: np.ndarray) -> np.ndarray:
+    """Returns the mirror image in the x-z plane (left and right exchanged), shape (..., 4)."""
+    return q * np.array([1, -1, 1, -1])

@@ -1,0 +1,192 @@
+"""The front door: a row of the catalogue, a paper's id, or a free combination -> an environment."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from trl_suite import actuation as actuation_models
+from trl_suite import catalogue, characters, errors, motion
+from trl_suite import terrain as terrains
+from trl_suite.arenas import PlanarTerrain
+from trl_suite.catalogue import Row
+from trl_suite.environment import Environment
+from trl_suite.tasks.imitation import Imitation
+from trl_suite.tasks.task import Task
+
+ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
+ALL_TASKS: tuple[tuple[str, str], ...] = tuple(catalogue.BY_TASK)
+BENCHMARKING: tuple[tuple[str, str], ...] = tuple(
+    key for key, row in catalogue.BY_TASK.items() if 'original' in row.tags
+)
+TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {
+    domain: tuple(task for d, task in ALL_TASKS if d == domain)
+    for domain in dict.fromkeys(d for d, _ in ALL_TASKS)
+}
+DEFAULT_CLIPS = {
+    'biped2d': 'biped2d_walk', 'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound',
+    'goat': 'dog_bound', 'raptor': 'raptor_run_050',
+}  # fmt: skip
+_ENVIRONMENT_OPTIONS = ('random', 'time_limit', 'step_limit')  # also taken from task_kwargs
+
+
+def _imitation(row: Row, options: dict[str, Any]) -> Task:
+    clip = row.clip if isinstance(row.clip, motion.Clip) else motion.load(row.clip or '')
+    return Imitation(
+        characters.make(row.character),
+        PlanarTerrain(terrains.load(row.terrain)),
+        clip,
+        actuation_model=row.actuation,
+        **options,
+    )
+
+
+_RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], type[Task]]] = {
+    'imitation': (_imitation, Imitation)
+}
+
+
+def load(
+    domain_name: str,
+    task_name: str,
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+) -> Environment:
+    """Loads an environment by family and task, as `dm_control.suite.load` does.
+
+    Args:
+      domain_name: family, one of `TASKS_BY_DOMAIN`.
+      task_name: one of `TASKS_BY_DOMAIN[domain_name]`.
+      task_kwargs: `random` (seed), `time_limit` (s), `step_limit`, and the task's own options.
+      environment_kwargs: options of `Environment`, e.g. `flat_observation`.
+
+    Raises:
+      ValueError: unknown names or options; the message has the closest matches.
+    """
+    if domain_name not in TASKS_BY_DOMAIN:
+        raise ValueError(errors.unknown('domain', domain_name, TASKS_BY_DOMAIN))
+    if task_name not in TASKS_BY_DOMAIN[domain_name]:
+        raise ValueError(
+            errors.unknown(f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name])
+        )
+    row = catalogue.BY_TASK[domain_name, task_name]
+    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+
+
+def make(
+    id: str,  # noqa: A002
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+) -> Environment:
+    """Makes an environment by its id in the paper's manner or by an alias ('plaid/dog_gaps').
+
+    Arguments and errors are those of `load`.
+    """
+    return build_row(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
+
+
+def find(id: str) -> Row:  # noqa: A002
+    """Returns the row of an id or alias.
+
+    Raises:
+      ValueError: unknown id; the message has the closest matches.
+    """
+    row = catalogue.BY_ID.get(id) or catalogue.ALIASES.get(id)
+    if row is None:
+        known = catalogue.ALIASES if '/' in str(id) else catalogue.BY_ID
+        raise ValueError(errors.unknown('environment', id, known))
+    return row
+
+
+def build(
+    character: str | characters.CharacterRow,
+    actuation: str = 'position',
+    terrain: Any = 'flat',
+    task: str = 'imitation',
+    clip: str | motion.Clip | None = None,
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+) -> Environment:
+    """Builds a combination that the catalogue does not name.
+
+    Args:
+      character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`.
+      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping.
+      task: the rules; 'imitation'.
+      clip: name of a clip, path of an .npz, or a `Clip`; by default the character's own.
+      task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
+      environment_kwargs: as for `load`.
+
+    Raises:
+      ValueError: unknown names, options, or parts that do not fit each other.
+    """
+    if task not in _RULES:
+        raise ValueError(errors.unknown('task', task, _RULES))
+    if actuation not in actuation_models.ACTUATIONS:
+        raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
+    name = character if isinstance(character, str) else character.name
+    if isinstance(character, str) and character not in characters.CHARACTERS:
+        raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
+    if clip is None:
+        if name not in DEFAULT_CLIPS:
+            raise ValueError(f'character {name!r} has no clip of its own; give clip=')
+        clip = DEFAULT_CLIPS[name]
+    row = Row(
+        id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{task}',
+        domain='custom',
+        task=task,
+        character=character,  # type: ignore[arg-type]
+        actuation=actuation,
+        terrain=terrain,
+        rules=task,
+        clip=clip,  # type: ignore[arg-type]
+        options=MappingProxyType({}),
+        description='A combination of the user.',
+    )
+    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+
+
+def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
+    """Builds the task of a row, for a plain `composer.Environment` or a batch.
+
+    Args:
+      row: a row of the catalogue.
+      options: keyword arguments of the task class that override those of the row.
+
+    Raises:
+      ValueError: an unknown option; the message has the closest matches.
+    """
+    make_task, cls = _RULES[row.rules]
+    merged = {**row.options, **(options or {})}
+    known = [
+        name
+        for name, parameter in inspect.signature(cls.__init__).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
+    ]
+    for name in merged:
+        if name not in known:
+            raise ValueError(errors.unknown(f'option of {row.id}', name, [*known, 'random']))
+    return make_task(row, merged)
+
+
+def build_row(
+    row: Row, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
+) -> Environment:
+    """Builds the environment of a row; see `load` for the arguments."""
+    known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
+    for name in environment_kwargs:
+        if name not in known:
+            raise ValueError(errors.unknown('option of an environment', name, known))
+    options = {'step_limit': row.step_limit, **environment_kwargs}
+    for name in _ENVIRONMENT_OPTIONS:
+        if name in task_kwargs:
+            options[name] = task_kwargs[name]
+    task = build_task(
+        row, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
+    )
+    environment = Environment(task, **options)
+    environment._recipe = (build_row, (row, task_kwargs, environment_kwargs))
+    return environment

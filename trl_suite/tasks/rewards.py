@@ -1,0 +1,39 @@
+"""Reward terms as pure functions over a leading batch axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# The imitation reward: weight * exp(-scale * error), weights summing to 1.
+# Source: the imitation scenario of the original; 'Does the choice of action space matter?'
+# (Peng & van de Panne 2017) has the same structure.
+IMITATION_TERMS: dict[str, tuple[float, float]] = {
+    'pose': (0.5, 2.0),
+    'velocity': (0.05, 0.005),
+    'end_effector': (0.15, 40.0),
+    'root': (0.1, 10.0),
+    'com': (0.2, 10.0),
+}
+COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
+
+_WEIGHTS = np.array([weight for weight, _ in IMITATION_TERMS.values()])
+_SCALES = np.array([-scale for _, scale in IMITATION_TERMS.values()])
+
+
+def imitation(errors: np.ndarray) -> np.ndarray:
+    """Terms of the imitation reward, each already weighted.
+
+    Args:
+      errors: squared errors, shape (n, 5), in the order of `IMITATION_TERMS`: normalised-weight
+        sums over joints (and root) of rad^2 and of rad^2/s^2; mean over end effectors of m^2; root
+        height in m^2; 0.1 times the centre-of-mass velocity error in m^2/s^2.
+
+    Returns:
+      Shape (n, 5); their sum is the reward, at most 1.
+    """
+    return _WEIGHTS * np.exp(_SCALES * errors)
+
+
+def wrap(angle: np.ndarray) -> np.ndarray:
+    """Wraps angles in rad to [-pi, pi): the shortest rotation."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi

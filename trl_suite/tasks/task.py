@@ -1,0 +1,138 @@
+"""The base of all tasks: rules over a batch axis, worn as a composer task."""
+
+from __future__ import annotations
+
+import abc
+import collections
+from typing import Any
+
+import numpy as np
+from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
+from dm_env import specs
+
+from trl_suite.actuation import ActionMap
+from trl_suite.world import World
+
+MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
+
+
+class Task(composer.Task):
+    """Rules of an environment, written once over a leading axis of n simulations.
+
+    A subclass owns arrays of n rows. It is driven by four methods: `bind` (a compiled world),
+    `begin_episode` (one row), `act` (all rows, before the physics) and `finish_step` (all rows,
+    after it). The composer hooks below are the case n = 1, so that a plain `composer.Environment`
+    runs the task as well; a subclass whose step lasts a variable time overrides `simulate`.
+
+    Attributes:
+      world: the simulations, after compiling.
+      action_map: what an action means.
+      observation: all observation blocks side by side, shape (n, observation size).
+      blocks: name -> slice of `observation`, in order, terrain first.
+      reward: shape (n,).
+      failed: rows whose episode has ended with discount 0, shape (n,) bool.
+      diverged: the failed rows whose physics broke down, shape (n,) bool.
+    """
+
+    world: World
+    action_map: ActionMap
+    observation: np.ndarray
+    blocks: dict[str, slice]
+    reward: np.ndarray
+    failed: np.ndarray
+    diverged: np.ndarray
+
+    # What a family implements.
+
+    @abc.abstractmethod
+    def bind(self, world: World) -> None:
+        """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
+
+    @abc.abstractmethod
+    def begin_episode(self, row: int, seed: np.random.SeedSequence) -> None:
+        """Draws terrain and start of one row, and observes it."""
+
+    @abc.abstractmethod
+    def act(self, action: np.ndarray) -> None:
+        """Takes actions, shape (n, k), in [-1, 1]."""
+
+    @abc.abstractmethod
+    def finish_step(self) -> None:
+        """Updates reward, failed and observation after the physics has advanced."""
+
+    @abc.abstractmethod
+    def info(self, row: int) -> dict[str, Any]:
+        """What happened to one row, beyond observation and reward."""
+
+    @abc.abstractmethod
+    def get_state(self, row: int) -> dict[str, Any]:
+        """Everything about one row that the world's state does not hold."""
+
+    @abc.abstractmethod
+    def set_state(self, row: int, state: dict[str, Any]) -> None:
+        """Restores what `get_state` returned; the world's state is set afterwards."""
+
+    def simulate(self) -> None:
+        """Advances the physics by one control step."""
+        self.world.step(self.physics_steps_per_control_step)
+
+    # Composer's interface: one simulation.
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        self.bind(World(physics))
+
+    def initialize_episode(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState
+    ) -> None:
+        self.begin_episode(0, episode_seed(random_state))
+
+    def before_step(
+        self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
+    ) -> None:
+        self.act(np.asarray(action, dtype=float)[None])
+
+    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        self.finish_step()
+
+    def get_reward(self, physics: mjcf.Physics) -> float:
+        return float(self.reward[0])
+
+    def get_discount(self, physics: mjcf.Physics) -> float:
+        return 0.0 if self.failed[0] else 1.0
+
+    def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
+        return bool(self.failed[0])
+
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
+        return specs.BoundedArray(
+            (len(self.action_map),), float, -1.0, 1.0, name='\t'.join(self.action_map.names)
+        )
+
+    @property
+    def task_observables(self) -> dict[str, observable.Observable]:
+        def block(part: slice) -> observable.Generic:
+            item = observable.Generic(lambda physics: self.observation[0, part].copy())
+            item.enabled = True
+            return item
+
+        if not hasattr(self, '_task_observables'):
+            self._task_observables = collections.OrderedDict(
+                (name, block(part)) for name, part in self.blocks.items()
+            )
+        return self._task_observables
+
+
+def episode_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
+    """Draws the seed of one episode: whatever the episode draws depends on nothing else."""
+    return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32).tolist())
+
+
+def consecutive(sizes: dict[str, int]) -> dict[str, slice]:
+    """Lays blocks of the given sizes side by side; empty ones are left out."""
+    ends = np.cumsum(list(sizes.values()))
+    return {
+        name: slice(int(end) - size, int(end))
+        for (name, size), end in zip(sizes.items(), ends, strict=True)
+        if size
+    }

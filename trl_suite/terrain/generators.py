@@ -1,0 +1,377 @@
+"""The planar terrain generators: random features one after another, and rolling ground under them.
+
+A planar terrain is a polyline with vertices SPACING apart. A generator is a function of
+(parameters, length in m, random generator) that returns a `Profile`: the vertices to append to the
+ground so far, which stands at height 0. It repeats its feature until the length is reached, so it
+overshoots by up to one feature. Two primitives make all features:
+
+* a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
+  flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m at its crest and
+  0.225 m at its foot. The level of the ground is unchanged.
+* a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
+
+The processes are those of the terrain generator of the original (Terrain RL Simulator, 2018);
+equality is in distribution, not draw by draw. New generators join through `register`:
+
+    @register('var2d_saw', ToothW=1.0, ToothHMin=0.1, ToothHMax=0.2)
+    def saw(parameters, length, rng):
+        cells = math.ceil(parameters['ToothW'] / SPACING)
+        teeth = math.ceil(length / SPACING / cells)
+        rises = rng.uniform(parameters['ToothHMin'], parameters['ToothHMax'], teeth)
+        heights = np.outer(rises, np.arange(1, cells + 1) / cells).ravel()
+        return Profile(heights, np.diff(heights, prepend=0.0) < 0)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import numbers
+import types
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.errors import unknown
+
+SPACING = 0.025  # m between vertices
+LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
+LONGEST = 1e6  # m; most ground asked for at once
+
+# Defaults of the parameters, by feature (those of the original).
+GAPS = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
+        'GapHMin': -2, 'GapHMax': -2}  # fmt: skip
+WALLS = {'WallSpacingMin': 6, 'WallSpacingMax': 8, 'WallWMin': 0.2, 'WallWMax': 0.2,
+         'WallHMin': 0.25, 'WallHMax': 0.5}  # fmt: skip
+STEPS = {'StepSpacingMin': 5, 'StepSpacingMax': 7, 'StepH0Min': 0.1, 'StepH0Max': 0.4,
+         'StepH1Min': -0.4, 'StepH1Max': -0.1}  # fmt: skip
+NARROW_GAPS = {'NarrowGapSpacingMin': 3, 'NarrowGapSpacingMax': 6,
+               'NarrowGapDistMin': 0.1, 'NarrowGapDistMax': 0.4,
+               'NarrowGapWMin': 0.15, 'NarrowGapWMax': 0.5,
+               'NarrowGapDepthMin': -2, 'NarrowGapDepthMax': -2,
+               'NarrowGapCountMin': 1, 'NarrowGapCountMax': 4}  # fmt: skip
+CLIFFS = {'CliffSpacingMin': 5, 'CliffSpacingMax': 7, 'CliffH0Min': 0.1, 'CliffH0Max': 0.4,
+          'CliffH1Min': -0.4, 'CliffH1Max': -0.1, 'CliffMiniCountMax': 0}  # fmt: skip
+BUMPS = {'BumpHMin': 0, 'BumpHMax': 0.03}
+SLOPES = {'SlopeDeltaRange': 0.25, 'SlopeDeltaMin': -0.35, 'SlopeDeltaMax': 0.35}
+
+# What values make sense, by name without Min or Max: a length or a count below zero means nothing,
+# and the upper bounds keep a stretch of ground in memory. Names not listed here may be any number.
+_LENGTH, _COUNT, _HEIGHT, _SLOPE = (0.0, 1e3), (0.0, 100.0), (-1e3, 1e3), (-100.0, 100.0)
+LIMITS = {
+    **dict.fromkeys(('GapSpacing', 'WallSpacing', 'StepSpacing', 'CliffSpacing'), _LENGTH),
+    **dict.fromkeys(('NarrowGapSpacing', 'NarrowGapDist'), _LENGTH),
+    **dict.fromkeys(('GapW', 'WallW', 'NarrowGapW'), _LENGTH),
+    **dict.fromkeys(('NarrowGapCount', 'CliffMiniCount'), _COUNT),
+    **dict.fromkeys(('GapH', 'WallH', 'StepH0', 'StepH1', 'BumpH'), _HEIGHT),
+    **dict.fromkeys(('CliffH0', 'CliffH1', 'NarrowGapDepth'), _HEIGHT),
+    **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange'), _SLOPE),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Profile:
+    """Vertices to append to a ground whose last vertex is at height 0.
+
+    Attributes:
+      heights: heights of the vertices, SPACING apart, m, shape (k,).
+      vertical: True where the cell between the previous vertex and this one is the vertical face of
+        a feature, shape (k,). The first cell begins at the last vertex of the ground so far.
+    """
+
+    heights: np.ndarray
+    vertical: np.ndarray
+
+
+Parameters = Mapping[str, float]
+Function = Callable[[Parameters, float, np.random.Generator], Profile]
+
+
+class Generator(NamedTuple):
+    """A terrain type: its function, and its parameters with their defaults."""
+
+    function: Function
+    defaults: Mapping[str, float]
+
+
+_generators: dict[str, Generator] = {}
+GENERATORS: Mapping[str, Generator] = types.MappingProxyType(_generators)
+
+
+def check(
+    where: str, values: Mapping[str, object], defaults: Parameters = types.MappingProxyType({})
+) -> dict[str, float]:
+    """Returns parameter values as floats.
+
+    Args:
+      where: what the values belong to, for the message.
+      values: name -> number.
+      defaults: values of the parameters that are not given.
+
+    Raises:
+      ValueError: a value is no finite number, is outside LIMITS, or a Min is above its Max.
+    """
+    checked = {}
+    for key, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise ValueError(f'{where}: {key} must be a number, not {value!r}')
+        low, high = LIMITS.get(key.removesuffix('Min').removesuffix('Max'), (-math.inf, math.inf))
+        try:
+            checked[key] = float(value)
+        except OverflowError:
+            checked[key] = math.inf
+        if not math.isfinite(checked[key]):
+            raise ValueError(f'{where}: {key} must be finite, not {value!r}')
+        if not low <= checked[key] <= high:
+            raise ValueError(f'{where}: {key} must be from {low:g} to {high:g}, not {value!r}')
+    complete = {**defaults, **checked}
+    for key in complete:
+        top = key.removesuffix('Min') + 'Max'
+        if key.endswith('Min') and complete[key] > complete.get(top, math.inf):
+            low, high = (
+                f'{name} {complete[name]:g}{"" if name in checked else " (the default)"}'
+                for name in (key, top)
+            )
+            raise ValueError(f'{where}: {low} is above {high}; a range runs from Min to Max')
+    return checked
+
+
+def register(
+    type_name: str, /, *, replace: bool = False, **defaults: float
+) -> Callable[[Function], Function]:
+    """Decorates a function as the generator of a new terrain type.
+
+    Args:
+      type_name: the `Type` in terrain files.
+      replace: whether an existing type of that name may be replaced.
+      **defaults: the names of all its parameters, with their defaults.
+
+    Raises:
+      ValueError: the name is taken, or a default makes no sense (see `check`).
+    """
+    if type_name in _generators and not replace:
+        raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
+    checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
+
+    def add(function: Function) -> Function:
+        _generators[type_name] = Generator(function, checked)
+        return function
+
+    return add
+
+
+def draw(
+    type_name: str, parameters: Parameters, length: float, rng: np.random.Generator
+) -> Profile:
+    """Draws one stretch of ground, and checks what the generator made of it.
+
+    Args:
+      type_name: a key of GENERATORS.
+      parameters: a value for every parameter of the type, as from `Terrain.parameters`.
+      length: nominal length, m; generators overshoot by up to one feature.
+      rng: source of randomness.
+
+    Raises:
+      ValueError: unknown type, a length that is not positive and below LONGEST, or a generator
+        that returns something else than a finite `Profile` of at least one vertex.
+    """
+    if type_name not in _generators:
+        raise ValueError(unknown('terrain type', type_name, _generators))
+    if not 0 < length <= LONGEST:
+        raise ValueError(f'length must be above 0 and at most {LONGEST:g} m, not {length!r}')
+    profile = _generators[type_name].function(parameters, length, rng)
+    fault = ''
+    if not isinstance(profile, Profile):
+        fault = f'must return a Profile, not {type(profile).__name__}'
+    else:
+        heights, vertical = np.asarray(profile.heights), np.asarray(profile.vertical)
+        if heights.ndim != 1 or not len(heights) or heights.dtype.kind not in 'fiu':
+            fault = f'heights must be numbers of shape (k,), k > 0, not {heights.shape}'
+        elif vertical.shape != heights.shape or vertical.dtype != bool:
+            fault = f'vertical must be bools of shape {heights.shape}, not {vertical.shape}'
+            fault += f' of {vertical.dtype}'
+        elif not np.isfinite(heights).all():
+            fault = f'height of vertex {int(np.argmin(np.isfinite(heights)))} is not finite'
+    if fault:
+        raise ValueError(f'generator of terrain type {type_name!r}: {fault}')
+    return Profile(heights.astype(float, copy=False), vertical)
+
+
+def cells(length: float) -> int:
+    """Returns the number of cells a length in m takes: rounded up, but 0.2 m is 8 cells."""
+    return math.ceil(length / SPACING - 1e-9)
+
+
+# Features: each draws one and returns its level runs, (number of vertices, height) in order.
+# Heights count from the ground before the feature; the last run is the ground after it.
+
+Runs = list[tuple[int, float]]
+Feature = Callable[[Parameters, np.random.Generator], Runs]
+
+
+def _uniform(parameters: Parameters, name: str, rng: np.random.Generator) -> float:
+    low, high = parameters[name + 'Min'], parameters[name + 'Max']
+    return low + (high - low) * rng.random()
+
+
+def _integer(low: float, high: float, rng: np.random.Generator) -> int:
+    """Draws an integer, both ends included; blended counts are truncated here, at their use."""
+    low, high = int(low), int(high)
+    return low + int((high - low + 1) * rng.random())
+
+
+def _box(parameters: Parameters, name: str, height: str, rng: np.random.Generator) -> Runs:
+    spacing, width = (_uniform(parameters, name + key, rng) for key in ('Spacing', 'W'))
+    return [(cells(spacing), 0.0), (cells(width), _uniform(parameters, height, rng)), (1, 0.0)]
+
+
+def _rise_range(parameters: Parameters, name: str, rng: np.random.Generator) -> str:
+    """Returns which of two ranges of a signed rise is drawn from.
+
+    A range whose ends are both 0 is switched off; of two that are on, a coin decides. So direction
+    comes from the numbers alone: with two positive ranges the ground only ascends.
+    """
+    ranges = [name + '0', name + '1']
+    enabled = [key for key in ranges if parameters[key + 'Min'] or parameters[key + 'Max']]
+    choices = enabled or ranges
+    return choices[_integer(0, len(choices) - 1, rng)]
+
+
+def _gap(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    return _box(parameters, 'Gap', 'GapH', rng)
+
+
+def _wall(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    return _box(parameters, 'Wall', 'WallH', rng)
+
+
+def _step(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    key = _rise_range(parameters, 'StepH', rng)
+    spacing = cells(_uniform(parameters, 'StepSpacing', rng))
+    return [(spacing, 0.0), (1, _uniform(parameters, key, rng))]
+
+
+def _mixed(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    return (_gap, _step, _wall)[_integer(0, 2, rng)](parameters, rng)
+
+
+def _narrow_gaps(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    """A cluster of gaps with stepping stones between; all floors count from the same surface."""
+    runs: Runs = []
+    spacing = 'NarrowGapSpacing'
+    low, high = (max(1, parameters['NarrowGapCount' + end]) for end in ('Min', 'Max'))
+    for _ in range(_integer(low, high, rng)):
+        runs.append((cells(_uniform(parameters, spacing, rng)), 0.0))
+        width = cells(_uniform(parameters, 'NarrowGapW', rng))
+        runs += [(width, _uniform(parameters, 'NarrowGapDepth', rng)), (1, 0.0)]
+        spacing = 'NarrowGapDist'
+    return runs
+
+
+def _cliff(parameters: Parameters, rng: np.random.Generator) -> Runs:
+    """One tall riser, broken by up to CliffMiniCountMax ledges at random heights."""
+    key = _rise_range(parameters, 'CliffH', rng)
+    tread = _uniform(parameters, 'CliffSpacing', rng)
+    total = _uniform(parameters, key, rng)
+    runs: Runs = []
+    level = 0.0
+    for _ in range(_integer(0, parameters['CliffMiniCountMax'], rng)):
+        runs.append((cells(tread), level))
+        level += (total - level) * rng.random()
+        runs.append((1, level))
+        tread = LEDGE
+    return [*runs, (cells(tread), level), (1, total)]
+
+
+def _repeat(
+    feature: Feature, parameters: Parameters, length: float, rng: np.random.Generator
+) -> Profile:
+    """Repeats a feature until the length is reached; every one has at least one vertex."""
+    counts: list[int] = []
+    levels: list[float] = []
+    missing, base = cells(length), 0.0
+    while missing > 0:
+        for count, level in feature(parameters, rng):
+            counts.append(count)
+            levels.append(base + level)
+            missing -= count
+        base = levels[-1]
+    heights = np.repeat(levels, counts)
+    # Ground of level runs changes its height at vertical faces only.
+    return Profile(heights, np.diff(heights, prepend=0.0) != 0)
+
+
+# Overlays: added over the vertices of a stretch.
+
+
+def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) -> Profile:
+    """Adds a mean-reverting random walk of the slope, which starts at slope 0 in every stretch.
+
+    Per vertex the slope changes by up to SlopeDeltaRange: down with a probability that grows
+    from 0 to 1 as the slope crosses the band from SlopeDeltaMin to SlopeDeltaMax, else up.
+    A band without width adds nothing.
+    """
+    low, high = parameters['SlopeDeltaMin'], parameters['SlopeDeltaMax']
+    if low == high:
+        return profile
+    count = len(profile.heights)
+    changes, thresholds = rng.random((2, count))
+    changes *= abs(parameters['SlopeDeltaRange'])
+    thresholds = low + (high - low) * thresholds
+    slope, slopes = 0.0, []
+    # Plain floats: a walk that looks at its own last value cannot be vectorised.
+    for change, threshold in zip(changes.tolist(), thresholds.tolist(), strict=True):
+        slope += -change if slope > threshold else change
+        slopes.append(slope)
+    offsets = np.cumsum(slopes) * SPACING
+    return Profile(profile.heights + offsets, profile.vertical)
+
+
+@register('var2d_flat')
+def flat(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Level ground."""
+    count = cells(length)
+    return Profile(np.zeros(count), np.zeros(count, dtype=bool))
+
+
+@register('var2d_bumps', **BUMPS)
+def bumps(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Level ground with white noise: every vertex but the last is moved up or down."""
+    profile = flat(parameters, length, rng)
+    sizes, coins = rng.random((2, len(profile.heights) - 1))
+    low, high = parameters['BumpHMin'], parameters['BumpHMax']
+    profile.heights[:-1] = np.where(coins < 0.5, 1, -1) * (low + (high - low) * sizes)
+    return profile
+
+
+@register('var2d_slopes', **SLOPES)
+def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Rolling ground."""
+    return _sloped(flat(parameters, length, rng), parameters, rng)
+
+
+@register('var2d_cliffs', **CLIFFS)
+def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Tall risers broken by ledges."""
+    return _repeat(_cliff, parameters, length, rng)
+
+
+def _register_feature(name: str, feature: Feature, defaults: Sequence[Parameters]) -> None:
+    """Registers a feature twice: on level ground and on rolling ground."""
+    merged = {key: value for part in defaults for key, value in part.items()}
+
+    @register(f'var2d_{name}', **merged)
+    def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        return _repeat(feature, parameters, length, rng)
+
+    @register(f'var2d_slopes_{name}', **merged, **SLOPES)
+    def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        return _sloped(level(parameters, length, rng), parameters, rng)
+
+
+_register_feature('gaps', _gap, [GAPS])
+_register_feature('walls', _wall, [WALLS])
+_register_feature('steps', _step, [STEPS])
+_register_feature('mixed', _mixed, [GAPS, WALLS, STEPS])
+_register_feature('narrow_gaps', _narrow_gaps, [NARROW_GAPS])

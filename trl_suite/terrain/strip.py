@@ -1,0 +1,215 @@
+"""The endless planar ground of one episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.terrain.generators import LONGEST, SPACING, Profile, cells, draw
+from trl_suite.terrain.parameters import Terrain
+
+STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
+PAD_END = 1.0  # m; the flat start ends here
+INTENDED_CENTRE = -1.0  # m
+
+
+class Strip:
+    """Planar ground without end, drawn in stretches of 20 m as it is asked for.
+
+    Vertex i stands at x = i * SPACING, for any integer i; the ground is linear in between. Ground
+    to the right and to the left is drawn from two random streams of their own, so what stands where
+    depends on the seed alone, never on when or how far the ground was asked for.
+
+    The first two stretches meet at height 0 at the `centre`. A stretch over x = 0 begins with flat
+    ground, meant to reach x = +1 (the original's rule). With the centre at -1, where the original
+    wanted it, that is a flat start from x = -1 to +1, and the first spacing follows. As run, the
+    original put the centre elsewhere; then either a feature ends exactly at the centre behind the
+    character (centre in (-1, 0]), or one ends at the centre in front of it and the flat ground
+    lies 20 m behind (centre > 0).
+
+    Attributes:
+      type: the terrain type.
+      parameters: a value for every parameter of the type.
+    """
+
+    def __init__(
+        self,
+        terrain: Terrain,
+        seed: int | np.random.SeedSequence | np.random.Generator,
+        *,
+        blend: float = 0.0,
+        spawn: str = 'intended',
+        centre: float = 0.0,
+    ):
+        """Prepares the ground; it is drawn when it is first asked for.
+
+        Args:
+          terrain: what ground.
+          seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
+            Generator (from which four numbers are drawn).
+          blend: which of the parameter sets, see `Terrain.parameters`.
+          spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start of the
+            original as run.
+          centre: where the first two stretches meet if spawn is 'upstream', m; else not used. In
+            the original 3 for gait machines, and x - 0.5 for the imitation of a clip that has moved
+            x m forward at its start phase.
+
+        Raises:
+          ValueError: unknown spawn, a centre that is not finite or further than LONGEST, or a blend
+            that is no number.
+          TypeError: the seed is something else.
+        """
+        if spawn not in ('intended', 'upstream'):
+            raise ValueError(f"spawn must be 'intended' or 'upstream', not {spawn!r}")
+        if not abs(centre) <= LONGEST:
+            raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
+        self.type = terrain.type
+        self.parameters = terrain.parameters(blend)
+        # Heights of the vertices from number _low on; one fewer flags for the cells between them.
+        self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
+        self._heights = np.zeros(1)
+        self._vertical = np.zeros(0, dtype=bool)
+        right, left = _sequence(seed).spawn(2)
+        self._right, self._left = np.random.default_rng(right), np.random.default_rng(left)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """From where to where the ground is drawn so far, m."""
+        return self._low * SPACING, (self._low + len(self._heights) - 1) * SPACING
+
+    def ensure(self, lo: float, hi: float) -> None:
+        """Draws the ground from lo to hi (m) as far as it is not there yet.
+
+        Raises:
+          ValueError: lo or hi is not finite or further than LONGEST from 0.
+        """
+        if not (abs(lo) <= LONGEST and abs(hi) <= LONGEST):
+            raise ValueError(f'ground exists within {LONGEST:g} m of 0, not from {lo!r} to {hi!r}')
+        self._extend(math.floor(lo / SPACING), math.ceil(hi / SPACING))
+
+    def window(self, lo_index: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the vertices lo_index, lo_index + 1, ... and draws them if need be.
+
+        Returns:
+          heights: m, shape (count,).
+          vertical: True where the cell that ends at the vertex is a vertical face, shape (count,).
+        """
+        if count < 1:
+            raise ValueError(f'count must be positive, not {count!r}')
+        # One vertex more to the left, so that the first cell is known.
+        self.ensure((lo_index - 1) * SPACING, (lo_index + count - 1) * SPACING)
+        first = lo_index - self._low
+        heights = self._heights[first : first + count]
+        return heights.copy(), self._vertical[first - 1 : first - 1 + count].copy()
+
+    def height(self, x: npt.ArrayLike) -> np.ndarray:
+        """Returns the heights of the ground at x (m), of the shape of x, by linear interpolation.
+
+        Raises:
+          ValueError: x holds a value that is not finite or further than LONGEST from 0.
+        """
+        left, rise, fraction = self._cell(x)
+        return left + fraction * rise
+
+    def slope(self, x: npt.ArrayLike) -> np.ndarray:
+        """Returns dh/dx of the cells that x (m) lies in; at a vertex, of the cell to its right.
+
+        Vertical faces count as what they are in the polyline: one cell wide.
+
+        Raises:
+          ValueError: as `height`.
+        """
+        return self._cell(x)[1] / SPACING
+
+    def state(self) -> dict[str, Any]:
+        """Returns everything `from_state` needs to go on exactly as this strip would."""
+        return {
+            'type': self.type,
+            'parameters': dict(self.parameters),
+            'low': self._low,
+            'heights': self._heights.copy(),
+            'vertical': self._vertical.copy(),
+            'right': self._right.bit_generator.state,
+            'left': self._left.bit_generator.state,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Strip:
+        """Returns a strip as it was when `state` was taken."""
+        strip = cls.__new__(cls)
+        strip.set_state(state)
+        return strip
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Puts the strip back to what it was when `state` was taken."""
+        right, left = np.random.default_rng(0), np.random.default_rng(0)
+        right.bit_generator.state, left.bit_generator.state = state['right'], state['left']
+        self.type, self.parameters = state['type'], dict(state['parameters'])
+        self._low = state['low']
+        self._heights, self._vertical = state['heights'].copy(), state['vertical'].copy()
+        self._right, self._left = right, left
+
+    def _cell(self, x: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the height left of x, the rise over the cell, and where in the cell x lies."""
+        x = np.asarray(x, dtype=float)
+        if not x.size:
+            return x, x, x
+        position = x / SPACING
+        lo, hi = float(position.min()), float(position.max())
+        if not (lo >= -LONGEST / SPACING and hi <= LONGEST / SPACING):  # also refuses NaN
+            raise ValueError(f'x must be finite and within {LONGEST:g} m of 0, not {x}')
+        self._extend(math.floor(lo), math.floor(hi) + 1)
+        number = np.floor(position)
+        i = number.astype(int) - self._low
+        left = self._heights[i]
+        return left, self._heights[i + 1] - left, position - number
+
+    def _extend(self, low: int, high: int) -> None:
+        """Draws stretches until the vertices from low to high are there."""
+        heights, vertical = [self._heights], [self._vertical]
+        end, height = self._low + len(self._heights) - 1, self._heights[-1]
+        while end < high:
+            profile = self._stretch(end, self._right)
+            heights.append(height + profile.heights)
+            vertical.append(profile.vertical)
+            height = heights[-1][-1]
+            end += len(profile.heights)
+        start, height = self._low, self._heights[0]
+        while start > low:
+            profile = self._stretch(start - cells(STRETCH), self._left)
+            # The last vertex comes to lie on the first one there is; the ground that the profile is
+            # appended to, at height 0, becomes the new first vertex.
+            ground = np.concatenate(([0.0], profile.heights))
+            heights.insert(0, ground[:-1] - ground[-1] + height)
+            vertical.insert(0, profile.vertical)
+            height = heights[0][0]
+            start -= len(profile.heights)
+        if len(heights) > 1:
+            self._low = start
+            self._heights, self._vertical = np.concatenate(heights), np.concatenate(vertical)
+
+    def _stretch(self, begin: int, rng: np.random.Generator) -> Profile:
+        """Draws a stretch that begins at a vertex; if it covers x = 0, after flat ground."""
+        profile = draw(self.type, self.parameters, STRETCH, rng)
+        if not begin <= 0 < begin + cells(STRETCH):
+            return profile
+        pad = min(cells(STRETCH), cells(PAD_END) - begin)
+        return Profile(
+            np.concatenate((np.zeros(pad), profile.heights)),
+            np.concatenate((np.zeros(pad, dtype=bool), profile.vertical)),
+        )
+
+
+def _sequence(seed: int | np.random.SeedSequence | np.random.Generator) -> np.random.SeedSequence:
+    """Returns a SeedSequence of our own, which may spawn children without touching the user's."""
+    if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0:
+        seed = np.random.SeedSequence(int(seed))
+    if isinstance(seed, np.random.SeedSequence):
+        return np.random.SeedSequence(seed.generate_state(4).tolist())
+    if isinstance(seed, np.random.Generator):
+        return np.random.SeedSequence(seed.integers(2**32, size=4).tolist())
+    raise TypeError(f'seed must be an int >= 0, a SeedSequence or a Generator, not {seed!r}')
