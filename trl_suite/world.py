@@ -20,11 +20,8 @@ READABLE = (
     'ten_length', 'actuator_force',
 )  # fmt: skip
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that continues a trajectory bit for bit
-_DIVERGED = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
+# Bad position, velocity and acceleration are neighbours among the warnings.
+_DIVERGED = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC + 1)
 
 
 class World:
@@ -106,7 +103,7 @@ class World:
 
     def diverged(self) -> np.ndarray:
         """Returns which simulations met a non-finite or huge state since their reset, (n,)."""
-        return np.array([any(self._warnings[i] > 0 for i in _DIVERGED)])
+        return np.array([self._warnings[_DIVERGED].any()])
 
     def body_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_BODY, names)

@@ -65,7 +65,7 @@ class PlanarTerrain(composer.Arena):
         self._world = world
         self._geoms = world.geom_ids([geom.full_identifier for geom in self.boxes])
         self.strips: list[Strip | None] = [None] * world.n
-        self._start = np.zeros(world.n, dtype=np.int64)  # vertex number of a window's first vertex
+        self._start = np.zeros(world.n)  # vertex number of a window's first vertex
         self._heights = np.zeros((world.n, _WINDOW))
         self._offset = np.arange(world.n) * _WINDOW
         self._lay_from = np.full(world.n, np.inf)  # m; beyond these the window is laid anew
@@ -86,22 +86,26 @@ class PlanarTerrain(composer.Arena):
 
     def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
-        u = x * (1 / SPACING) - self._start[rows, None]
-        np.minimum(np.maximum(u, 0, out=u), _WINDOW - 1.000001, out=u)
+        u = x * (1 / SPACING)
+        u -= self._start[rows, None]
         cell = u.astype(np.int64)
         u -= cell
         cell += self._offset[rows, None]
-        flat = self._heights.ravel()
-        low = flat[cell]
+        # Clipping only guards rows whose physics broke down; `follow` keeps the others inside.
+        low = self._heights.take(cell, mode='clip')
         cell += 1
-        return low + u * (flat[cell] - low)
+        rise = self._heights.take(cell, mode='clip')
+        rise -= low
+        rise *= u
+        rise += low
+        return rise
 
     def slope(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
-        u = np.clip(x * (1 / SPACING) - self._start[rows, None], 0, _WINDOW - 1.000001)
-        cell = u.astype(np.int64) + self._offset[rows, None]
-        flat = self._heights.ravel()
-        return (flat[cell + 1] - flat[cell]) / SPACING
+        cell = (x * (1 / SPACING) - self._start[rows, None]).astype(np.int64)
+        cell += self._offset[rows, None]
+        low = self._heights.take(cell, mode='clip')
+        return (self._heights.take(cell + 1, mode='clip') - low) / SPACING
 
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""

@@ -1,0 +1,261 @@
+"""Reading and writing the JSON motion files of Terrain RL Simulator and DeepMimic.
+
+Both hold `Frames`, arrays of [duration of the frame in s, root x, y, z, root quaternion wxyz, then
+one number per hinge and a quaternion wxyz per ball joint, in the order of the character file]. They
+differ in `Loop`: a boolean in TerrainRL, 'wrap' or 'none' in DeepMimic, which also centres the root
+and does not carry its height over a cycle.
+
+The files' frame has x forward, y up and z to the right. Turned into ours, (x, y, z) -> (x, -z, y),
+hinge angles keep their sign: their hinges turn about +z, ours about (0, -1, 0), the same axis.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.motion.clip import JOINT_SIZES, Clip
+
+_HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
+_FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by
+_ZERO = 1e-6  # length below which a quaternion has no direction
+_LARGEST = 1e300  # beyond it an integer of the file may not fit a float
+
+
+
+# Joint layouts of DeepMimic's characters: name -> columns. Fixed joints (wrists) have no columns.
+_ARM = (('shoulder', 4), ('elbow', 1))
+_LEG = (('hip', 4), ('knee', 1), ('ankle', 4))
+HUMANOID3D: Mapping[str, int] = {
+    'chest': 4,
+    'neck': 4,
+    **{f'right_{name}': size for name, size in (*_LEG, *_ARM)},
+    **{f'left_{name}': size for name, size in (*_LEG, *_ARM)},
+}
+_FORELEG = (('shoulder', 4), ('forearm', 1), ('hand', 4), ('finger', 4))
+_HINDLEG = (('upper_leg', 4), ('leg', 1), ('foot', 4), ('toe', 4))
+DOG3D: Mapping[str, int] = {
+    'spine0': 4,
+    'spine1': 4,
+    'neck': 4,
+    'head': 4,
+    **{f'{side}_{name}': size for side in ('left', 'right') for name, size in _FORELEG},
+    **{f'{side}_{name}': size for side in ('left', 'right') for name, size in _HINDLEG},
+    'tail0': 4,
+    'tail1': 4,
+}
+
+
+def read_terrainrl(
+    path: str | os.PathLike[str], joints: Sequence[str], sizes: Sequence[int], root: str
+) -> Clip:
+    """Reads a TerrainRL motion file.
+
+    Args:
+      path: JSON file.
+      joints: joint names in the order of the character file.
+      sizes: columns of each, 1 (hinge) or 4 (ball).
+      root: 'planar' or 'free'; a planar file stores the full root, too.
+
+    Returns:
+      The clip in our frame, named after the file, quaternions normalised.
+
+    Raises:
+      ValueError: if the file is malformed or does not match the layout; the message names the file,
+        the frame (counted from 0) and the field.
+      FileNotFoundError: if there is no such file.
+    """
+    path = pathlib.Path(path)
+    motion = _parse(path)
+    loop = motion.get('Loop', False)
+    if not isinstance(loop, bool):
+        raise ValueError(f'{path}: Loop: true or false is needed, found {loop!r}')
+    return _clip(path, _frames(path, motion), joints, sizes, root, loop)
+
+
+def read_deepmimic(
+    path: str | os.PathLike[str],
+    joints: Sequence[str] = tuple(HUMANOID3D),
+    sizes: Sequence[int] = tuple(HUMANOID3D.values()),
+) -> Clip:
+    """Reads a DeepMimic motion file; the layout is humanoid3d's unless given.
+
+    As in DeepMimic the first frame is moved over the origin. A looping clip gains no height over
+    cycles unless `CycleSyncRootHeight` is set: what the frames gain is taken out evenly, where
+    DeepMimic would jump at the seam.
+
+    Args:
+      path: JSON file.
+      joints: joint names in the order of the character file, without fixed joints.
+      sizes: columns of each, 1 (hinge) or 4 (ball).
+
+    Returns:
+      The clip in our frame, root 'free', named after the file, quaternions normalised.
+
+    Raises:
+      ValueError: as `read_terrainrl`, and for a looping clip whose displacement shall not
+        accumulate (`CycleSyncRootPos` false) or whose heading shall (`CycleSyncRootRot` true).
+      FileNotFoundError: if there is no such file.
+    """
+    path = pathlib.Path(path)
+    motion = _parse(path)
+    loop = motion.get('Loop', 'none')
+    if loop not in ('wrap', 'none'):
+        raise ValueError(f"{path}: Loop: 'wrap' or 'none' is needed, found {loop!r}")
+    looping = loop == 'wrap'
+    frames = _frames(path, motion)
+    if looping:
+        for field, served in (('CycleSyncRootPos', True), ('CycleSyncRootRot', False)):
+            if motion.get(field, served) is not served:
+                raise ValueError(f'{path}: {field}: {motion[field]!r} is not supported')
+        if not motion.get('CycleSyncRootHeight', False):
+            times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
+            gain = frames[-1, 2] - frames[0, 2]
+            frames[:, 2] -= gain * times / times[-1]
+    frames[:, [1, 3]] -= frames[0, [1, 3]]
+    return _clip(path, frames, joints, sizes, 'free', looping)
+
+
+def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
+    """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged."""
+    durations = np.append(np.diff(clip.times), 0.0)
+    n = len(clip.times)
+    frames = np.zeros((n, _HEADER + sum(clip.sizes)))
+    frames[:, 0] = durations
+    if clip.root == 'planar':
+        frames[:, [1, 2]] = clip.poses[:, :2]
+        frames[:, 4] = np.cos(clip.poses[:, 2] / 2)
+        frames[:, 7] = np.sin(clip.poses[:, 2] / 2)
+    else:
+        x, y, z = clip.poses[:, :3].T
+        frames[:, 1:4] = np.stack([x, z, -y], axis=1)
+        frames[:, 4:8] = _upright(clip.poses[:, 3:7])
+    frames[:, _HEADER:] = clip.poses[:, 3 if clip.root == 'planar' else 7 :]
+    for column in _balls(clip.sizes):
+        here = slice(column, column + 4)
+        frames[:, here] = _upright(frames[:, here])
+    rows = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
+    text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{rows}\n]\n}}\n'
+    path = pathlib.Path(path)
+    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    try:
+        part.write_text(text)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _parse(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        motion = json.loads(path.read_text(encoding='utf-8'))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f'{path}: not JSON: {error}') from None
+    if not isinstance(motion, dict):
+        raise ValueError(f'{path}: an object with Frames is needed')
+    return motion
+
+
+def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
+    """Returns the frames as an array, (n, length), every number finite and every duration > 0."""
+    frames = motion.get('Frames')
+    if not isinstance(frames, list):
+        raise ValueError(f'{path}: Frames: an array of frames is needed')
+    if len(frames) < 2:
+        raise ValueError(f'{path}: Frames: at least 2 are needed, found {len(frames)}')
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, list):
+            raise ValueError(f'{path}: frame {i}: an array of numbers is needed')
+        if len(frame) != len(frames[0]):
+            raise ValueError(
+                f'{path}: frame {i} has {len(frame)} numbers, frame 0 has {len(frames[0])}'
+            )
+        for j, value in enumerate(frame):
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (number and abs(value) < _LARGEST):  # false for NaN, too
+                raise ValueError(f'{path}: frame {i}, {_field(j)}: {value!r} is no finite number')
+    if len(frames[0]) < _HEADER:
+        raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
+    array = np.array(frames, dtype=float)
+    for i in np.flatnonzero(array[:-1, 0] <= 0):
+        raise ValueError(f'{path}: frame {i}, duration: {array[i, 0]:g} s is not positive')
+    return array
+
+
+def _field(column: int, joints: Sequence[str] = (), sizes: Sequence[int] = ()) -> str:
+    """Names a column of a frame."""
+    if column < _HEADER:
+        return 'duration' if column == 0 else 'root position' if column < 4 else 'root quaternion'
+    for joint, size in zip(joints, sizes, strict=True):
+        if column < _HEADER + size:
+            return f'joint {joint!r}'
+        column -= size
+    return f'column {column}'
+
+
+def _balls(sizes: Sequence[int]) -> Iterator[int]:
+    """Yields the first column of every ball joint of a frame."""
+    column = _HEADER
+    for size in sizes:
+        if size == 4:
+            yield column
+        column += size
+
+
+def _upright(q: np.ndarray) -> np.ndarray:
+    """Returns quaternions of our frame in the files' frame: (x, y, z) -> (x, z, -y)."""
+    return q[:, [0, 1, 3, 2]] * np.array([1, 1, 1, -1])
+
+
+def _lying(q: np.ndarray) -> np.ndarray:
+    """Returns quaternions of the files' frame in ours: (x, y, z) -> (x, -z, y)."""
+    return q[:, [0, 1, 3, 2]] * np.array([1, 1, -1, 1])
+
+
+def _clip(
+    path: pathlib.Path,
+    frames: np.ndarray,
+    joints: Sequence[str],
+    sizes: Sequence[int],
+    root: str,
+    loop: bool,
+) -> Clip:
+    """Returns frames of a file as a clip."""
+    joints, sizes = tuple(joints), tuple(sizes)
+    if len(joints) != len(sizes) or not set(sizes) <= set(JOINT_SIZES):
+        raise ValueError(f'{len(joints)} joints with sizes {sizes}: one of {JOINT_SIZES} is needed')
+    length = _HEADER + sum(sizes)
+    if frames.shape[1] != length:
+        raise ValueError(
+            f'{path}: frame 0 has {frames.shape[1]} numbers, the layout of {len(joints)} joints '
+            f'needs {length}'
+        )
+    for column in (4, *_balls(sizes)):
+        here = slice(column, column + 4)
+        norms = np.linalg.norm(frames[:, here], axis=1)
+        for i in np.flatnonzero(norms < _ZERO):
+            field = _field(column, joints, sizes)
+            raise ValueError(f'{path}: frame {i}, {field}: the quaternion is zero')
+        frames[:, here] /= norms[:, None]
+    times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
+    balls = list(_balls(sizes))
+    for column in balls:
+        frames[:, column : column + 4] = _lying(frames[:, column : column + 4])
+    if root == 'planar':
+        position, rotation = np.abs(frames[:, 3]), np.abs(frames[:, [5, 6]]).max(axis=1)
+        for field, off in (('root position', position), ('root quaternion', rotation)):
+            for i in np.flatnonzero(off > _FLAT):
+                raise ValueError(f'{path}: frame {i}, {field}: leaves the plane by {off[i]:g}')
+        # A quaternion and its negative are the same rotation: unwrap the full angle, not half.
+        pitch = np.unwrap(2 * np.arctan2(frames[:, 7], frames[:, 4]))
+        pitch -= 2 * np.pi * np.round(pitch[0] / (2 * np.pi))
+        head = np.column_stack([frames[:, [1, 2]], pitch])
+    else:
+        x, y, z = frames[:, 1:4].T
+        head = np.column_stack([x, -z, y, _lying(frames[:, 4:8])])
+    poses = np.concatenate([head, frames[:, _HEADER:]], axis=1)
+    return Clip(path.stem, times, poses, root, joints, sizes, loop, f'read from {path.name}')

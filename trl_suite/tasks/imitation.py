@@ -7,6 +7,7 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
-from trl_suite.tasks.reference import Reference, link_velocities
+from trl_suite.tasks.reference import Reference
 from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive
 from trl_suite.terrain import Strip
 from trl_suite.world import World
@@ -28,6 +29,9 @@ VIEW_AHEAD = 3.0  # m; where it ends
 CLEARANCE = 0.001  # m; left under every link at the start
 PHASE_BINS = 4
 _BINS = np.arange(PHASE_BINS)
+_CROSS = np.array([1.0, -1.0])  # v = w x r in the x-z plane: (w z, -w x) for w about +y
+# Features of the reference that the reward compares, in the order of its terms.
+_COMPARED = ('angles', 'rates', 'effectors', 'com_velocity', 'height')
 CENTRES = ('clip', 'posture', 'original')  # of position control
 
 
@@ -121,7 +125,8 @@ class Imitation(Task):
             'phase': 0 if target else 1 + PHASE_BINS,
             'target': 4 * links + 1 if target else 0,
         })
-        self._samples = np.linspace(-VIEW_BEHIND, VIEW_AHEAD, terrain_samples)
+        # The last sample is the ground under the root, from which all heights are measured.
+        self._samples = np.append(np.linspace(-VIEW_BEHIND, VIEW_AHEAD, terrain_samples), 0.0)
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
         self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])
 
@@ -160,56 +165,107 @@ class Imitation(Task):
     def bind(self, world: World) -> None:
         self.world = world
         self.arena.bind(world)
-        row, model = self.character.row, self.character.mjcf_model
-        scope = f'{model.model}/'
-        self._root_qpos, self._root_dof = world.joint_addresses(
-            [f'{scope}{joint}/' for joint in ('root_x', 'root_z', 'root_pitch')]
+        row = self.character.row
+        scope = f'{self.character.mjcf_model.model}/'
+        root = world.joint_addresses([f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')])
+        joints = world.joint_addresses([j.full_identifier for j in self.character.joints])
+        self._pose_qpos, self._pose_dof = (
+            np.concatenate(addresses) for addresses in zip(root, joints, strict=True)
         )
-        self._joint_qpos, self._joint_dof = world.joint_addresses(
-            [joint.full_identifier for joint in self.character.joints]
-        )
-        self._links = world.body_ids([body.full_identifier for body in self.character.bodies])
-        self._effectors = world.body_ids(
-            [body.full_identifier for body in self.character.end_effectors]
-        )
-        self._geoms = world.geom_ids(
-            [geom.full_identifier for geom in self.character.collision_geoms]
-        )
-        self._controls = world.control_addresses([scope + name for name in self.action_map.names])
-        self._fall = world.sensor_addresses(self._fall_sensors)
-        # Links' mass share; the reward's weights of root and joints.
-        mass = world.models[0].body_mass[self._links]
-        self._share = mass / mass.sum()
-        self._root_weight = row.weights[0]
-        self._joint_weights_twice = np.tile(row.weights[1:], 2)  # of angles, then of rates
+        links = world.body_ids([body.full_identifier for body in self.character.bodies])
+        effectors = world.body_ids([b.full_identifier for b in self.character.end_effectors])
+        self._geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
+        controls = world.control_addresses([scope + name for name in self.action_map.names])
+        self._controls = consecutive_or_array(controls)
+        # Added one after the other: a slice of sensordata.
+        falls = world.sensor_addresses(self._fall_sensors)
+        self._fall = slice(int(falls[0]), int(falls[-1]) + 1)
         self.reference = Reference(
-            self.clip, world.models[0], self._root_qpos, self._root_dof, self._joint_qpos,
-            self._joint_dof, self._links, self._effectors,
-        )  # fmt: skip
-
+            self.clip, world.models[0], self._pose_qpos, self._pose_dof, links, effectors
+        )
         columns = self.reference.columns
+        self._phase_step = self.control_timestep / self.reference.period
         self._target_columns = slice(columns['height'].start, columns['velocities'].stop)
+
+        # Within the loop, bodies and joints stand in the engine's order, so that all of a
+        # character is one slice of every array; only the observation is put into link order.
+        self._bodies = bodies = slice(int(links.min()), int(links.max()) + 1)
+        order = links - bodies.start
+        self._link_order = None if (order == np.arange(len(links))).all() else order
+        self._effector_bodies = effectors - bodies.start
+        mass = world.models[0].body_mass[bodies, None]
+        self._share = mass / mass.sum()
+        # Weights of the squared differences of what the reward compares.
+        weights = row.weights[np.argsort(self._pose_qpos[2:])]
+        count = len(effectors)
+        self._weights = np.concatenate([
+            weights, weights, np.full(2 * count, 1 / count), [rewards.COM_ERROR_FACTOR] * 2, [1.0],
+        ])  # fmt: skip
+        self._compared = {name: columns[name] for name in _COMPARED}
+        self._term_starts = np.array([part.start for part in self._compared.values()])
 
         n = world.n
         self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
         self.reward = np.zeros(n)
         self.reward_terms = np.zeros((n, len(rewards.IMITATION_TERMS)))
         self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
-        self._start_time = np.zeros(n)  # s; time of the clip at the start of the episode
-        self._steps = np.zeros(n, np.int64)
+        self.phase = np.zeros(n)  # of the clip, in [0, 1)
+        self._start_phases = np.zeros(n)
+        self._steps = np.zeros(n)
         # One ground query serves samples, root and end effectors.
-        self._ground_x = np.zeros((n, len(self._samples) + 1 + len(self._effectors)))
+        self._ground_x = np.zeros((n, len(self._samples) + count))
+        self._comparison = np.zeros((n, len(self._weights)))
+        self._all = self._views(slice(None))
 
-    @property
-    def clip_time(self) -> np.ndarray:
-        """Time on the clip that every simulation is at, s, shape (n,)."""
-        return self._start_time + self._steps * self.control_timestep
-
-    @property
-    def phase(self) -> np.ndarray:
-        """Phase of the clip in [0, 1), shape (n,)."""
-        cycles = self.clip_time / self.reference.period
-        return np.minimum(cycles - np.floor(cycles), np.nextafter(1, 0))
+    def _views(self, rows: slice) -> SimpleNamespace:
+        """The parts of all arrays that one observation of some rows reads and writes."""
+        world, blocks, bodies = self.world, self.blocks, self._bodies
+        angles, rates = (
+            slice(int(address[2:].min()), int(address[2:].max()) + 1)
+            for address in (self._pose_qpos, self._pose_dof)
+        )
+        x, z, pitch = self._pose_qpos[:3]
+        out = self.observation[rows]
+        pose = out[:, blocks['pose']]
+        shape = (len(out), bodies.stop - bodies.start, 2)
+        position, velocity = pose[:, 1:].reshape(shape), out[:, blocks['velocity']].reshape(shape)
+        permuted = self._link_order is not None
+        ground_x, compared = self._ground_x[rows], self._comparison[rows]
+        view = SimpleNamespace(
+            rows=rows,
+            root=world.qpos[rows, None, x : z + 1],
+            x=world.qpos[rows, x, None],
+            z=world.qpos[rows, z, None],
+            pitch=world.qpos[rows, pitch],
+            angles=world.qpos[rows, angles],
+            rates=world.qvel[rows, rates],
+            xpos=world.xpos[rows, bodies, ::2],
+            xipos=world.xipos[rows, bodies, ::2],
+            spin=world.cvel[rows, bodies, 1:2],
+            linear=world.cvel[rows, bodies, 3:6:2],
+            com=world.subtree_com[rows, bodies.start, None, ::2],
+            phase=self.phase[rows],
+            com_x=world.subtree_com[rows, bodies.start, :1],
+            ground_x=ground_x,
+            sample_x=ground_x[:, : len(self._samples)],
+            effector_x=ground_x[:, len(self._samples) :],
+            compared=compared,
+            **{f'compared_{name}': compared[:, part] for name, part in self._compared.items()},
+            height=pose[:, :1],
+            # Computed in the engine's order; out of place where the link order differs.
+            position=np.empty(shape) if permuted else position,
+            velocity=np.empty(shape) if permuted else velocity,
+            position_out=position,
+            velocity_out=velocity,
+            terrain=out[:, blocks.get('terrain', slice(0, 0))],
+            strain=out[:, blocks['strain']] if 'strain' in blocks else None,
+            tendons=world.ten_length[rows],
+            target=out[:, blocks['target']] if 'target' in blocks else None,
+            phase_out=out[:, blocks['phase']] if 'phase' in blocks else None,
+            fall=world.sensordata[rows, self._fall],
+        )
+        view.compared_effectors = view.compared_effectors.reshape(len(out), -1, 2)
+        return view
 
     def begin_episode(self, row: int, seed: np.random.SeedSequence) -> None:
         terrain_seed, start_seed = seed.spawn(2)
@@ -224,22 +280,22 @@ class Imitation(Task):
         )
         self.arena.begin_episode(row, strip)
 
-        world = self.world
+        world, rows = self.world, slice(row, row + 1)
         world.reset(row)
-        self._start_time[row], self._steps[row] = time[0], 0
+        self.phase[row] = self._start_phases[row] = phase
+        self._steps[row] = 0
         pose[0] = 0.0
-        rows = slice(row, row + 1)
         pose[1] += self.arena.height(np.zeros((1, 1)), rows)[0, 0]
-        world.qpos[row, self._root_qpos], world.qpos[row, self._joint_qpos] = pose[:3], pose[3:]
-        world.qvel[row, self._root_dof], world.qvel[row, self._joint_dof] = rate[:3], rate[3:]
+        world.qpos[row, self._pose_qpos] = pose
+        world.qvel[row, self._pose_dof] = rate
         world.forward(row)
         lift = self._penetration(row) + CLEARANCE
         if lift > 0:
-            world.qpos[row, self._root_qpos[1]] += lift
+            world.qpos[row, self._pose_qpos[1]] += lift
             world.forward(row)
         self.failed[row] = self.diverged[row] = False
         self.reward[row] = 0.0
-        self._observe(rows)
+        self._observe(self._all if world.n == 1 else self._views(rows))
 
     def _penetration(self, row: int) -> float:
         """How deep the lowest of the links' bounding boxes reaches below the ground, m."""
@@ -253,82 +309,79 @@ class Imitation(Task):
     def act(self, action: np.ndarray) -> None:
         self.world.ctrl[:, self._controls] = self.action_map.control(action)
         # Ground ahead is laid before the physics, so that its pictures are current after it.
-        self.arena.follow(self.world.qpos[:, self._root_qpos[0]])
+        self.arena.follow(self._all.x[:, 0])
 
     def finish_step(self) -> None:
-        world = self.world
+        v = self._all
         self._steps += 1
-        self.diverged[:] = world.diverged() | (
-            np.abs(world.qvel[:, self._joint_dof]).max(1) > MAX_JOINT_SPEED
-        )
-        fallen = (world.sensordata[:, self._fall] > 0).any(1)
-        np.logical_or(fallen, self.diverged, out=self.failed)
-        kept = self.observation[self.diverged]
-        self._observe(slice(None))
-        if len(kept):  # the last finite observation stands for what broke down
+        np.multiply(self._steps, self._phase_step, out=self.phase)
+        self.phase += self._start_phases
+        self.phase %= 1.0
+        fast = np.maximum.reduce(np.abs(v.rates), axis=1) > MAX_JOINT_SPEED
+        np.logical_or(self.world.diverged(), fast, out=self.diverged)
+        np.logical_or.reduce(v.fall, axis=1, out=self.failed)
+        self.failed |= self.diverged
+        # The last finite observation stands for what broke down.
+        kept = self.observation[self.diverged] if self.diverged.any() else None
+        self._observe(v)
+        if kept is not None:
             self.observation[self.diverged] = kept
         self.reward_terms[self.failed] = 0.0
-        np.sum(self.reward_terms, axis=1, out=self.reward)
+        np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
-    def _observe(self, rows: slice) -> None:
+    def _observe(self, v: SimpleNamespace) -> None:
         """Writes observation and reward terms of some rows from the world's state."""
-        world, column = self.world, self.reference.columns
-        qpos, qvel = world.qpos[rows], world.qvel[rows]
-        x, z, pitch = (qpos[:, address] for address in self._root_qpos)
-        facing = np.where(np.cos(pitch) >= 0, 1.0, -1.0)
-        xipos = world.xipos[rows][:, self._links]
-        centre = world.subtree_com[rows, self._links[0]]
-        effector = world.xpos[rows][:, self._effectors]
-        velocity = link_velocities(xipos, world.cvel[rows][:, self._links], centre)
+        # A trunk that points backwards looks backwards.
+        backwards = np.cos(v.pitch) < 0
+        facing = np.where(backwards, -1.0, 1.0) if backwards.any() else None
+        np.subtract(v.xipos, v.root, out=v.position)
+        # Spatial velocities are about the centre of mass of the whole tree.
+        np.multiply((v.xipos - v.com)[:, :, ::-1], v.spin, out=v.velocity)
+        v.velocity *= _CROSS
+        v.velocity += v.linear
 
-        samples = len(self._samples)
-        ground_x = self._ground_x[rows]
-        ground_x[:, :samples] = x[:, None] + facing[:, None] * self._samples
-        ground_x[:, samples] = x
-        ground_x[:, samples + 1 :] = effector[:, :, 0]
-        ground = self.arena.height(ground_x, rows)
-        under_root = ground[:, samples]
-        height = z - under_root
-
-        phase = self.phase[rows]
-        reference = self.reference.features(phase)
-        # Joints and pitch side by side, as the reference has them.
-        moving = np.concatenate([qpos[:, self._joint_qpos], qvel[:, self._joint_dof]], axis=1)
-        moving -= reference[:, : moving.shape[1]]
-        joints = moving.shape[1] // 2
-        moving *= moving
-        moving *= self._joint_weights_twice
-        pitch_error = rewards.wrap(pitch - reference[:, column['pitch'].start])
-        pitch_rate_error = qvel[:, self._root_dof[2]] - reference[:, column['pitch_rate'].start]
-        effector[:, :, 0] -= centre[:, :1] + reference[:, column['effector_x']]
-        effector[:, :, 2] -= ground[:, samples + 1 :] + reference[:, column['effector_z']]
-        com_error = (velocity * self._share[:, None]).sum(1) - reference[:, column['com_velocity']]
-        errors_ = np.empty((len(x), len(rewards.IMITATION_TERMS)))
-        errors_[:, 0] = self._root_weight * pitch_error**2 + moving[:, :joints].sum(1)
-        errors_[:, 1] = self._root_weight * pitch_rate_error**2 + moving[:, joints:].sum(1)
-        errors_[:, 2] = (effector[:, :, ::2] ** 2).sum((1, 2)) / len(self._effectors)
-        errors_[:, 3] = (height - reference[:, column['height'].start]) ** 2
-        errors_[:, 4] = rewards.COM_ERROR_FACTOR * (com_error**2).sum(1)
-        self.reward_terms[rows] = rewards.imitation(errors_)
-
-        out, blocks = self.observation[rows], self.blocks
+        samples = len(self._samples) - 1
+        effector = v.xpos[:, self._effector_bodies]
+        offsets = self._samples if facing is None else facing * self._samples
+        np.add(v.x, offsets, out=v.sample_x)
+        v.effector_x[...] = effector[:, :, 0]
+        ground = self.arena.height(v.ground_x, v.rows)
+        under_root = ground[:, samples, None]
+        np.subtract(v.z, under_root, out=v.height)
         if samples:
-            out[:, blocks['terrain']] = ground[:, :samples] - under_root[:, None]
-        pose = out[:, blocks['pose']]
-        pose[:, 0] = height
-        pose[:, 1::2] = (xipos[:, :, 0] - x[:, None]) * facing[:, None]
-        pose[:, 2::2] = xipos[:, :, 2] - z[:, None]
-        speed = out[:, blocks['velocity']]
-        speed[:, 0::2] = velocity[:, :, 0] * facing[:, None]
-        speed[:, 1::2] = velocity[:, :, 1]
-        if 'strain' in blocks:
-            out[:, blocks['strain']] = (world.ten_length[rows] - self._rest) / self._scale
-        if 'target' in blocks:
-            out[:, blocks['target']] = reference[:, self._target_columns]
+            np.subtract(ground[:, :samples], under_root, out=v.terrain)
+
+        # What the reward compares, side by side with the same features of the reference.
+        reference = self.reference.features(v.phase)
+        v.compared_angles[...] = v.angles
+        v.compared_rates[...] = v.rates
+        np.subtract(effector[:, :, 0], v.com_x, out=v.compared_effectors[:, :, 0])
+        np.subtract(effector[:, :, 1], ground[:, samples + 1 :], out=v.compared_effectors[:, :, 1])
+        np.add.reduce(v.velocity * self._share, axis=1, out=v.compared_com_velocity)
+        v.compared_height[...] = v.height
+        error = v.compared
+        error -= reference[:, : error.shape[1]]
+        error[:, 0] = rewards.wrap(error[:, 0])
+        error *= error
+        error *= self._weights
+        self.reward_terms[v.rows] = rewards.imitation(
+            np.add.reduceat(error, self._term_starts, axis=1)
+        )
+
+        if facing is not None:
+            v.position[:, :, 0] *= facing
+            v.velocity[:, :, 0] *= facing
+        if self._link_order is not None:
+            v.position_out[...] = v.position[:, self._link_order]
+            v.velocity_out[...] = v.velocity[:, self._link_order]
+        if v.strain is not None:
+            np.subtract(v.tendons, self._rest, out=v.strain)
+            v.strain /= self._scale
+        if v.target is not None:
+            v.target[...] = reference[:, self._target_columns]
         else:
-            bins = out[:, blocks['phase']]
-            bins[:, 0] = phase
-            bins[:, 1:] = (phase * PHASE_BINS).astype(np.int64)[:, None] == _BINS
+            v.phase_out[:, 0] = v.phase
+            np.equal(np.floor(v.phase * PHASE_BINS)[:, None], _BINS, out=v.phase_out[:, 1:])
 
     def info(self, row: int) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
@@ -337,7 +390,7 @@ class Imitation(Task):
             'reward_terms': {name: float(value) for name, value in terms},
             'fell': bool(self.failed[row] and not self.diverged[row]),
             'diverged': bool(self.diverged[row]),
-            'distance': float(self.world.qpos[row, self._root_qpos[0]]),
+            'distance': float(self.world.qpos[row, self._pose_qpos[0]]),
         }
 
     def clip_action(self, row: int) -> np.ndarray:
@@ -346,28 +399,31 @@ class Imitation(Task):
         Raises:
           ValueError: torque and muscle control have no such action.
         """
-        if self.actuation_model not in ('position', 'velocity'):
+        columns = {'position': 'joints', 'velocity': 'joint_rates'}
+        if self.actuation_model not in columns:
             raise ValueError(
                 f'{self.actuation_model} control cannot follow a clip open loop; position and '
                 'velocity control can'
             )
-        name = 'angles' if self.actuation_model == 'position' else 'rates'
-        features = self.reference.features(self.phase)[row]
-        return self.action_map.action(features[self.reference.columns[name]])
+        features = self.reference.features(self.phase[row : row + 1])[0]
+        control = features[self.reference.columns[columns[self.actuation_model]]]
+        return self.action_map.action(control)
 
     def reference_pose(self, row: int) -> np.ndarray:
         """Pose of the reference beside the simulated character: x, z, pitch, joints."""
-        pose = self.clip.pose(self.clip_time[row : row + 1])[0]
-        start = self.clip.pose(self._start_time[row : row + 1])[0]
-        pose[0] -= start[0]
+        start = self._start_phases[row] * self.reference.period
+        now = start + self._steps[row] * self.control_timestep
+        first, pose = self.clip.pose(np.array([start, now]))
+        pose[0] -= first[0]
         pose[1] += self.arena.height(np.full((1, 1), pose[0]), slice(row, row + 1))[0, 0]
         return pose
 
     def get_state(self, row: int) -> dict[str, Any]:
         return {
             'arena': self.arena.state(row),
-            'start_time': float(self._start_time[row]),
-            'steps': int(self._steps[row]),
+            'phase': float(self.phase[row]),
+            'start_phase': float(self._start_phases[row]),
+            'steps': float(self._steps[row]),
             'observation': self.observation[row].copy(),
             'reward': float(self.reward[row]),
             'reward_terms': self.reward_terms[row].copy(),
@@ -377,11 +433,20 @@ class Imitation(Task):
 
     def set_state(self, row: int, state: dict[str, Any]) -> None:
         self.arena.restore(row, state['arena'])
-        self._start_time[row], self._steps[row] = state['start_time'], state['steps']
+        self.phase[row], self._start_phases[row] = state['phase'], state['start_phase']
+        self._steps[row] = state['steps']
         self.observation[row] = state['observation']
         self.reward[row] = state['reward']
         self.reward_terms[row] = state['reward_terms']
         self.failed[row], self.diverged[row] = state['failed'], state['diverged']
+
+
+def consecutive_or_array(addresses: np.ndarray) -> slice | np.ndarray:
+    """Returns addresses as a slice where they follow each other: a view is cheaper than a copy."""
+    first, count = int(addresses[0]), len(addresses)
+    if (addresses == np.arange(first, first + count)).all():
+        return slice(first, first + count)
+    return addresses
 
 
 def position_range(

@@ -14,21 +14,20 @@ class Reference:
     """Kinematics of a looping planar clip, tabulated once over the phase.
 
     Features of one phase, all independent of the ground and of the distance walked; see `columns`:
-      angles (J,) rad, rates (J,) rad/s; pitch rad, pitch_rate rad/s; height of the root m;
+      angles (1 + J,) pitch and joint angles in the engine's order, rad; rates (1 + J,) rad/s;
+      effectors (2 * E,) end effectors: x ahead of the centre of mass, z above 0, m;
+      com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
-      effector_x (E,) end effectors ahead of the centre of mass, m; effector_z (E,) above 0, m;
-      com_velocity (2,) m/s.
+      joints (J,) joint angles in link order, rad; joint_rates (J,) rad/s.
     """
 
     def __init__(
         self,
         clip: Clip,
         model: mujoco.MjModel,
-        root_qpos: np.ndarray,
-        root_dof: np.ndarray,
-        joint_qpos: np.ndarray,
-        joint_dof: np.ndarray,
+        pose_qpos: np.ndarray,
+        pose_dof: np.ndarray,
         links: np.ndarray,
         effectors: np.ndarray,
     ) -> None:
@@ -37,45 +36,43 @@ class Reference:
         Args:
           clip: a looping clip with a planar root, its joints in link order.
           model: the compiled model of the character.
-          root_qpos: addresses in qpos of x, z and pitch; `root_dof` the same in qvel.
-          root_dof: see root_qpos.
-          joint_qpos: addresses of the joints in qpos, in link order; `joint_dof` in qvel.
-          joint_dof: see joint_qpos.
+          pose_qpos: addresses in qpos of x, z, pitch and the joints in link order.
+          pose_dof: the same in qvel.
           links: body ids in link order, the root body first.
           effectors: body ids of the end effectors.
         """
         self.clip = clip
         self.period = clip.duration
         data = mujoco.MjData(model)
-        qpos_address = np.concatenate([root_qpos, joint_qpos])
-        dof_address = np.concatenate([root_dof, joint_dof])
         times = np.arange(SAMPLES + 1) / SAMPLES * self.period
         poses, rates = clip.pose(times), clip.velocity(times)
         mass = model.body_mass[links]
         share = mass / mass.sum()
+        engine_order = 2 + np.argsort(pose_qpos[2:])
         rows = []
         for pose, rate in zip(poses, rates, strict=True):
-            data.qpos[qpos_address] = pose
-            data.qvel[dof_address] = rate
+            data.qpos[pose_qpos] = pose
+            data.qvel[pose_dof] = rate
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
-            centre = share @ data.xipos[links]
-            velocity = link_velocities(
-                data.xipos[None, links], data.cvel[None, links], data.subtree_com[None, links[0]]
-            )[0]
-            effector = data.xpos[effectors]
+            centres = data.xipos[links][:, ::2]
+            com = share @ centres
+            velocity = link_velocities(centres, data.cvel[links], data.subtree_com[links[0], ::2])
+            effector = data.xpos[effectors][:, ::2] - (com[0], 0)
             rows.append(
                 np.concatenate([
-                    pose[3:], rate[3:], pose[2:3], rate[2:3], pose[1:2],
-                    (data.xipos[links][:, [0, 2]] - pose[:2]).ravel(), velocity.ravel(),
-                    effector[:, 0] - centre[0], effector[:, 2], share @ velocity,
+                    pose[engine_order], rate[engine_order], effector.ravel(), share @ velocity,
+                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(), pose[3:], rate[3:],
                 ])
             )  # fmt: skip
-        self._table = np.array(rows)
-        joints, bodies, ends = len(joint_qpos), 2 * len(links), len(effectors)
+        table = np.array(rows)
+        # Each row beside its step to the next: one look-up serves an interpolation.
+        self._table = np.concatenate([table[:-1], np.diff(table, axis=0)], axis=1)
+        self._width = table.shape[1]
+        joints, bodies = len(links) - 1, 2 * len(links)
         sizes = dict(
-            angles=joints, rates=joints, pitch=1, pitch_rate=1, height=1, positions=bodies,
-            velocities=bodies, effector_x=ends, effector_z=ends, com_velocity=2,
+            angles=joints + 1, rates=joints + 1, effectors=2 * len(effectors), com_velocity=2,
+            height=1, positions=bodies, velocities=bodies, joints=joints, joint_rates=joints,
         )  # fmt: skip
         stops = np.cumsum(list(sizes.values()))
         self.columns = {
@@ -87,23 +84,23 @@ class Reference:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
         u = phase * SAMPLES
         i = u.astype(np.int64)
-        low = self._table[i]
-        return low + (u - i)[:, None] * (self._table[i + 1] - low)
+        found = self._table[i]
+        step = found[:, self._width :]
+        step *= (u - i)[:, None]
+        step += found[:, : self._width]
+        return step
 
 
-def link_velocities(xipos: np.ndarray, cvel: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def link_velocities(centres: np.ndarray, cvel: np.ndarray, about: np.ndarray) -> np.ndarray:
     """Velocities of link centres in the x-z plane.
 
     Args:
-      xipos: link centres, m, shape (n, links, 3).
-      cvel: spatial velocities (angular, linear) about `centre`, shape (n, links, 6).
-      centre: centre of mass of the whole tree, where MuJoCo keeps cvel, m, shape (n, 3).
+      centres: link centres, x and z, m, shape (links, 2).
+      cvel: spatial velocities (angular, linear) about `about`, shape (links, 6).
+      about: centre of mass of the whole tree, where MuJoCo keeps cvel, x and z, m.
 
     Returns:
-      Velocities in x and z, m/s, shape (n, links, 2).
+      Velocities in x and z, m/s, shape (links, 2).
     """
-    velocity = cvel[:, :, 3:6:2].copy()
-    spin = cvel[:, :, 1]
-    velocity[:, :, 0] += spin * (xipos[:, :, 2] - centre[:, None, 2])
-    velocity[:, :, 1] -= spin * (xipos[:, :, 0] - centre[:, None, 0])
-    return velocity
+    offset = (centres - about)[:, ::-1] * (1, -1)
+    return cvel[:, 3:6:2] + cvel[:, 1:2] * offset

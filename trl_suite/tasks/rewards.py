@@ -11,8 +11,8 @@ IMITATION_TERMS: dict[str, tuple[float, float]] = {
     'pose': (0.5, 2.0),
     'velocity': (0.05, 0.005),
     'end_effector': (0.15, 40.0),
-    'root': (0.1, 10.0),
     'com': (0.2, 10.0),
+    'root': (0.1, 10.0),
 }
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
@@ -25,8 +25,8 @@ def imitation(errors: np.ndarray) -> np.ndarray:
 
     Args:
       errors: squared errors, shape (n, 5), in the order of `IMITATION_TERMS`: normalised-weight
-        sums over joints (and root) of rad^2 and of rad^2/s^2; mean over end effectors of m^2; root
-        height in m^2; 0.1 times the centre-of-mass velocity error in m^2/s^2.
+        sums over joints (and root) of rad^2 and of rad^2/s^2; mean over end effectors of m^2; 0.1
+        times the centre-of-mass velocity error in m^2/s^2; root height in m^2.
 
     Returns:
       Shape (n, 5); their sum is the reward, at most 1.

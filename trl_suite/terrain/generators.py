@@ -13,7 +13,7 @@ overshoots by up to one feature. Two primitives make all features:
 The processes are those of the terrain generator of the original (Terrain RL Simulator, 2018);
 equality is in distribution, not draw by draw. New generators join through `register`:
 
-    @register('var2d_saw', ToothW=1.0, ToothHMin=0.1, ToothHMax=0.2)
+    @register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
     def saw(parameters, length, rng):
         cells = math.ceil(parameters['ToothW'] / SPACING)
         teeth = math.ceil(length / SPACING / cells)
@@ -28,7 +28,7 @@ import dataclasses
 import math
 import numbers
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +85,7 @@ class Profile:
 
 
 Parameters = Mapping[str, float]
+_NONE: Parameters = types.MappingProxyType({})
 Function = Callable[[Parameters, float, np.random.Generator], Profile]
 
 
@@ -100,7 +101,7 @@ GENERATORS: Mapping[str, Generator] = types.MappingProxyType(_generators)
 
 
 def check(
-    where: str, values: Mapping[str, object], defaults: Parameters = types.MappingProxyType({})
+    where: str, values: Mapping[str, object], defaults: Parameters = _NONE
 ) -> dict[str, float]:
     """Returns parameter values as floats.
 
@@ -129,23 +130,23 @@ def check(
     for key in complete:
         top = key.removesuffix('Min') + 'Max'
         if key.endswith('Min') and complete[key] > complete.get(top, math.inf):
-            low, high = (
+            bottom, top = (
                 f'{name} {complete[name]:g}{"" if name in checked else " (the default)"}'
                 for name in (key, top)
             )
-            raise ValueError(f'{where}: {low} is above {high}; a range runs from Min to Max')
+            raise ValueError(f'{where}: {bottom} is above {top}; a range runs from Min to Max')
     return checked
 
 
 def register(
-    type_name: str, /, *, replace: bool = False, **defaults: float
+    type_name: str, defaults: Parameters = _NONE, *, replace: bool = False
 ) -> Callable[[Function], Function]:
     """Decorates a function as the generator of a new terrain type.
 
     Args:
       type_name: the `Type` in terrain files.
+      defaults: the names of all its parameters, with their defaults.
       replace: whether an existing type of that name may be replaced.
-      **defaults: the names of all its parameters, with their defaults.
 
     Raises:
       ValueError: the name is taken, or a default makes no sense (see `check`).
@@ -335,7 +336,7 @@ def flat(parameters: Parameters, length: float, rng: np.random.Generator) -> Pro
     return Profile(np.zeros(count), np.zeros(count, dtype=bool))
 
 
-@register('var2d_bumps', **BUMPS)
+@register('var2d_bumps', BUMPS)
 def bumps(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Level ground with white noise: every vertex but the last is moved up or down."""
     profile = flat(parameters, length, rng)
@@ -345,33 +346,32 @@ def bumps(parameters: Parameters, length: float, rng: np.random.Generator) -> Pr
     return profile
 
 
-@register('var2d_slopes', **SLOPES)
+@register('var2d_slopes', SLOPES)
 def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Rolling ground."""
     return _sloped(flat(parameters, length, rng), parameters, rng)
 
 
-@register('var2d_cliffs', **CLIFFS)
+@register('var2d_cliffs', CLIFFS)
 def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Tall risers broken by ledges."""
     return _repeat(_cliff, parameters, length, rng)
 
 
-def _register_feature(name: str, feature: Feature, defaults: Sequence[Parameters]) -> None:
+def _register_feature(name: str, feature: Feature, defaults: Parameters) -> None:
     """Registers a feature twice: on level ground and on rolling ground."""
-    merged = {key: value for part in defaults for key, value in part.items()}
 
-    @register(f'var2d_{name}', **merged)
+    @register(f'var2d_{name}', defaults)
     def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _repeat(feature, parameters, length, rng)
 
-    @register(f'var2d_slopes_{name}', **merged, **SLOPES)
+    @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
     def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _sloped(level(parameters, length, rng), parameters, rng)
 
 
-_register_feature('gaps', _gap, [GAPS])
-_register_feature('walls', _wall, [WALLS])
-_register_feature('steps', _step, [STEPS])
-_register_feature('mixed', _mixed, [GAPS, WALLS, STEPS])
-_register_feature('narrow_gaps', _narrow_gaps, [NARROW_GAPS])
+_register_feature('gaps', _gap, GAPS)
+_register_feature('walls', _wall, WALLS)
+_register_feature('steps', _step, STEPS)
+_register_feature('mixed', _mixed, {**GAPS, **WALLS, **STEPS})
+_register_feature('narrow_gaps', _narrow_gaps, NARROW_GAPS)

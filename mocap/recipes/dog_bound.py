@@ -1,0 +1,173 @@
+"""The dog's bound: its gait machine recorded in MuJoCo, then the feet set down without sliding.
+
+The gait machine is the original's, with its default figures: four states, stable PD control,
+gravity compensation through the feet on the ground, and forces pushed into the ground. The cycle
+is the median of many; the recording overruns two joint limits and slips a little, so each leg is
+then solved again for a foot that rolls without slipping, within the limits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import figure
+import mujoco
+import numpy as np
+from scipy import optimize
+
+from trl_suite.motion.clip import Clip
+
+CONTROL = 1 / 600  # s
+SUBSTEPS = 5  # physics at 3000 Hz
+SECONDS = 20.0
+GRAVITY = 9.8  # m/s2, of the gravity compensation
+
+JOINTS = (
+    *('spine0', 'spine1', 'spine2', 'spine3', 'torso', 'neck0', 'neck1', 'head'),
+    *('tail0', 'tail1', 'tail2', 'tail3'),
+    *('shoulder', 'elbow', 'wrist', 'finger', 'hip', 'knee', 'ankle', 'toe'),
+)
+SPINE = JOINTS[:5]
+FRONT, HIND = JOINTS[12:16], JOINTS[16:]
+# Kp N m/rad, Kd N m s/rad, target rad, in the order of JOINTS.
+KP = (*(200,) * 5, *(50,) * 3, *(4,) * 4, 160, 80, 80, 80, 130, 50, 50, 50)
+KD = (*(20,) * 5, *(5,) * 3, *(0.4,) * 4, 16, 8, 8, 8, 13, 5, 5, 5)
+TARGET = (
+    *(0.0,) * 5,
+    *(0.68507, 0.2, 0.20456, 0.4, 0.2, 0.2, 0.2),
+    *(-0.5224, 0.87117, 0.11488, -0.46365),
+    *(0.61719, -1.31193, 1.32022, -0.62549),
+)
+WORLD = ('shoulder', 'hip')  # joints whose target is the pitch of the link in the world
+
+# The bound: duration of the stances s, velocity feedback s/m, forces on the body N.
+STANCE = 0.125
+FEEDBACK = 0.014184
+BACK_FORCE = np.array([378.334188, 408.983406])
+FRONT_FORCE = np.array([449.223161, 14.581642])
+STATES = (  # spine, shoulder, elbow, hip, knee, ankle: target angles, rad
+    (-0.112436, -2.992142, 6.511997, -0.322121, -1.353893, 0.992232),  # back stance
+    (0.033595, 0.466324, 0.374654, 1.330918, -3.087531, 2.393892),  # extend
+    (-0.09348, -1.514667, 0.664715, 0.727145, -1.679779, 1.315872),  # front stance
+    (-0.110882, -1.252001, 1.111638, 0.744034, -2.18498, 0.930373),  # gather
+)
+STATE_JOINTS = ('shoulder', 'elbow', 'hip', 'knee', 'ankle')
+
+
+class Recorder:
+    """The dog on a plane under its gait machine; `step` advances one control step."""
+
+    def __init__(self) -> None:
+        self.model = model = figure.model('dog', ground=True)
+        model.opt.timestep = CONTROL / SUBSTEPS
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        colliding = model.geom_conaffinity > 0
+        model.geom_conaffinity[colliding] = 1  # with the ground only, not with itself
+        model.jnt_solref[:] = (0.005, 1)  # limits
+        self.data = mujoco.MjData(model)
+        self.dof = np.array([model.joint(name).dofadr[0] for name in JOINTS])
+        self.limit = np.array([model.jnt_actfrcrange[model.joint(name).id, 1] for name in JOINTS])
+        self.kp, self.kd = np.zeros(model.nv), np.zeros(model.nv)
+        self.kp[self.dof], self.kd[self.dof] = KP, KD
+        self.target = np.zeros(model.nv)
+        self.target[self.dof] = TARGET
+        self.feet = [model.geom(name).id for name in ('toe', 'finger')]
+        self.state, self.phase = 3, 1.0
+        self.started = self.new_cycle = False
+
+    def touching(self) -> tuple[bool, bool]:
+        """Returns whether toe and finger are on the ground."""
+        toe, finger = (bool(np.any(self.data.contact.geom == foot)) for foot in self.feet)
+        return toe, finger
+
+    def step(self) -> None:
+        """Advances the physics with the torques held, then computes the next ones."""
+        for _ in range(SUBSTEPS):
+            mujoco.mj_step(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+        toe, finger = self.touching()
+        self._advance(toe, finger)
+        torque = self._pd(toe, finger)
+        jacobians = [self._foot_jacobian(geom) for geom in self.feet]
+        if toe or finger:
+            torque += self._gravity_compensation(jacobians, (toe, finger))
+        for limb, foot, on, force, states in (
+            (HIND, 0, toe, BACK_FORCE, (0, 1)),
+            (FRONT, 1, finger, FRONT_FORCE, (2, 3)),
+        ):
+            if on and self.state in states:
+                dofs = [self.model.joint(name).dofadr[0] for name in limb]
+                torque[dofs] -= (jacobians[foot].T @ force)[dofs]
+        self.data.qfrc_applied[self.dof] = np.clip(torque[self.dof], -self.limit, self.limit)
+
+    def _advance(self, toe: bool, finger: bool) -> None:
+        self.phase += CONTROL / STANCE
+        ends = (self.phase >= 1, finger, self.phase >= 1, toe)
+        self.new_cycle = False
+        if not self.started or ends[self.state]:
+            self.state = (self.state + 1) % 4
+            self.new_cycle = self.state == 0
+            self.started, self.phase = True, 0.0
+            spine, *angles = STATES[self.state]
+            for name in SPINE:
+                self.target[self.model.joint(name).dofadr[0]] = spine
+            for name, angle in zip(STATE_JOINTS, angles, strict=True):
+                self.target[self.model.joint(name).dofadr[0]] = angle
+        mujoco.mj_subtreeVel(self.model, self.data)
+        forward = self.data.subtree_linvel[self.model.body('root').id][0]
+        for name, on in (('hip', toe), ('shoulder', finger)):
+            if not on:
+                angle = STATES[self.state][1 + STATE_JOINTS.index(name)]
+                self.target[self.model.joint(name).dofadr[0]] = angle + FEEDBACK * forward
+
+    def _pd(self, toe: bool, finger: bool) -> np.ndarray:
+        model, data = self.model, self.data
+        target = self.target.copy()
+        for name in WORLD:
+            dof = model.joint(name).dofadr[0]
+            frame = data.xmat[model.body(name).id].reshape(3, 3)
+            target[dof] -= np.arctan2(frame[2, 0], frame[0, 0]) - data.qpos[dof]
+        mass = np.empty((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
+        v = data.qvel
+        pull = self.kp * (target - data.qpos - CONTROL * v)
+        acceleration = np.linalg.solve(
+            mass + CONTROL * np.diag(self.kd), pull - self.kd * v - data.qfrc_bias
+        )
+        torque = pull - self.kd * (v + CONTROL * acceleration)
+        torque[:3] = 0
+        return torque
+
+    def _foot_jacobian(self, geom: int) -> np.ndarray:
+        """Returns the Jacobian (x and z, nv) of the middle of a foot's sole."""
+        model, data = self.model, self.data
+        frame = data.geom_xmat[geom].reshape(3, 3)
+        point = data.geom_xpos[geom] - frame[:, 2] * model.geom_size[geom, 2]
+        jacobian = np.empty((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, point, model.geom_bodyid[geom])
+        return jacobian[[0, 2]]
+
+    def _gravity_compensation(self, jacobians, on) -> np.ndarray:
+        model, data = self.model, self.data
+        weight = np.zeros(model.nv)
+        jacobian = np.empty((3, model.nv))
+        for body in range(1, model.nbody):
+            mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+            weight -= GRAVITY * model.body_mass[body] * jacobian[2]
+        feet = np.concatenate([j.T * touch for j, touch in zip(jacobians, on, strict=True)], 1)
+        a = feet[:3]
+        force = np.linalg.solve(a.T @ a + 1e-4 * np.eye(4), -a.T @ weight[:3])
+        torque = -weight - feet @ force
+        torque[:3] = 0
+        return torque
+
+
+# A start from which the bound settles: hind feet about to land, the trunk turning down.
+START = (
+    *(0.0, 0.345, 0.76),
+    *(-0.317, 0.014, -0.01, -0.006, -0.001, 0.41, 0.364, 0.187),
+    *(-0.728, -0.187, -0.165, 0.035),
+    *(-1.57, 0.488, 0.518, -0.843, 0.449, -2.476, 1.609, -0.343),
+)
+START_SPEED = 5.5

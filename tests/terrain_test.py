@@ -1,0 +1,747 @@
+"""Tests of trl_suite.terrain: figures from the papers and from the original's description."""
+
+import copy
+import json
+import math
+import pathlib
+import pickle
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import terrain
+from trl_suite.terrain import generators
+
+# The example printed in the paper.
+PAPER = """
+{
+  "Type": "var2d_slopes_mixed",
+  "Params": [
+    {
+      "GapSpacingMin": 3, "GapSpacingMax": 4, "GapWMin": 0.3, "GapWMax": 0.5,
+      "GapHMin": -2, "GapHMax": -2,
+      "WallSpacingMin": 3, "WallSpacingMax": 4, "WallWMin": 0.2, "WallWMax": 0.2,
+      "WallHMin": 0.25, "WallHMax": 0.4,
+      "StepSpacingMin": 3, "StepSpacingMax": 4, "StepH0Min": 0.1, "StepH0Max": 0.3,
+      "StepH1Min": -0.3, "StepH1Max": -0.1,
+      "SlopeDeltaRange": 0.05, "SlopeDeltaMin": -0.5, "SlopeDeltaMax": 0.5
+    }
+  ]
+}
+"""
+
+
+def draw(source, length=20.0, seed=0):
+    ground = terrain.load(source)
+    rng = np.random.default_rng(seed)
+    return generators.draw(ground.type, ground.parameters(), length, rng)
+
+
+def planar(kind, **parameters):
+    return {'Type': f'var2d_{kind}', 'Params': [parameters]}
+
+
+def runs(profile):
+    """Returns (vertices, height) of the level runs of the ground, its first vertex included."""
+    heights = np.concatenate(([0.0], profile.heights))
+    starts = np.flatnonzero(np.diff(heights, prepend=np.nan) != 0)
+    return np.diff(np.append(starts, len(heights))), heights[starts]
+
+
+def slopes(profile):
+    return np.diff(profile.heights, prepend=0.0) / 0.025
+
+
+class ProcessTest(parameterized.TestCase):
+    """What the generators make."""
+
+    def assert_uniform(self, values, low, high):
+        """Asserts that values could be draws from U(low, high)."""
+        values = np.asarray(values)
+        self.assertGreater(len(values), 300)
+        self.assertBetween(values.min(), low - 1e-9, low + 0.05 * (high - low) + 1e-9)
+        self.assertBetween(values.max(), high - 0.05 * (high - low) - 1e-9, high + 1e-9)
+        deviation = (high - low) / math.sqrt(12 * len(values))
+        self.assertAlmostEqual(values.mean(), (low + high) / 2, delta=4 * deviation + 1e-9)
+
+    def assert_lengths(self, counts, low, high):
+        """Asserts that counts of cells could be lengths from U(low, high) m, rounded up."""
+        low, high = low / 0.025, high / 0.025
+        lowest = math.floor(low + 1e-6) + 1 + 0.05 * (high - low)
+        self.assertBetween(np.min(counts), low, lowest)
+        self.assertBetween(np.max(counts), high - 0.05 * (high - low), math.ceil(high - 1e-6))
+        deviation = (high - low) / math.sqrt(12 * len(counts))
+        self.assertAlmostEqual(np.mean(counts) - 0.5, (low + high) / 2, delta=4 * deviation)
+
+    def test_spacing(self):
+        self.assertEqual(terrain.SPACING, 0.025)
+
+    def test_box_of_wall(self):
+        # A wall of 0.2 m is 8 vertices: crest 0.175 m, foot 0.225 m; the ground stays at 0.
+        wall = planar('walls', WallSpacingMin=1, WallSpacingMax=1, WallHMin=0.3, WallHMax=0.3)
+        profile = draw(wall, 5.0)
+        counts, levels = runs(profile)
+        # 40 cells of spacing, then 8 vertices of wall, then 1 + 40 vertices.
+        np.testing.assert_array_equal(counts[:4], [41, 8, 41, 8])
+        np.testing.assert_array_equal(levels[:4], [0, 0.3, 0, 0.3])
+        faces = np.flatnonzero(profile.vertical)  # of cells
+        np.testing.assert_array_equal(faces[:4] - 40, [0, 8, 49, 57])
+        self.assertEqual(profile.heights[-1], 0)
+
+    def test_rise_accumulates(self):
+        step = planar('steps', StepSpacingMin=0.5, StepSpacingMax=0.5, StepH0Min=0.1,
+                      StepH0Max=0.1, StepH1Min=0.1, StepH1Max=0.1)  # fmt: skip
+        profile = draw(step, 2.1)
+        counts, levels = runs(profile)
+        # Tread and riser take 21 cells; four of them reach 84 = 2.1 m.
+        np.testing.assert_array_equal(counts, [21, 21, 21, 21, 1])
+        np.testing.assert_allclose(levels, [0, 0.1, 0.2, 0.3, 0.4], atol=1e-12)
+        np.testing.assert_array_equal(np.flatnonzero(profile.vertical), [20, 41, 62, 83])
+
+    @parameterized.parameters(
+        (0.2, 8), (0.3, 12), (0.55, 22), (0.7, 28), (0.1 + 0.2, 12), (0.21, 9), (0.0, 0)
+    )
+    def test_cells(self, length, count):
+        self.assertEqual(generators.cells(length), count)
+
+    @parameterized.parameters(*sorted(terrain.GENERATORS))
+    def test_length(self, kind):
+        # At least the length asked for, longer by less than a feature.
+        longest_feature = {'narrow_gaps': 10.0}
+        name = kind.removeprefix('var2d_').removeprefix('slopes_')
+        for seed in range(10):
+            length = len(draw({'Type': kind}, 20.0, seed).heights) * 0.025
+            self.assertBetween(length, 20.0 - 1e-9, 20.0 + longest_feature.get(name, 9.1))
+
+    def test_length_of_level_ground(self):
+        for kind in ('flat', 'bumps', 'slopes'):
+            self.assertLen(draw(planar(kind)).heights, 800)
+
+    def test_gaps(self):
+        counts, levels = runs(draw('gaps', 10_000.0))
+        floor = levels < 0
+        np.testing.assert_array_equal(levels[floor], -2)
+        np.testing.assert_array_equal(levels[~floor], 0)
+        self.assert_lengths(counts[floor], 0.5, 2)
+        # Between two gaps: the vertex after the gap, and the spacing.
+        self.assert_lengths(counts[~floor][:-1] - 1, 4, 7)
+
+    def test_depth_of_gaps(self):
+        _, levels = runs(draw('gaps_hopper', 5_000.0))
+        self.assert_uniform(levels[levels < 0], -2.5, -2)
+
+    def test_walls(self):
+        counts, levels = runs(draw('walls_humanoid', 10_000.0))
+        crest = levels > 0
+        np.testing.assert_array_equal(counts[crest], 8)
+        self.assert_uniform(levels[crest], 0.05, 0.25)
+        self.assert_lengths(counts[~crest][:-1] - 1, 2, 4)
+
+    def test_steps_go_up_as_often_as_down(self):
+        counts, levels = runs(draw('steps', 10_000.0))
+        rises = np.diff(levels)
+        self.assert_uniform(rises[rises > 0], 0.1, 0.4)
+        self.assert_uniform(rises[rises < 0], -0.4, -0.1)
+        up = (rises > 0).mean()
+        self.assertAlmostEqual(up, 0.5, delta=4 * 0.5 / math.sqrt(len(rises)))
+        # A tread is the vertex of the riser and the spacing.
+        self.assert_lengths(counts[1:-1] - 1, 5, 7)
+
+    def test_steps_humanoid_only_ascend(self):
+        _, levels = runs(draw('steps_humanoid', 3_000.0))
+        rises = np.diff(levels)
+        self.assertBetween(rises.min(), 0.05 - 1e-9, 0.06)
+        self.assertBetween(rises.max(), 0.14, 0.15 + 1e-9)
+        # The second range is 0.1 to 0.15: the mean of both is 0.1125, the grade about 6 %.
+        self.assertAlmostEqual(rises.mean(), 0.1125, delta=0.004)
+        self.assertAlmostEqual(levels[-1] / 3_000, 0.06, delta=0.006)
+
+    def test_cliffs_humanoid_only_descend(self):
+        _, levels = runs(draw('cliffs_humanoid', 5_000.0))
+        self.assert_uniform(np.diff(levels), -1, -0.3)
+
+    @parameterized.parameters(
+        ((0.0, 0.0), (0.2, 0.3), 'up'),
+        ((-0.3, -0.2), (0.0, 0.0), 'down'),
+        ((0.0, 0.2), (-0.2, 0.0), 'both'),  # one end at 0 does not switch a range off
+    )
+    def test_rise_range(self, first, second, direction):
+        step = planar('steps', StepSpacingMin=0, StepSpacingMax=0, StepH0Min=first[0],
+                      StepH0Max=first[1], StepH1Min=second[0], StepH1Max=second[1])  # fmt: skip
+        rises = np.diff(draw(step).heights)
+        self.assertEqual({'up': {1}, 'down': {-1}, 'both': {-1, 1}}[direction], {*np.sign(rises)})
+
+    def test_both_rise_ranges_off(self):
+        off = planar('steps', StepH0Min=0, StepH0Max=0, StepH1Min=0, StepH1Max=0)
+        profile = draw(off)
+        np.testing.assert_array_equal(profile.heights, 0)
+        self.assertFalse(profile.vertical.any())
+
+    def test_stairs_grade(self):
+        self.assertAlmostEqual(draw('stairs', 2_000.0).heights[-1] / 2_000, 0.335, delta=0.02)
+
+    def test_narrow_gaps(self):
+        counts, levels = runs(draw('narrow_gaps', 20_000.0))
+        floor = levels < 0
+        np.testing.assert_array_equal(levels[floor], -2)
+        self.assert_lengths(counts[floor], 0.1, 0.5)
+        # Spacings are at least 3 m, stepping stones at most 0.4 m.
+        between = counts[~floor][:-1] - 1
+        stones = between[between < 40]
+        self.assert_lengths(stones, 0.15, 0.4)
+        self.assert_lengths(between[between > 40], 3, 6)
+        clusters = np.diff(np.append(np.flatnonzero(between > 40), len(between)))[:-1]
+        number, times = np.unique(clusters, return_counts=True)
+        np.testing.assert_array_equal(number, [1, 2, 3, 4])
+        np.testing.assert_allclose(times / times.sum(), 0.25, atol=0.03)
+
+    def test_count_of_narrow_gaps_is_truncated_and_at_least_one(self):
+        one = planar('narrow_gaps', NarrowGapCountMin=0, NarrowGapCountMax=1.9)
+        counts, levels = runs(draw(one, 2_000.0))
+        self.assertGreaterEqual(counts[levels == 0][:-1].min(), 3 / 0.025)
+
+    def test_cliffs_have_ledges(self):
+        profile = draw('cliffs_rugged', 20_000.0)
+        counts, levels = runs(profile)
+        rises = np.diff(levels)
+        self.assertGreater(rises.min(), 0)  # the first range only, and ledges lie in between
+        # A ledge is the vertex of its riser and 4 cells; a tread is at least 0.8 m.
+        treads = counts[1:-1] - 1
+        ledge = treads < 8
+        np.testing.assert_array_equal(treads[ledge], 4)
+        self.assert_lengths(treads[~ledge], 0.8, 1.0)
+        # Total rises are uniform, and have 1, 2 or 3 risers with equal frequency.
+        ends = np.append(np.flatnonzero(~ledge), len(ledge))
+        totals = np.diff(levels[ends + 1])
+        self.assert_uniform(totals, 0.2, 0.5)
+        number, times = np.unique(np.diff(ends), return_counts=True)
+        np.testing.assert_array_equal(number, [1, 2, 3])
+        np.testing.assert_allclose(times / times.sum(), 1 / 3, atol=0.02)
+        self.assertAlmostEqual(levels[-1] / 20_000, 0.34, delta=0.02)
+
+    def test_cliffs_are_level_between(self):
+        heights = draw(planar('cliffs')).heights
+        self.assertLess(len(np.unique(heights)), 10)
+
+    def test_mixed_thirds(self):
+        counts, levels = runs(draw('mixed_humanoid', 20_000.0))
+        rises = np.diff(levels)
+        gaps = np.count_nonzero(rises < -1)
+        walls = np.count_nonzero(counts[1:-1] == 8)
+        steps = len(rises) - 2 * gaps - 2 * walls
+        total = gaps + walls + steps
+        self.assertGreater(total, 3_000)
+        np.testing.assert_allclose(np.array([gaps, walls, steps]) / total, 1 / 3, atol=0.04)
+
+    def test_bumps(self):
+        heights = draw(planar('bumps', BumpHMin=0.02, BumpHMax=0.05), 1_000.0).heights
+        self.assertEqual(heights[-1], 0)
+        moved = heights[:-1]
+        self.assert_uniform(np.abs(moved), 0.02, 0.05)
+        self.assertAlmostEqual((moved > 0).mean(), 0.5, delta=0.02)
+        self.assertLess(abs(np.corrcoef(moved[1:], moved[:-1])[0, 1]), 0.03)  # white
+        self.assertFalse(draw('bumps').vertical.any())
+
+    @parameterized.parameters(
+        ('slopes', 0.0, 0.13, 0.90, 0.08),
+        ('slopes_humanoid', 0.0, 0.36, 0.68, 0.13),
+        ('inclines', 0.175, 0.04, 0.10, 0.01),
+    )
+    def test_slopes(self, name, mean, deviation, correlation, deviation_over_1m):
+        g = slopes(draw(name, 20_000.0))
+        self.assertAlmostEqual(g.mean(), mean, delta=0.005)
+        self.assertAlmostEqual(g.std(), deviation, delta=0.006)
+        self.assertAlmostEqual(np.corrcoef(g[1:], g[:-1])[0, 1], correlation, delta=0.02)
+        self.assertAlmostEqual(g.reshape(-1, 40).mean(1).std(), deviation_over_1m, delta=0.006)
+
+    def test_slopes_under_features(self):
+        # The walk alone: of features that have no height.
+        ground = json.loads(PAPER)
+        for key in ('GapH', 'WallH', 'StepH0', 'StepH1'):
+            ground['Params'][0].update({f'{key}Min': 0, f'{key}Max': 0})
+        g = slopes(draw(ground, 20_000.0))
+        self.assertAlmostEqual(g.std(), 0.09, delta=0.006)
+        self.assertAlmostEqual(np.corrcoef(g[1:], g[:-1])[0, 1], 0.95, delta=0.01)
+        metres = g[: len(g) // 40 * 40].reshape(-1, 40).mean(1)
+        self.assertAlmostEqual(metres.std(), 0.07, delta=0.006)
+
+    def test_slope_starts_at_zero_and_moves_first_vertex(self):
+        first = np.array([draw('slopes', 0.025, seed).heights[0] for seed in range(500)])
+        self.assertGreater(np.abs(first).min(), 0)
+        # One change of up to 0.1, either way, over one cell.
+        self.assert_uniform(first, -0.1 * 0.025, 0.1 * 0.025)
+
+    def test_slope_band_without_width_adds_nothing(self):
+        bare = planar('slopes', SlopeDeltaRange=0.3, SlopeDeltaMin=0.2, SlopeDeltaMax=0.2)
+        np.testing.assert_array_equal(draw(bare).heights, 0)
+        # The shipped slopes_gaps is such a file: 3 m on, 2 m off, level.
+        counts, levels = runs(draw('slopes_gaps', 100.0))
+        np.testing.assert_array_equal(levels[:4], [0, -2, 0, -2])
+        np.testing.assert_array_equal(counts[:4], [121, 80, 121, 80])
+
+    @parameterized.parameters('gaps', 'walls', 'steps', 'mixed', 'narrow_gaps')
+    def test_features_on_slopes(self, kind):
+        profile = draw(planar(f'slopes_{kind}', SlopeDeltaRange=0.02))
+        rise = np.abs(np.diff(profile.heights, prepend=0.0))
+        self.assertTrue(profile.vertical.any())
+        self.assertGreater(rise[profile.vertical].min(), 0.08)
+        self.assertLess(rise[~profile.vertical].max(), 0.02)
+        self.assertGreater(rise[~profile.vertical].min(), 0)
+
+    def test_features_without_extent_end(self):
+        nothing = {
+            key: 0
+            for key in terrain.GENERATORS['var2d_slopes_narrow_gaps'].defaults
+            if not key.startswith('Slope')
+        }
+        profile = draw({'Type': 'var2d_slopes_narrow_gaps', 'Params': [nothing]})
+        self.assertGreaterEqual(len(profile.heights), 800)
+
+
+class FileTest(parameterized.TestCase):
+    """Terrain files, presets, blending."""
+
+    def write(self, text, name='mine.json'):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        path = pathlib.Path(folder.name) / name
+        path.write_text(text, encoding='utf-8')
+        return path
+
+    def test_paper_example(self):
+        path = self.write(PAPER, 'slopes.txt')
+        for source in (path, str(path), json.loads(PAPER)):
+            ground = terrain.load(source)
+            self.assertEqual(ground.type, 'var2d_slopes_mixed')
+            self.assertEqual(ground.parameters(), json.loads(PAPER)['Params'][0])
+        preset = terrain.load('slopes_mixed_humanoid')
+        self.assertEqual(preset.parameters(), terrain.load(path).parameters())
+        self.assertIs(terrain.load(preset), preset)
+
+    @parameterized.parameters({}, {'Params': []}, {'Params': [{}]}, {'GroundWidth': 20})
+    def test_defaults(self, **content):
+        gaps = terrain.load({'Type': 'var2d_gaps', **content}).parameters()
+        self.assertEqual(
+            gaps,
+            {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
+             'GapHMin': -2, 'GapHMax': -2},
+        )  # fmt: skip
+
+    def test_given_values_replace_defaults(self):
+        gaps = terrain.load(planar('gaps', GapWMax=1)).parameters()
+        self.assertEqual((gaps['GapWMin'], gaps['GapWMax'], gaps['GapSpacingMax']), (0.5, 1, 7))
+
+    def test_blend(self):
+        ground = terrain.load('gaps_curriculum')
+        for blend, low, high in (
+            (0, 0.1, 0.25), (0.5, 0.3, 0.875), (1, 0.5, 1.5), (-3, 0.1, 0.25), (7, 0.5, 1.5),
+        ):  # fmt: skip
+            values = ground.parameters(blend)
+            self.assertAlmostEqual(values['GapWMin'], low)
+            self.assertAlmostEqual(values['GapWMax'], high)
+            self.assertEqual(values['GapSpacingMin'], 4)
+        self.assertEqual(ground.parameters(), ground.parameters(0))
+        for blend in (math.nan, True, '0'):
+            with self.assertRaisesRegex(ValueError, 'blend must be a number'):
+                ground.parameters(blend)
+
+    def test_blend_of_three_sets_and_of_defaults(self):
+        sets = [{'GapWMin': 0.1, 'GapWMax': 0.1}, {}, {'GapWMin': 1, 'GapWMax': 1}]
+        ground = terrain.load({'Type': 'var2d_gaps', 'Params': sets})
+        self.assertAlmostEqual(ground.parameters(0.5)['GapWMin'], 0.3)
+        self.assertAlmostEqual(ground.parameters(1.5)['GapWMin'], 0.75)
+        self.assertAlmostEqual(ground.parameters(1.5)['GapWMax'], 1.5)
+
+    def test_blended_strip(self):
+        easy, hard = (
+            terrain.Strip(terrain.load('bumps_blend'), 0, blend=blend).height(np.arange(1, 20, 0.1))
+            for blend in (0, 1)
+        )
+        np.testing.assert_array_equal(easy, 0)
+        self.assertGreater(np.abs(hard).max(), 0.06)
+
+    @parameterized.parameters(*terrain.PRESETS)
+    def test_preset(self, name):
+        ground = terrain.load(name)
+        self.assertEqual(ground.name, name)
+        strip = terrain.Strip(ground, 1, blend=1)
+        heights, _ = strip.window(-2000, 4001)  # 100 m
+        self.assertTrue(np.isfinite(heights).all())
+        if name != 'flat':
+            self.assertGreater(np.ptp(heights), 0)
+
+    def test_names_of_presets(self):
+        self.assertContainsSubset(
+            {'flat', 'gaps', 'walls', 'steps', 'mixed', 'slopes', 'slopes_mixed', 'cliffs_humanoid',
+             'cliffs_rugged', 'inclines', 'steps_humanoid', 'slopes_humanoid', 'gaps_humanoid',
+             'walls_humanoid', 'slopes_mixed_humanoid', 'mixed_humanoid'},
+            terrain.PRESETS.keys(),
+        )  # fmt: skip
+
+    def test_presets_that_differ_from_the_original(self):
+        values = terrain.load('mixed_curriculum').parameters(0)
+        self.assertEqual((values['StepH0Min'], values['StepH0Max']), (0.05, 0.1))
+        values = terrain.load('gaps_humanoid').parameters()
+        self.assertEqual((values['GapHMin'], values['GapHMax']), (-0.9, -0.85))
+        mixed = terrain.load('slopes_mixed_humanoid').parameters()
+        mixed = {key: value for key, value in mixed.items() if not key.startswith('Slope')}
+        self.assertEqual(terrain.load('mixed_humanoid').parameters(), mixed)
+
+    @parameterized.named_parameters(
+        ('no_json', '{"Type": ', ['not a terrain file']),
+        ('nested', '[' * 100_000, ['not a terrain file']),
+        ('no_object', '[]', ['Type and Params']),
+        ('no_type', '{"Params": []}', ["'Type' is missing", 'var2d_gaps']),
+        ('wrong_key', '{"Type": "var2d_gaps", "Parms": []}', ["'Parms'", "'Params'"]),
+        ('type', '{"Type": "var2d_gap"}', ["'var2d_gap'", "'var2d_gaps'"]),
+        ('type_3d', '{"Type": ["x"]}', ['Type must be a string']),
+        ('no_list', '{"Type": "var2d_gaps", "Params": {}}', ['Params must be a list']),
+        ('no_set', '{"Type": "var2d_gaps", "Params": [1]}', ['Params[0]', 'must be an object']),
+        ('misspelt', '{"Type": "var2d_gaps", "Params": [{}, {"GapWidthMin": 1}]}',
+         ['Params[1]', "'GapWidthMin'", "'GapWMin'"]),
+        ('case', '{"Type": "var2d_gaps", "Params": [{"gapwmin": 1}]}', ["'GapWMin'"]),
+        ('other_type', '{"Type": "var2d_gaps", "Params": [{"WallWMin": 1}]}',
+         ['Params[0]', "'WallWMin' has no effect in var2d_gaps", 'var2d_walls']),
+        ('none', '{"Type": "var2d_flat", "Params": [{"Height": 1}]}', ["'Height'", 'has none']),
+        ('twice', '{"Type": "var2d_gaps", "Params": [{"GapWMin": 1, "GapWMin": 1}]}',
+         ["'GapWMin' is given twice"]),
+        ('reversed', '{"Type": "var2d_gaps", "Params": [{"GapWMin": 2, "GapWMax": 1}]}',
+         ['Params[0]', 'GapWMin 2 is above GapWMax 1']),
+        ('reversed_default', '{"Type": "var2d_gaps", "Params": [{"GapWMin": 3}]}',
+         ['GapWMin 3 is above GapWMax 2 (the default)']),
+        ('reversed_depth', '{"Type": "var2d_gaps", "Params": [{"GapHMin": -1, "GapHMax": -2}]}',
+         ['GapHMin -1 is above GapHMax -2']),
+        ('nan', '{"Type": "var2d_gaps", "Params": [{"GapWMin": NaN}]}', ['GapWMin', 'finite']),
+        ('infinite', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1e999}]}', ['finite']),
+        ('huge', '{"Type": "var2d_gaps", "Params": [{"GapWMax": 1' + '0' * 400 + '}]}', ['finite']),
+        ('text', '{"Type": "var2d_gaps", "Params": [{"GapWMin": "1"}]}', ['GapWMin', "'1'"]),
+        ('bool', '{"Type": "var2d_gaps", "Params": [{"GapWMin": true}]}', ['GapWMin', 'True']),
+        ('null', '{"Type": "var2d_gaps", "Params": [{"GapWMin": null}]}', ['GapWMin', 'None']),
+        ('negative', '{"Type": "var2d_gaps", "Params": [{"GapWMin": -1}]}',
+         ['GapWMin', 'from 0', '-1']),
+        ('endless', '{"Type": "var2d_gaps", "Params": [{"GapSpacingMax": 1e12}]}',
+         ['GapSpacingMax', '1000']),
+        ('count', '{"Type": "var2d_narrow_gaps", "Params": [{"NarrowGapCountMax": 1e9}]}',
+         ['NarrowGapCountMax', '100']),
+        ('width', '{"Type": "var2d_gaps", "GroundWidth": "wide"}', ['GroundWidth', "'wide'"]),
+    )  # fmt: skip
+    def test_refused(self, text, parts):
+        path = self.write(text)
+        with self.assertRaises(ValueError) as caught:
+            terrain.load(path)
+        for part in [str(path), *parts]:
+            self.assertIn(part, str(caught.exception))
+
+    def test_not_utf8(self):
+        path = self.write('')
+        path.write_bytes(b'\xff\xfe\x00')
+        with self.assertRaisesRegex(ValueError, 'mine.json: not a terrain file'):
+            terrain.load(path)
+
+    def test_other_sources(self):
+        with self.assertRaisesRegex(ValueError, "'gaps_humanoid'"):
+            terrain.load('gap_humanoid')
+        with self.assertRaises(FileNotFoundError):
+            terrain.load('no_such_terrain.json')
+        with self.assertRaisesRegex(TypeError, 'int'):
+            terrain.load(3)
+
+    def test_terrains_are_read_only_and_copied(self):
+        ground = terrain.load('gaps')
+        with self.assertRaises(TypeError):
+            ground.parameter_sets[0]['GapWMin'] = math.nan
+        ground.parameters()['GapWMin'] = math.nan
+        for other in (pickle.loads(pickle.dumps(ground)), copy.deepcopy(ground)):
+            self.assertEqual(other, ground)
+            self.assertEqual(other.parameters()['GapWMin'], 0.5)
+
+
+class RegisterTest(parameterized.TestCase):
+    """Terrain types of the user."""
+
+    def setUp(self):
+        super().setUp()
+        before = dict(generators._generators)
+        self.addCleanup(generators._generators.update, before)
+        self.addCleanup(generators._generators.clear)
+
+    def test_new_type(self):
+        @terrain.register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
+        def saw(parameters, length, rng):
+            cells = math.ceil(parameters['ToothW'] / terrain.SPACING)
+            teeth = math.ceil(length / terrain.SPACING / cells)
+            rises = rng.uniform(parameters['ToothHMin'], parameters['ToothHMax'], teeth)
+            heights = np.outer(rises, np.arange(1, cells + 1) / cells).ravel()
+            return terrain.Profile(heights, np.diff(heights, prepend=0.0) < 0)
+
+        ground = terrain.load({'Type': 'var2d_saw', 'Params': [{'ToothW': 0.5}]})
+        heights = terrain.Strip(ground, 0).height(1 + np.arange(0, 10, 0.5) - 1e-9)
+        np.testing.assert_array_less(heights[1:], 0.2 + 1e-9)
+        np.testing.assert_array_less(0.1 - 1e-6, heights[1:])
+        with self.assertRaisesRegex(ValueError, "did you mean 'ToothW'"):
+            terrain.load({'Type': 'var2d_saw', 'Params': [{'ToothV': 0.5}]})
+        with self.assertRaisesRegex(ValueError, 'ToothHMin 0.5 is above ToothHMax 0.2'):
+            terrain.load({'Type': 'var2d_saw', 'Params': [{'ToothHMin': 0.5}]})
+
+    def test_taken_name(self):
+        with self.assertRaisesRegex(ValueError, 'var2d_gaps'):
+            terrain.register('var2d_gaps')
+        function = lambda parameters, length, rng: terrain.Profile(np.ones(9), np.zeros(9, bool))  # noqa: E731
+        terrain.register('var2d_gaps', replace=True)(function)
+        self.assertIs(terrain.GENERATORS['var2d_gaps'].function, function)
+
+    def test_bad_defaults(self):
+        with self.assertRaisesRegex(ValueError, 'mine.*HMin 2 .*above'):
+            terrain.register('mine', {'HMin': 2, 'HMax': 1})
+
+    @parameterized.parameters(
+        (lambda: np.zeros(3), 'must return a Profile'),
+        (lambda: terrain.Profile(np.zeros(0), np.zeros(0, bool)), 'shape'),
+        (lambda: terrain.Profile(np.zeros((2, 2)), np.zeros((2, 2), bool)), 'shape'),
+        (lambda: terrain.Profile(np.array(['a']), np.zeros(1, bool)), 'numbers'),
+        (lambda: terrain.Profile(np.zeros(3), np.zeros(2, bool)), 'vertical'),
+        (lambda: terrain.Profile(np.zeros(3), np.zeros(3)), 'vertical'),
+        (lambda: terrain.Profile(np.array([0, 1, np.nan]), np.zeros(3, bool)), 'vertex 2'),
+    )
+    def test_bad_generator(self, make, message):
+        terrain.register('mine')(lambda parameters, length, rng: make())
+        strip = terrain.Strip(terrain.load({'Type': 'mine'}), 0)
+        with self.assertRaisesRegex(ValueError, f"'mine'.*{message}"):
+            strip.height(5.0)
+
+    def test_draw_refuses(self):
+        rng = np.random.default_rng(0)
+        for length in (0, -1, math.nan, math.inf, 1e9):
+            with self.assertRaisesRegex(ValueError, 'length'):
+                generators.draw('var2d_flat', {}, length, rng)
+        with self.assertRaisesRegex(ValueError, 'var2d_flat'):
+            generators.draw('var2d_flt', {}, 1.0, rng)
+
+
+class StripTest(parameterized.TestCase):
+    """The endless ground."""
+
+    def make(self, name='slopes_mixed', seed=0, **options):
+        return terrain.Strip(terrain.load(name), seed, **options)
+
+    @parameterized.parameters('gaps', 'slopes_humanoid', 'bumps', 'cliffs_rugged')
+    def test_intended_start(self, name):
+        for seed in range(10):
+            strip = self.make(name, seed)
+            np.testing.assert_array_equal(strip.height(np.linspace(-1, 1, 99)), 0)
+            # Right of +1 the first spacing or slope begins; left of -1 a feature ends.
+            self.assertNotEqual(strip.height(-1.025), 0)
+            self.assertEqual(strip.height(1.025) != 0, name in ('slopes_humanoid', 'bumps'))
+        first = {'gaps': 4, 'cliffs_rugged': 0.8}.get(name, 0)
+        np.testing.assert_array_equal(strip.height(np.linspace(1, 1 + first, 99)), 0)
+
+    @parameterized.parameters(*sorted(terrain.PRESETS))
+    def test_joins(self, name):
+        # Away from vertical faces the ground never leaps, across 13 joins.
+        heights, vertical = self.make(name).window(-5000, 10_000)
+        leap = np.abs(np.diff(heights))[~vertical[1:]]
+        self.assertLess(leap.max(), 0.15)
+        self.assertLess(np.median(leap), 0.08)
+
+    def test_ground_between_boxes_is_level_across_joins(self):
+        heights, _ = self.make('gaps').window(-4000, 8000)
+        self.assertEqual({-2.0, 0.0}, {*heights})
+
+    def test_request_order_does_not_matter(self):
+        for name in ('slopes_mixed', 'cliffs_rugged'):
+            once = self.make(name)
+            once.ensure(-100, 100)
+            steps = self.make(name)
+            for x in np.arange(0, 100, 0.7):
+                steps.height(x)
+            for x in np.arange(0, 100, 0.9):
+                steps.ensure(-x, x)
+            there = self.make(name)
+            there.window(2000, 10)
+            there.height([-77.0, 3.0])
+            for other in (steps, there):
+                for a, b in zip(other.window(-3900, 7800), once.window(-3900, 7800), strict=True):
+                    np.testing.assert_array_equal(a, b)
+
+    def test_window(self):
+        strip = self.make('walls')
+        heights, vertical = strip.window(-500, 2000)
+        self.assertEqual(heights.shape, (2000,))
+        self.assertEqual(vertical.shape, (2000,))
+        # Faces are the cells in which level ground changes its height.
+        np.testing.assert_array_equal(vertical[1:], np.diff(heights) != 0)
+        # The flag of the first cell is right even where nothing was drawn before it.
+        first = round(strip.extent[0] / 0.025)
+        self.assertTrue(self.make('walls').window(first, 1)[1][0])
+        heights[:] = vertical[:] = 1  # a copy
+        self.assertEqual(strip.height(0.0), 0)
+        with self.assertRaises(ValueError):
+            strip.window(0, 0)
+
+    def test_seeds(self):
+        def ground(seed):
+            return self.make('slopes', seed).window(-1000, 2000)[0]
+
+        np.testing.assert_array_equal(ground(3), ground(3))
+        self.assertFalse(np.array_equal(ground(3), ground(4)))
+        sequence = np.random.SeedSequence(3)
+        np.testing.assert_array_equal(ground(sequence), ground(sequence))
+        np.testing.assert_array_equal(ground(sequence), ground(3))
+        self.assertEqual(sequence.n_children_spawned, 0)
+        a, b = (ground(child) for child in np.random.SeedSequence(3).spawn(2))
+        self.assertFalse(np.array_equal(a, b))
+        rng = np.random.default_rng(3)
+        first, second = ground(rng), ground(rng)
+        self.assertFalse(np.array_equal(first, second))
+        np.testing.assert_array_equal(first, ground(np.random.default_rng(3)))
+        for seed in (None, 1.5, True, -1, 'a'):
+            with self.assertRaisesRegex(TypeError, 'seed'):
+                ground(seed)
+
+    def test_sides_differ(self):
+        heights = self.make('slopes').window(-840, 1681)[0]
+        self.assertFalse(np.array_equal(heights[:840], heights[:840:-1]))
+
+    def test_same_ground_in_another_process(self):
+        code = (
+            'from trl_suite import terrain as t; '
+            "print(t.Strip(t.load('slopes_mixed'), 7).height([9.1, -9.1]).tolist())"
+        )
+        root = pathlib.Path(terrain.__file__).parents[2]
+        output = subprocess.run(
+            [sys.executable, '-c', code], cwd=root, capture_output=True, text=True, check=True
+        ).stdout
+        here = self.make('slopes_mixed', 7).height([9.1, -9.1])
+        self.assertEqual(json.loads(output), here.tolist())
+
+    def test_imports_no_physics(self):
+        root = pathlib.Path(terrain.__file__).parents[1]
+        code = (
+            'import sys, types; '
+            "package = sys.modules['trl_suite'] = types.ModuleType('trl_suite'); "
+            f'package.__path__ = [{str(root)!r}]; '  # without what the suite itself imports
+            'import trl_suite.terrain; '
+            "print([name for name in ('mujoco', 'dm_control') if name in sys.modules])"
+        )
+        output = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True
+        ).stdout
+        self.assertEqual(output.strip(), '[]')
+
+    def test_state(self):
+        strip = self.make('slopes_mixed')
+        strip.ensure(-30, 50)
+        state = pickle.loads(pickle.dumps(strip.state()))
+        ways = [terrain.Strip.from_state(state), pickle.loads(pickle.dumps(strip))]
+        other = self.make('gaps', 9)
+        other.ensure(-60, 60)
+        other.set_state(state)
+        expected = strip.window(-4000, 8000)
+        for restored in [*ways, other]:
+            self.assertEqual(restored.extent[0], state['low'] * 0.025)
+            for a, b in zip(restored.window(-4000, 8000), expected, strict=True):
+                np.testing.assert_array_equal(a, b)
+        # The state is no part of the strip it was taken from.
+        self.assertLess(state['heights'].size, 6000)
+
+    def test_broken_state_leaves_strip_alone(self):
+        strip = self.make()
+        before = strip.height(5.0)
+        state = strip.state()
+        del state['vertical']
+        with self.assertRaises(KeyError):
+            strip.set_state(state)
+        self.assertEqual(strip.height(5.0), before)
+        np.testing.assert_array_equal(strip.height([55.0]), self.make().height([55.0]))
+
+    @parameterized.parameters('slopes_mixed', 'cliffs_rugged', 'bumps')
+    def test_height_is_linear_interpolation(self, name):
+        strip = self.make(name)
+        heights, _ = strip.window(-1200, 2401)
+        vertices = np.arange(-1200, 1201) * 0.025
+        x = np.random.default_rng(0).uniform(-30, 30, (50, 40))
+        np.testing.assert_allclose(strip.height(x), np.interp(x, vertices, heights), atol=1e-11)
+        np.testing.assert_allclose(strip.height(vertices), heights, atol=1e-11)
+        self.assertEqual(strip.height(x).shape, (50, 40))
+        self.assertEqual(np.shape(strip.height(0.3)), ())
+        self.assertEqual(strip.height([]).shape, (0,))
+
+    def test_height_draws_as_needed(self):
+        strip = self.make()
+        self.assertTrue(np.isfinite(strip.height([-333.3, 444.4])).all())
+        low, high = strip.extent
+        self.assertBetween(low, -360, -333.3)
+        self.assertBetween(high, 444.4, 480)
+
+    def test_slope(self):
+        strip = self.make('slopes')
+        x = (np.arange(-800, 800) + 0.5) * 0.025
+        expected = (strip.height(x + 0.01) - strip.height(x - 0.01)) / 0.02
+        np.testing.assert_allclose(strip.slope(x), expected, atol=1e-9)
+        self.assertEqual(strip.slope(0.3), 0)
+
+    @parameterized.parameters(math.nan, math.inf, -math.inf, 1.1e6, -1.1e6)
+    def test_refuses(self, x):
+        strip = self.make()
+        for request in (
+            lambda: strip.height([0.0, x]),
+            lambda: strip.slope(x),
+            lambda: strip.ensure(0, x),
+            lambda: strip.ensure(x, 0),
+            lambda: self.make(spawn='upstream', centre=x),
+        ):
+            with self.assertRaises(ValueError):
+                request()
+        self.assertEqual(strip.extent, (-1, -1))  # nothing was drawn
+
+    def test_refuses_window_out_of_bounds(self):
+        with self.assertRaises(ValueError):
+            self.make().window(10**9, 10)
+        with self.assertRaises(ValueError):
+            self.make().window(0, 10**9)
+
+    def test_refuses_spawn(self):
+        with self.assertRaisesRegex(ValueError, "'upstrem'"):
+            self.make(spawn='upstrem')
+
+    def test_upstream_view_10(self):
+        # The centre is at 3: a feature ends there, and the next spacing starts there.
+        for seed in range(5):
+            walls = self.make('walls', seed, spawn='upstream', centre=3.0)
+            self.assertGreater(walls.height([2.8, 2.975]).min(), 0.25 - 1e-9)
+            np.testing.assert_array_equal(walls.height([2.775, 3.0]), 0)
+            np.testing.assert_array_equal(walls.height(np.arange(3, 9, 0.02)), 0)
+            steps = self.make('steps', seed, spawn='upstream', centre=3.0)
+            self.assertGreater(abs(steps.height(2.975)), 0.1 - 1e-9)
+            self.assertEqual(steps.height(3.0), 0)
+            # 18 m of flat far to the left, before 20 m of walls that overshoot by up to a feature.
+            faces = np.flatnonzero(walls.window(-1800, 1900)[1]) * 0.025 - 45
+            i = np.diff(faces).argmax()
+            self.assertBetween(np.diff(faces)[i], 18 + 6 - 1e-9, 18 + 8.1)
+            self.assertBetween(faces[i + 1], -25.3 + 6, -17 + 8.1)
+
+    @parameterized.parameters(0.0, -0.25, -0.5)
+    def test_upstream_view_3(self, centre):
+        # A feature ends at the centre, behind; flat to +1; then the first spacing.
+        for seed in range(5):
+            strip = self.make('walls_humanoid', seed, spawn='upstream', centre=centre)
+            self.assertGreater(strip.height(centre - 0.1), 0)
+            np.testing.assert_array_equal(strip.height(np.linspace(centre, 3, 99)), 0)
+            heights = strip.height(np.arange(1, 6, 0.01))
+            self.assertBetween(np.argmax(heights > 0.01) * 0.01, 2 - 1e-9, 4.05)
+
+    @parameterized.parameters(0.25, 0.9, 1.4)
+    def test_upstream_view_3_at_later_phase(self, centre):
+        # No flat start: a feature ends at the centre in front, the next spacing starts there.
+        for seed in range(5):
+            strip = self.make('walls_humanoid', seed, spawn='upstream', centre=centre)
+            self.assertGreater(strip.height(centre - 0.1), 0)
+            heights = strip.height(np.arange(centre, centre + 5, 0.01))
+            self.assertBetween(np.argmax(heights > 0.01) * 0.01, 2 - 1e-9, 4.05)
+
+
+if __name__ == '__main__':
+    absltest.main()
