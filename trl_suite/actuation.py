@@ -28,6 +28,7 @@ MUSCLE_DAMPING_DIVISOR = 100.0  # the force-velocity curve damps as well
 TORQUE_SCALE = 0.75  # of the limit at full action
 VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
 POSITION_HALF_RANGE = 1.5  # rad at full action
+_LOW, _HIGH = np.full((), -1.0), np.ones(())  # of actions; arrays are quicker than scalars
 EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
 
 
@@ -54,7 +55,11 @@ class ActionMap:
 
     def control(self, action: np.ndarray) -> np.ndarray:
         """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
-        return self.centre + self.half_range * np.minimum(np.maximum(action, -1.0), 1.0)
+        control = np.maximum(action, _LOW)
+        np.minimum(control, _HIGH, out=control)
+        control *= self.half_range
+        control += self.centre
+        return control
 
     def action(self, control: np.ndarray) -> np.ndarray:
         """Maps controls (..., k) to the actions that cause them; not clipped."""

@@ -124,7 +124,7 @@ class Environment(composer.Environment):
         self._reset_next_step = (
             task.should_terminate_episode(physics)
             or (self._step_limit is not None and self._steps >= self._step_limit)
-            or self._physics.data.time >= self._time_limit
+            or (self._time_limit < np.inf and self._physics.time() >= self._time_limit)
         )
         step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, reward, task.get_discount(physics), observation)
@@ -144,13 +144,13 @@ class Environment(composer.Environment):
         return action
 
     def _observe(self) -> collections.OrderedDict[str, np.ndarray]:
-        row = self._task.observation[0]
+        row = self._task.observation[0].copy()
         observation: collections.OrderedDict[str, np.ndarray] = collections.OrderedDict()
         if self._flat_observation:
-            observation[FLAT_OBSERVATION_KEY] = row.copy()
+            observation[FLAT_OBSERVATION_KEY] = row
         else:
             for name, part in self._task.blocks.items():
-                observation[name] = row[part].copy()
+                observation[name] = row[part]
         if self._extra_observables:
             updated = self._observation_updater.get_observation()
             extra = {name: np.asarray(updated[name], float) for name in self._extra_observables}

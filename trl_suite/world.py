@@ -59,7 +59,7 @@ class World:
         self._model, self._data = physics.model.ptr, physics.data.ptr
         self.models = [self._model]
         self._scratch = mujoco.MjData(self._model)
-        self._warnings = self._data.warning.number
+        self._divergence = self._data.warning.number[_DIVERGED]
         for field in WRITABLE + READABLE:
             view = getattr(self._data, field)[None]
             if field in READABLE:
@@ -101,9 +101,13 @@ class World:
         mujoco.mj_setState(self._model, self._data, state, STATE)
         mujoco.mj_forward(self._model, self._data)
 
+    def any_diverged(self) -> bool:
+        """Whether `diverged` holds for any simulation; the cheap test of every step."""
+        return any(self._divergence.tolist())
+
     def diverged(self) -> np.ndarray:
         """Returns which simulations met a non-finite or huge state since their reset, (n,)."""
-        return np.array([self._warnings[_DIVERGED].any()])
+        return np.array([self.any_diverged()])
 
     def body_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_BODY, names)

@@ -59,12 +59,12 @@ class Report:
 
 
 def corners(character: str, clip: Clip, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the corners of every collision box in the world, (times, 8, 3) by geom name."""
+    """Returns the corners of every box that can collide, in the world, (times, 8, 3) by geom name."""
     model = figure.model(character)
     data = mujoco.MjData(model)
     poses = clip.pose(t)
     address = [model.jnt_qposadr[model.joint(name).id] for name in clip.joints]
-    boxes = [g for g in range(model.ngeom) if model.geom_group[g] == 3]
+    boxes = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     found = {model.geom(g).name: np.empty((len(t), 8, 3)) for g in boxes}
     for i, pose in enumerate(poses):
         data.qpos[:3] = pose[:3]

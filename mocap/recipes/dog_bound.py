@@ -53,6 +53,25 @@ STATES = (  # spine, shoulder, elbow, hip, knee, ankle: target angles, rad
 )
 STATE_JOINTS = ('shoulder', 'elbow', 'hip', 'knee', 'ankle')
 
+# A start from which the bound settles: hind feet about to land, the trunk turning down.
+START = (
+    *(0.0, 0.345, 0.76),
+    *(-0.317, 0.014, -0.01, -0.006, -0.001, 0.41, 0.364, 0.187),
+    *(-0.728, -0.187, -0.165, 0.035),
+    *(-1.57, 0.488, 0.518, -0.843, 0.449, -2.476, 1.609, -0.343),
+)
+START_SPEED = 5.5  # m/s
+
+PHASES = 200  # samples of a cycle
+HARMONICS = 12
+SETTLE = 8  # cycles before the bound has settled
+RATE_WEIGHT = 0.02  # s, of a gap in the rates against one in the angles
+BLEND = 24  # samples over which a change of a foot's path grows and fades
+MARGIN = 0.01  # rad to the joint limits
+SOLE = ((-0.025, -0.035), (0.085, -0.035))  # heel and tip of both feet from their joint, m
+TAIL = JOINTS[8:12]
+TAIL_SWING = 0.5  # share kept: the recorded tail, which collides with nothing, dips into the ground
+
 
 class Recorder:
     """The dog on a plane under its gait machine; `step` advances one control step."""
@@ -64,7 +83,8 @@ class Recorder:
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         colliding = model.geom_conaffinity > 0
         model.geom_conaffinity[colliding] = 1  # with the ground only, not with itself
-        model.jnt_solref[:] = (0.005, 1)  # limits
+        model.jnt_solref[:] = (4 * model.opt.timestep, 1)  # stiff limits, steadier cycles
+        model.geom_solref[:], model.geom_solimp[:] = (0.005, 1), (0.95, 0.99, 0.001, 0.5, 2)
         self.data = mujoco.MjData(model)
         self.dof = np.array([model.joint(name).dofadr[0] for name in JOINTS])
         self.limit = np.array([model.jnt_actfrcrange[model.joint(name).id, 1] for name in JOINTS])
@@ -163,11 +183,166 @@ class Recorder:
         return torque
 
 
-# A start from which the bound settles: hind feet about to land, the trunk turning down.
-START = (
-    *(0.0, 0.345, 0.76),
-    *(-0.317, 0.014, -0.01, -0.006, -0.001, 0.41, 0.364, 0.187),
-    *(-0.728, -0.187, -0.165, 0.035),
-    *(-1.57, 0.488, 0.518, -0.843, 0.449, -2.476, 1.609, -0.343),
-)
-START_SPEED = 5.5
+
+def record() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns poses (n, 3 + joints) and contacts (n, 2: toe, finger) at every control step, and
+    the steps (cycles,) that begin a cycle.
+    """
+    recorder = Recorder()
+    qpos, qvel = recorder.data.qpos, recorder.data.qvel
+    qpos[:3], qpos[recorder.dof], qvel[0] = START[:3], START[3:], START_SPEED
+    poses, contacts, starts = [], [], []
+    for i in range(round(SECONDS / CONTROL)):
+        recorder.step()
+        poses.append(np.concatenate([qpos[:3], qpos[recorder.dof]]))
+        contacts.append(recorder.touching())
+        if recorder.new_cycle:
+            starts.append(i)
+    return np.array(poses), np.array(contacts), np.array(starts)
+
+
+def cycle(poses: np.ndarray, contacts: np.ndarray, starts: np.ndarray):
+    """Returns the cycle that closes best, closed: the seam gap is spread evenly over it.
+
+    The bound alternates long and short cycles, and a mean of unlike contacts touches nowhere.
+
+    Returns:
+      Poses (PHASES, 3 + joints) with x relative to a steady advance, contacts (PHASES, 2), the
+      advance in m, and the period in s.
+    """
+    rates = np.gradient(poses, CONTROL, axis=0)
+    first, last = starts[SETTLE:-1], starts[SETTLE + 1 :]
+    gap = np.abs(poses[last] - poses[first])[:, 1:].max(axis=1)
+    gap += RATE_WEIGHT * np.abs(rates[last] - rates[first]).max(axis=1)
+    a, b = first[np.argmin(gap)], last[np.argmin(gap)]
+    phase = np.arange(PHASES + 1) / PHASES
+    at = a + phase * (b - a)
+    sample = np.stack([np.interp(at, np.arange(len(poses)), c) for c in poses.T], axis=1)
+    advance = float(sample[-1, 0] - sample[0, 0])
+    sample[:, 0] -= sample[0, 0]
+    sample -= np.outer(phase, sample[-1] - sample[0])
+    spectrum = np.fft.rfft(sample[:-1], axis=0)
+    spectrum[HARMONICS + 1 :] = 0
+    closed = np.fft.irfft(spectrum, PHASES, axis=0)
+    touching = contacts[np.round(at[:-1]).astype(int)]
+    return closed, touching, advance, float(b - a) * CONTROL
+
+
+def stance(touching: np.ndarray) -> np.ndarray:
+    """Returns the samples of a foot's stance, in order, over the seam if need be, gaps closed."""
+    n = len(touching)
+    on = np.flatnonzero(touching)
+    breaks = np.diff(np.append(on, on[0] + n))  # the stance ends before the longest flight
+    start = on[(int(np.argmax(breaks)) + 1) % len(on)]
+    end = on[int(np.argmax(breaks))]
+    return np.arange(start, end + (n if end < start else 0) + 1)
+
+
+def set_down(joint: np.ndarray, pitch: np.ndarray, on: np.ndarray, advance: float) -> np.ndarray:
+    """Returns a foot joint's path, (n, 2), changed so that the foot rolls without slipping.
+
+    Args:
+      joint: recorded path over one cycle, (n, 2), x as travelled.
+      pitch: of the foot, (n,).
+      on: samples of the stance, which may run past n.
+      advance: of a cycle, m.
+    """
+    n = len(joint)
+    drift = np.array([advance, 0])
+    path = np.concatenate([joint - drift, joint, joint + drift])
+    sole = np.stack([figure.rotate(np.array(end), np.tile(pitch, 3)) for end in SOLE], axis=1)
+    at = on + n
+    lowest = sole[at, :, 1].argmin(axis=1)
+    pivot = lowest[:-1]
+    roll = sole[at[1:], pivot, 0] - sole[at[:-1], pivot, 0]
+    x = -np.concatenate([[0], np.cumsum(roll)])
+    standing = np.stack([x - x.mean() + path[at, 0].mean(), -sole[at, lowest, 1]], axis=1)
+    result = path.copy()
+    result[at] = standing
+    # Before and after, the change fades, and does so at a rate that lets the foot arrive at rest.
+    u = np.arange(1, BLEND + 1)[:, None] / BLEND
+    for edge, inner, way in ((0, 1, -1), (-1, -2, 1)):
+        near = at[edge] + way * np.arange(1, BLEND + 1)
+        change = standing[edge] - path[at[edge]]
+        rate = standing[edge] - standing[inner] - (path[near[0]] - path[at[edge]])
+        result[near] += (change * (1 + 2 * u) + BLEND * rate * u) * (1 - u) ** 2
+    # The stance may reach over the seam: gather what belongs to each phase.
+    changed = (result - path).reshape(3, n, 2)
+    return joint + changed.sum(axis=0)
+
+
+def solve_leg(
+    make: figure.Figure,
+    poses: np.ndarray,
+    leg: tuple[str, ...],
+    path: np.ndarray,
+    grip: np.ndarray,
+) -> np.ndarray:
+    """Returns the poses with a leg bent, within its limits, so that its foot follows a path.
+
+    The foot keeps its pitch as far as the limits let it; the other joints change as little as that
+    allows. `grip` in [0, 1] says how much the foot matters; in mid-air only the limits do.
+    """
+    columns = [3 + JOINTS.index(name) for name in leg]
+    model = figure.model('dog')
+    low, high = np.array([model.joint(name).range for name in leg]).T
+    low, high = low + MARGIN, high - MARGIN
+    foot = 1 + JOINTS.index(leg[-1])
+    pitch = make.forward(poses)[1][:, foot]
+    result = poses.copy()
+    for i, pose in enumerate(poses):
+        trial = pose[None].copy()
+
+        def residual(angles, i=i, pose=pose, trial=trial):
+            trial[0, columns] = angles
+            joint, turn = make.joints(trial)
+            off = joint[0, foot] - path[i]
+            return np.concatenate(
+                [
+                    1e3 * grip[i] * off,
+                    [10 * grip[i] * (turn[0, foot] - pitch[i])],
+                    angles - pose[columns],
+                ]
+            )
+
+        start = np.clip(pose[columns], low + 1e-6, high - 1e-6)
+        result[i, columns] = optimize.least_squares(residual, start, bounds=(low, high)).x
+    return result
+
+
+def clip() -> Clip:
+    """Returns the bound."""
+    poses, touching, advance, period = cycle(*record())
+    make = figure.figure('dog', JOINTS)
+    phase = np.arange(PHASES + 1) / PHASES
+    poses[:, 0] += advance * phase[:-1]
+    tail = [3 + JOINTS.index(name) for name in TAIL]
+    poses[:, tail] = TAIL_SWING * poses[:, tail] + (1 - TAIL_SWING) * poses[:, tail].mean(axis=0)
+    for leg, foot in ((HIND, 0), (FRONT, 1)):
+        joint, pitch = make.joints(poses)
+        index = 1 + JOINTS.index(leg[-1])
+        on = stance(touching[:, foot])
+        path = set_down(joint[:, index], pitch[:, index], on, advance)
+        # Firm from the blend before the stance to the one after it, easing off as long again.
+        n, middle = PHASES, (on[0] + on[-1]) / 2
+        away = np.abs((np.arange(n) - middle + n / 2) % n - n / 2) - len(on) / 2
+        grip = np.clip(2 - away / BLEND, 0, 1) ** 4
+        poses = solve_leg(make, poses, leg, path, grip)
+    poses = np.concatenate([poses, poses[:1]])
+    poses[-1, 0] += advance
+    poses[:, 0] -= poses[0, 0]
+    return Clip(
+        'dog_bound',
+        period * phase,
+        poses,
+        'planar',
+        JOINTS,
+        (1,) * len(JOINTS),
+        True,
+        f'bound at {advance / period:.2f} m/s, recorded from the gait machine',
+    )
+
+
+def clips() -> list[Clip]:
+    """Returns the clips of this recipe."""
+    return [clip()]

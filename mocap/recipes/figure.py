@@ -62,8 +62,8 @@ class Figure:
         """Returns the distance of a link's joint from its parent's, m."""
         return float(np.linalg.norm(self.offset[self.links.index(link)]))
 
-    def forward(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns centres of mass (n, links, 2) and pitch angles (n, links) of all links."""
+    def joints(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns joint positions (n, links, 2) and pitch angles (n, links) of all links."""
         pitch = np.empty((len(poses), len(self.links)))
         joint = np.empty((*pitch.shape, 2))
         for i, p in enumerate(self.parent):
@@ -72,6 +72,11 @@ class Figure:
             else:
                 pitch[:, i] = pitch[:, p] + poses[:, 2 + i]
                 joint[:, i] = joint[:, p] + rotate(self.offset[i], pitch[:, p])
+        return joint, pitch
+
+    def forward(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns centres of mass (n, links, 2) and pitch angles (n, links) of all links."""
+        joint, pitch = self.joints(poses)
         return joint + rotate(self.com, pitch), pitch
 
     def centre(self, poses: np.ndarray) -> np.ndarray:

@@ -1,21 +1,34 @@
-"""Makes every clip of mocap/ anew: python mocap/recipes/make.py [name ...]."""
+"""Makes every clip of mocap/ anew, or those named: python mocap/recipes/make.py [name ...]."""
 
 from __future__ import annotations
 
 import pathlib
 import sys
 
+import checks
+import dog_bound
 import run
 import walk
 
 MOCAP = pathlib.Path(__file__).resolve().parents[1]
+RECIPES = (walk, run, dog_bound)
 
 
 def main(names: list[str]) -> None:
-    for clip in [*walk.clips(), *run.clips()]:
-        if not names or clip.name in names:
+    for recipe in RECIPES:
+        for clip in recipe.clips():
+            if names and clip.name not in names:
+                continue
             clip.save(MOCAP / f'{clip.name}.npz')
-            print(f'{clip.name}: {len(clip.times)} frames, {clip.duration:g} s')
+            found = checks.measure(clip, checks.CHARACTERS[clip.name])
+            print(
+                f'{clip.name}: {len(clip.times)} frames, {found.period:.4g} s, '
+                f'{found.speed:.4g} m/s, lowest {1000 * found.lowest:.1f} mm, '
+                f'slide {1000 * found.slide:.1f} mm, planted {found.planted:.0%}, '
+                f'margin {found.margin[0]:.3f} rad ({found.margin[1]}), '
+                f'fastest {found.fastest[0]:.0f} rad/s ({found.fastest[1]}), '
+                f'seam {found.seam_position:.0e} / {found.seam_rate:.2f}'
+            )
 
 
 if __name__ == '__main__':

@@ -18,6 +18,8 @@ FRAMES = 8
 def strip(clip: motion.Clip, character: str, frames: int = FRAMES, size: int = 300) -> np.ndarray:
     """Returns pictures over one cycle side by side, RGB (height, width, 3)."""
     model = figure.model(character, ground=True)
+    model.vis.headlight.ambient[:] = 0.45
+    model.vis.headlight.diffuse[:] = 0.6
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     camera.azimuth, camera.elevation, camera.distance = 90, -6, 2.4

@@ -22,6 +22,7 @@ PARKED = -60.0  # m; depth at which unused boxes lie
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
+_CELLS_PER_METRE = np.asarray(1 / SPACING)
 
 
 class PlanarTerrain(composer.Arena):
@@ -65,11 +66,12 @@ class PlanarTerrain(composer.Arena):
         self._world = world
         self._geoms = world.geom_ids([geom.full_identifier for geom in self.boxes])
         self.strips: list[Strip | None] = [None] * world.n
-        self._start = np.zeros(world.n)  # vertex number of a window's first vertex
-        self._heights = np.zeros((world.n, _WINDOW))
-        self._offset = np.arange(world.n) * _WINDOW
-        self._lay_from = np.full(world.n, np.inf)  # m; beyond these the window is laid anew
-        self._lay_to = np.full(world.n, -np.inf)
+        self._start = np.zeros((world.n, 1))  # vertex number of a window's first vertex
+        self._offset = np.arange(world.n)[:, None] * _WINDOW
+        # Of every cell its first height and the rise to the next, m; all windows in one table.
+        self._cells = np.zeros((world.n * _WINDOW, 2))
+        self._lay_from = np.full((world.n, 1), np.inf)  # m; beyond these the window is laid anew
+        self._lay_to = np.full((world.n, 1), -np.inf)
 
     def begin_episode(self, row: int, strip: Strip) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
@@ -77,42 +79,37 @@ class PlanarTerrain(composer.Arena):
         self._lay(row, 0)
 
     def follow(self, x: np.ndarray) -> None:
-        """Keeps ground under and ahead of characters whose roots are at x, m, shape (n,)."""
+        """Keeps ground under and ahead of characters whose roots are at x, m, shape (n, 1)."""
         moved = (x < self._lay_from) | (x > self._lay_to)
         if moved.any():
             for row in np.flatnonzero(moved):
                 # The window starts at multiples of the advance, however far a row has jumped.
-                self._lay(row, round(float(x[row]) / ADVANCE) * _ADVANCE)
+                self._lay(row, round(float(x[row, 0]) / ADVANCE) * _ADVANCE)
 
     def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
-        u = x * (1 / SPACING)
-        u -= self._start[rows, None]
+        u = x * _CELLS_PER_METRE
+        u -= self._start[rows]
         cell = u.astype(np.int64)
         u -= cell
-        cell += self._offset[rows, None]
+        cell += self._offset[rows]
         # Clipping only guards rows whose physics broke down; `follow` keeps the others inside.
-        low = self._heights.take(cell, mode='clip')
-        cell += 1
-        rise = self._heights.take(cell, mode='clip')
-        rise -= low
-        rise *= u
-        rise += low
-        return rise
+        found = self._cells.take(cell, axis=0, mode='clip')
+        u *= found[:, :, 1]
+        u += found[:, :, 0]
+        return u
 
     def slope(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
-        cell = (x * (1 / SPACING) - self._start[rows, None]).astype(np.int64)
-        cell += self._offset[rows, None]
-        low = self._heights.take(cell, mode='clip')
-        return (self._heights.take(cell + 1, mode='clip') - low) / SPACING
+        cell = (x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
+        return self._cells.take(cell + self._offset[rows], axis=0, mode='clip')[:, :, 1] / SPACING
 
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
         strip = self.strips[row]
         return {
             'strip': None if strip is None else strip.state(),
-            'centre': int(self._start[row]) + _BEHIND,
+            'centre': int(self._start[row, 0]) + _BEHIND,
         }
 
     def restore(self, row: int, state: dict[str, Any]) -> None:
@@ -128,7 +125,9 @@ class PlanarTerrain(composer.Arena):
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
         self._start[row] = start
-        self._heights[row] = heights
+        cells = self._cells[row * _WINDOW : (row + 1) * _WINDOW]
+        cells[:, 0] = heights
+        cells[:-1, 1] = np.diff(heights)
         self._lay_from[row] = (centre - 0.5 * _ADVANCE - 1) * SPACING
         self._lay_to[row] = (centre + 0.5 * _ADVANCE + 1) * SPACING
         tolerance = boxes.TOLERANCE

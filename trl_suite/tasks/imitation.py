@@ -28,10 +28,8 @@ VIEW_BEHIND = 0.5  # m; where the line of terrain samples begins
 VIEW_AHEAD = 3.0  # m; where it ends
 CLEARANCE = 0.001  # m; left under every link at the start
 PHASE_BINS = 4
-_BINS = np.arange(PHASE_BINS)
-_CROSS = np.array([1.0, -1.0])  # v = w x r in the x-z plane: (w z, -w x) for w about +y
-# Features of the reference that the reward compares, in the order of its terms.
-_COMPARED = ('angles', 'rates', 'effectors', 'com_velocity', 'height')
+_UPRIGHT = np.pi / 2  # rad
+_ONE = np.ones(())
 CENTRES = ('clip', 'posture', 'original')  # of position control
 
 
@@ -181,28 +179,34 @@ class Imitation(Task):
         falls = world.sensor_addresses(self._fall_sensors)
         self._fall = slice(int(falls[0]), int(falls[-1]) + 1)
         self.reference = Reference(
-            self.clip, world.models[0], self._pose_qpos, self._pose_dof, links, effectors
-        )
+            self.clip, world.models[0], self._pose_qpos, self._pose_dof, links, effectors,
+            PHASE_BINS,
+        )  # fmt: skip
         columns = self.reference.columns
         self._phase_step = self.control_timestep / self.reference.period
         self._target_columns = slice(columns['height'].start, columns['velocities'].stop)
+        self._phase_columns = slice(columns['quarter'].start - 1, columns['quarter'].stop)
 
         # Within the loop, bodies and joints stand in the engine's order, so that all of a
         # character is one slice of every array; only the observation is put into link order.
         self._bodies = bodies = slice(int(links.min()), int(links.max()) + 1)
         order = links - bodies.start
         self._link_order = None if (order == np.arange(len(links))).all() else order
-        self._effector_bodies = effectors - bodies.start
-        mass = world.models[0].body_mass[bodies, None]
-        self._share = mass / mass.sum()
-        # Weights of the squared differences of what the reward compares.
-        weights = row.weights[np.argsort(self._pose_qpos[2:])]
+        # Columns of end effectors in the flat xpos: all x, then all z, m.
+        self._effector_xz = np.concatenate([3 * effectors, 3 * effectors + 2])
+        mass = world.models[0].body_mass[bodies]
+        self._share = (mass / mass.sum())[None]
+        # What each squared difference contributes to each error, (features compared, terms).
         count = len(effectors)
-        self._weights = np.concatenate([
-            weights, weights, np.full(2 * count, 1 / count), [rewards.COM_ERROR_FACTOR] * 2, [1.0],
-        ])  # fmt: skip
-        self._compared = {name: columns[name] for name in _COMPARED}
-        self._term_starts = np.array([part.start for part in self._compared.values()])
+        weights = row.weights[np.argsort(self._pose_qpos[2:])]
+        parts = {
+            'angles': weights, 'rates': weights, 'effectors': np.full(2 * count, 1 / count),
+            'com_velocity': np.full(2, rewards.COM_ERROR_FACTOR), 'height': np.ones(1),
+        }  # fmt: skip
+        self._compared = {name: columns[name] for name in parts}
+        self._weights = np.zeros((self._compared['height'].stop, len(parts)))
+        for term, (name, weight) in enumerate(parts.items()):
+            self._weights[columns[name], term] = weight
 
         n = world.n
         self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
@@ -210,11 +214,13 @@ class Imitation(Task):
         self.reward_terms = np.zeros((n, len(rewards.IMITATION_TERMS)))
         self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
         self.phase = np.zeros(n)  # of the clip, in [0, 1)
-        self._start_phases = np.zeros(n)
-        self._steps = np.zeros(n)
+        self._start_cycles = np.zeros(n)  # phase of the start
+        self._cycles = np.zeros(n)  # time on the clip in periods: the phase, not wrapped
+        self._speed = np.zeros(n)
         # One ground query serves samples, root and end effectors.
         self._ground_x = np.zeros((n, len(self._samples) + count))
         self._comparison = np.zeros((n, len(self._weights)))
+        self._errors = np.zeros((n, 1, len(parts)))
         self._all = self._views(slice(None))
 
     def _views(self, rows: slice) -> SimpleNamespace:
@@ -229,9 +235,14 @@ class Imitation(Task):
         pose = out[:, blocks['pose']]
         shape = (len(out), bodies.stop - bodies.start, 2)
         position, velocity = pose[:, 1:].reshape(shape), out[:, blocks['velocity']].reshape(shape)
-        permuted = self._link_order is not None
+        # Computed in the engine's order; out of place where the link order differs.
+        position_out, velocity_out = position, velocity
+        if self._link_order is not None:
+            position, velocity = np.empty(shape), np.empty(shape)
         ground_x, compared = self._ground_x[rows], self._comparison[rows]
-        view = SimpleNamespace(
+        part = {name: compared[:, columns] for name, columns in self._compared.items()}
+        count = part['effectors'].shape[1] // 2
+        return SimpleNamespace(
             rows=rows,
             root=world.qpos[rows, None, x : z + 1],
             x=world.qpos[rows, x, None],
@@ -239,33 +250,42 @@ class Imitation(Task):
             pitch=world.qpos[rows, pitch],
             angles=world.qpos[rows, angles],
             rates=world.qvel[rows, rates],
-            xpos=world.xpos[rows, bodies, ::2],
+            xpos=world.xpos[rows].reshape(len(out), -1),
             xipos=world.xipos[rows, bodies, ::2],
             spin=world.cvel[rows, bodies, 1:2],
-            linear=world.cvel[rows, bodies, 3:6:2],
+            linear_x=world.cvel[rows, bodies, 3],
+            linear_z=world.cvel[rows, bodies, 5],
             com=world.subtree_com[rows, bodies.start, None, ::2],
-            phase=self.phase[rows],
             com_x=world.subtree_com[rows, bodies.start, :1],
+            fall=world.sensordata[rows, self._fall],
+            phase=self.phase[rows],
+            phase_column=self.phase[rows, None],
+            position=position,
+            velocity=velocity,
+            velocity_x=velocity[:, :, 0],
+            velocity_z=velocity[:, :, 1],
+            position_out=position_out,
+            velocity_out=velocity_out,
             ground_x=ground_x,
             sample_x=ground_x[:, : len(self._samples)],
-            effector_x=ground_x[:, len(self._samples) :],
+            effector_ground_x=ground_x[:, len(self._samples) :],
             compared=compared,
-            **{f'compared_{name}': compared[:, part] for name, part in self._compared.items()},
+            angles_out=part['angles'],
+            rates_out=part['rates'],
+            effectors=part['effectors'],
+            effector_x=part['effectors'][:, :count],
+            effector_z=part['effectors'][:, count:],
+            com_velocity=part['com_velocity'][:, None],
+            height_out=part['height'],
+            errors=self._errors[rows],
+            reward_terms=self.reward_terms[rows],
             height=pose[:, :1],
-            # Computed in the engine's order; out of place where the link order differs.
-            position=np.empty(shape) if permuted else position,
-            velocity=np.empty(shape) if permuted else velocity,
-            position_out=position,
-            velocity_out=velocity,
             terrain=out[:, blocks.get('terrain', slice(0, 0))],
             strain=out[:, blocks['strain']] if 'strain' in blocks else None,
             tendons=world.ten_length[rows],
             target=out[:, blocks['target']] if 'target' in blocks else None,
             phase_out=out[:, blocks['phase']] if 'phase' in blocks else None,
-            fall=world.sensordata[rows, self._fall],
         )
-        view.compared_effectors = view.compared_effectors.reshape(len(out), -1, 2)
-        return view
 
     def begin_episode(self, row: int, seed: np.random.SeedSequence) -> None:
         terrain_seed, start_seed = seed.spawn(2)
@@ -282,8 +302,7 @@ class Imitation(Task):
 
         world, rows = self.world, slice(row, row + 1)
         world.reset(row)
-        self.phase[row] = self._start_phases[row] = phase
-        self._steps[row] = 0
+        self.phase[row] = self._cycles[row] = self._start_cycles[row] = phase
         pose[0] = 0.0
         pose[1] += self.arena.height(np.zeros((1, 1)), rows)[0, 0]
         world.qpos[row, self._pose_qpos] = pose
@@ -309,42 +328,46 @@ class Imitation(Task):
     def act(self, action: np.ndarray) -> None:
         self.world.ctrl[:, self._controls] = self.action_map.control(action)
         # Ground ahead is laid before the physics, so that its pictures are current after it.
-        self.arena.follow(self._all.x[:, 0])
+        self.arena.follow(self._all.x)
 
     def finish_step(self) -> None:
         v = self._all
-        self._steps += 1
-        np.multiply(self._steps, self._phase_step, out=self.phase)
-        self.phase += self._start_phases
-        self.phase %= 1.0
-        fast = np.maximum.reduce(np.abs(v.rates), axis=1) > MAX_JOINT_SPEED
-        np.logical_or(self.world.diverged(), fast, out=self.diverged)
+        self._cycles += self._phase_step
+        np.remainder(self._cycles, _ONE, out=self.phase)
+        # Sums of squares are the cheapest tests for what hardly ever happens.
+        fast = np.vdot(v.rates, v.rates) > MAX_JOINT_SPEED**2
+        if fast or self.world.any_diverged():
+            np.abs(v.rates).max(1, out=self._speed)
+            np.logical_or(self.world.diverged(), self._speed > MAX_JOINT_SPEED, out=self.diverged)
+            # The last finite observation stands for what broke down.
+            kept = self.observation[self.diverged]
+            self._observe(v)
+            self.observation[self.diverged] = kept
+        else:
+            self.diverged[:] = False
+            self._observe(v)
         np.logical_or.reduce(v.fall, axis=1, out=self.failed)
         self.failed |= self.diverged
-        # The last finite observation stands for what broke down.
-        kept = self.observation[self.diverged] if self.diverged.any() else None
-        self._observe(v)
-        if kept is not None:
-            self.observation[self.diverged] = kept
         self.reward_terms[self.failed] = 0.0
         np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
     def _observe(self, v: SimpleNamespace) -> None:
         """Writes observation and reward terms of some rows from the world's state."""
         # A trunk that points backwards looks backwards.
-        backwards = np.cos(v.pitch) < 0
-        facing = np.where(backwards, -1.0, 1.0) if backwards.any() else None
+        facing = None
+        if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2:
+            facing = np.where(np.cos(v.pitch) < 0, -1.0, 1.0)[:, None]
         np.subtract(v.xipos, v.root, out=v.position)
-        # Spatial velocities are about the centre of mass of the whole tree.
-        np.multiply((v.xipos - v.com)[:, :, ::-1], v.spin, out=v.velocity)
-        v.velocity *= _CROSS
-        v.velocity += v.linear
+        # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
+        turning = v.xipos - v.com
+        turning *= v.spin
+        np.add(v.linear_x, turning[:, :, 1], out=v.velocity_x)
+        np.subtract(v.linear_z, turning[:, :, 0], out=v.velocity_z)
 
         samples = len(self._samples) - 1
-        effector = v.xpos[:, self._effector_bodies]
-        offsets = self._samples if facing is None else facing * self._samples
-        np.add(v.x, offsets, out=v.sample_x)
-        v.effector_x[...] = effector[:, :, 0]
+        v.xpos.take(self._effector_xz, axis=1, out=v.effectors, mode='clip')
+        np.add(v.x, self._samples if facing is None else facing * self._samples, out=v.sample_x)
+        v.effector_ground_x[...] = v.effector_x
         ground = self.arena.height(v.ground_x, v.rows)
         under_root = ground[:, samples, None]
         np.subtract(v.z, under_root, out=v.height)
@@ -353,24 +376,23 @@ class Imitation(Task):
 
         # What the reward compares, side by side with the same features of the reference.
         reference = self.reference.features(v.phase)
-        v.compared_angles[...] = v.angles
-        v.compared_rates[...] = v.rates
-        np.subtract(effector[:, :, 0], v.com_x, out=v.compared_effectors[:, :, 0])
-        np.subtract(effector[:, :, 1], ground[:, samples + 1 :], out=v.compared_effectors[:, :, 1])
-        np.add.reduce(v.velocity * self._share, axis=1, out=v.compared_com_velocity)
-        v.compared_height[...] = v.height
-        error = v.compared
-        error -= reference[:, : error.shape[1]]
-        error[:, 0] = rewards.wrap(error[:, 0])
+        v.angles_out[...] = v.angles
+        v.rates_out[...] = v.rates
+        v.effector_x -= v.com_x
+        v.effector_z -= ground[:, samples + 1 :]
+        np.matmul(self._share, v.velocity, out=v.com_velocity)
+        v.height_out[...] = v.height
+        error = v.compared - reference[:, : v.compared.shape[1]]
+        if facing is not None:
+            error[:, 0] = rewards.wrap(error[:, 0])
         error *= error
-        error *= self._weights
-        self.reward_terms[v.rows] = rewards.imitation(
-            np.add.reduceat(error, self._term_starts, axis=1)
-        )
+        # Row by row, so that a row's sums do not depend on how many rows there are.
+        np.matmul(error[:, None], self._weights, out=v.errors)
+        rewards.imitation(v.errors[:, 0], out=v.reward_terms)
 
         if facing is not None:
             v.position[:, :, 0] *= facing
-            v.velocity[:, :, 0] *= facing
+            v.velocity_x *= facing
         if self._link_order is not None:
             v.position_out[...] = v.position[:, self._link_order]
             v.velocity_out[...] = v.velocity[:, self._link_order]
@@ -380,8 +402,8 @@ class Imitation(Task):
         if v.target is not None:
             v.target[...] = reference[:, self._target_columns]
         else:
-            v.phase_out[:, 0] = v.phase
-            np.equal(np.floor(v.phase * PHASE_BINS)[:, None], _BINS, out=v.phase_out[:, 1:])
+            v.phase_out[...] = reference[:, self._phase_columns]
+            v.phase_out[:, :1] = v.phase_column
 
     def info(self, row: int) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
@@ -399,21 +421,19 @@ class Imitation(Task):
         Raises:
           ValueError: torque and muscle control have no such action.
         """
-        columns = {'position': 'joints', 'velocity': 'joint_rates'}
-        if self.actuation_model not in columns:
+        if self.actuation_model not in ('position', 'velocity'):
             raise ValueError(
                 f'{self.actuation_model} control cannot follow a clip open loop; position and '
                 'velocity control can'
             )
-        features = self.reference.features(self.phase[row : row + 1])[0]
-        control = features[self.reference.columns[columns[self.actuation_model]]]
-        return self.action_map.action(control)
+        time = self.phase[row : row + 1] * self.reference.period
+        sample = self.clip.pose if self.actuation_model == 'position' else self.clip.velocity
+        return self.action_map.action(sample(time)[0, 3:])
 
     def reference_pose(self, row: int) -> np.ndarray:
         """Pose of the reference beside the simulated character: x, z, pitch, joints."""
-        start = self._start_phases[row] * self.reference.period
-        now = start + self._steps[row] * self.control_timestep
-        first, pose = self.clip.pose(np.array([start, now]))
+        cycles = np.array([self._start_cycles[row], self._cycles[row]])
+        first, pose = self.clip.pose(cycles * self.reference.period)
         pose[0] -= first[0]
         pose[1] += self.arena.height(np.full((1, 1), pose[0]), slice(row, row + 1))[0, 0]
         return pose
@@ -422,8 +442,8 @@ class Imitation(Task):
         return {
             'arena': self.arena.state(row),
             'phase': float(self.phase[row]),
-            'start_phase': float(self._start_phases[row]),
-            'steps': float(self._steps[row]),
+            'start_cycles': float(self._start_cycles[row]),
+            'cycles': float(self._cycles[row]),
             'observation': self.observation[row].copy(),
             'reward': float(self.reward[row]),
             'reward_terms': self.reward_terms[row].copy(),
@@ -433,8 +453,8 @@ class Imitation(Task):
 
     def set_state(self, row: int, state: dict[str, Any]) -> None:
         self.arena.restore(row, state['arena'])
-        self.phase[row], self._start_phases[row] = state['phase'], state['start_phase']
-        self._steps[row] = state['steps']
+        self.phase[row], self._cycles[row] = state['phase'], state['cycles']
+        self._start_cycles[row] = state['start_cycles']
         self.observation[row] = state['observation']
         self.reward[row] = state['reward']
         self.reward_terms[row] = state['reward_terms']

@@ -15,11 +15,11 @@ class Reference:
 
     Features of one phase, all independent of the ground and of the distance walked; see `columns`:
       angles (1 + J,) pitch and joint angles in the engine's order, rad; rates (1 + J,) rad/s;
-      effectors (2 * E,) end effectors: x ahead of the centre of mass, z above 0, m;
+      effectors (2 * E,) end effectors: all x ahead of the centre of mass, then all z above 0, m;
       com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
-      joints (J,) joint angles in link order, rad; joint_rates (J,) rad/s.
+      quarter (bins,) one-hot of the part of the cycle that the phase lies in.
     """
 
     def __init__(
@@ -30,6 +30,7 @@ class Reference:
         pose_dof: np.ndarray,
         links: np.ndarray,
         effectors: np.ndarray,
+        bins: int,
     ) -> None:
         """Tabulates a clip.
 
@@ -40,6 +41,7 @@ class Reference:
           pose_dof: the same in qvel.
           links: body ids in link order, the root body first.
           effectors: body ids of the end effectors.
+          bins: parts of the cycle, a divisor of SAMPLES.
         """
         self.clip = clip
         self.period = clip.duration
@@ -61,18 +63,22 @@ class Reference:
             effector = data.xpos[effectors][:, ::2] - (com[0], 0)
             rows.append(
                 np.concatenate([
-                    pose[engine_order], rate[engine_order], effector.ravel(), share @ velocity,
-                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(), pose[3:], rate[3:],
+                    pose[engine_order], rate[engine_order], effector.T.ravel(), share @ velocity,
+                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(),
                 ])
             )  # fmt: skip
         table = np.array(rows)
+        quarter = np.repeat(np.eye(bins), SAMPLES // bins, axis=0)
         # Each row beside its step to the next: one look-up serves an interpolation.
-        self._table = np.concatenate([table[:-1], np.diff(table, axis=0)], axis=1)
-        self._width = table.shape[1]
+        self._table = np.concatenate(
+            [table[:-1], np.zeros((SAMPLES, 1)), quarter, np.diff(table, axis=0),
+             np.zeros((SAMPLES, 1 + bins))], axis=1,
+        )  # fmt: skip
+        self._width = self._table.shape[1] // 2
         joints, bodies = len(links) - 1, 2 * len(links)
         sizes = dict(
             angles=joints + 1, rates=joints + 1, effectors=2 * len(effectors), com_velocity=2,
-            height=1, positions=bodies, velocities=bodies, joints=joints, joint_rates=joints,
+            height=1, positions=bodies, velocities=bodies, phase=1, quarter=bins,
         )  # fmt: skip
         stops = np.cumsum(list(sizes.values()))
         self.columns = {
@@ -84,7 +90,7 @@ class Reference:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
         u = phase * SAMPLES
         i = u.astype(np.int64)
-        found = self._table[i]
+        found = self._table.take(i, axis=0)
         step = found[:, self._width :]
         step *= (u - i)[:, None]
         step += found[:, : self._width]

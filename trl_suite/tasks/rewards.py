@@ -20,20 +20,24 @@ _WEIGHTS = np.array([weight for weight, _ in IMITATION_TERMS.values()])
 _SCALES = np.array([-scale for _, scale in IMITATION_TERMS.values()])
 
 
-def imitation(errors: np.ndarray) -> np.ndarray:
+def imitation(errors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Terms of the imitation reward, each already weighted.
 
     Args:
       errors: squared errors, shape (n, 5), in the order of `IMITATION_TERMS`: normalised-weight
         sums over joints (and root) of rad^2 and of rad^2/s^2; mean over end effectors of m^2; 0.1
         times the centre-of-mass velocity error in m^2/s^2; root height in m^2.
+      out: where to write the result.
 
     Returns:
       Shape (n, 5); their sum is the reward, at most 1.
     """
-    return _WEIGHTS * np.exp(_SCALES * errors)
+    terms = np.multiply(errors, _SCALES, out=out)
+    np.exp(terms, out=terms)
+    terms *= _WEIGHTS
+    return terms
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """Wraps angles in rad to [-pi, pi): the shortest rotation."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    """Wraps angles in rad to [-pi, pi]: the shortest rotation. Those inside stay bit for bit."""
+    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
