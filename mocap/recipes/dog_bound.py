@@ -8,8 +8,6 @@ then solved again for a foot that rolls without slipping, within the limits.
 
 from __future__ import annotations
 
-import dataclasses
-
 import figure
 import mujoco
 import numpy as np
@@ -181,7 +179,6 @@ class Recorder:
         torque = -weight - feet @ force
         torque[:3] = 0
         return torque
-
 
 
 def record() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

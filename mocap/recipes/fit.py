@@ -34,36 +34,41 @@ RAPTOR = (
 )
 
 # Earlier runs to start from, with the foot slow to leave and meet the ground (rise 3).
-_BIPED = dict(th0=0.12, r0=-4.0, tto=-0.5, rto=-12.0, tb=-0.35, ax=3.0, xl=0.22, rise=3.0)
 STARTS = {
     'biped2d_run': run.Run(
         'biped2d',
         0.62,
         3.4,
-        _BIPED
-        | dict(ds=0.2917, ff=0.1544, ho=0.6258, sa=0.2014, ta=-1.2809, sb=0.7076)
-        | dict(qa=4.1257, qb=9.6333, lift=0.2029, lsk=-0.0786, z=0.7893, lean=-0.0601)
-        | dict(pc2=0.0082, ps2=-0.03, pc4=-0.0087, ps4=-0.015),
+        run.shape(
+            stance=(0.2917, 0.1544, 0.6258, 0.12, -4.0, -0.5, -12.0),
+            swing=(0.2014, -1.2809, 0.7076, -0.35, 4.1257, 9.6333),
+            path=(0.2029, -0.0786, 3.0, 3.0, 0.7893, 0.22),
+            pelvis=(-0.0601, 0.0082, -0.03, -0.0087, -0.015),
+        ),
     ),
     'raptor_run_066': run.Run(
         'raptor',
         0.66,
         4.05,
-        dict(ds=0.2084, ff=0.2777, ho=0.5457, th0=0.15, r0=-1.0, tto=-0.301, rto=-12.0834)
-        | dict(sa=0.3976, ta=-1.6904, sb=0.8491, tb=0.2295, qa=4.7544, qb=10.03)
-        | dict(lift=0.1837, lsk=-0.1464, ax=8.7445, z=0.4411, lean=0.0314)
-        | dict(pc2=-0.0343, ps2=0.05, pc4=-0.0054, ps4=0.0133, xl=0.1863, rise=3.0)
-        | dict(b0=1.1986, b1=0.9807, b2=0.1291, b3=-1.1591, b4=-0.0808),
+        run.shape(
+            stance=(0.2084, 0.2777, 0.5457, 0.15, -1.0, -0.301, -12.0834),
+            swing=(0.3976, -1.6904, 0.8491, 0.2295, 4.7544, 10.03),
+            path=(0.1837, -0.1464, 3.0, 8.7445, 0.4411, 0.1863),
+            pelvis=(0.0314, -0.0343, 0.05, -0.0054, 0.0133),
+            metatarsus=(1.1986, 0.9807, 0.1291, -1.1591, -0.0808),
+        ),
     ),
     'raptor_run_050': run.Run(
         'raptor',
-        0.50,
+        0.5,
         3.95,
-        dict(ds=0.25, ff=0.3653, ho=0.4758, th0=0.1443, r0=-1.0, tto=-0.3002, rto=-12.7737)
-        | dict(sa=0.2717, ta=-1.4474, sb=0.7683, tb=0.0913, qa=2.0462, qb=5.3748)
-        | dict(lift=0.1906, lsk=-0.1316, ax=4.9387, z=0.4752, lean=0.0072)
-        | dict(pc2=-0.0105, ps2=0.0398, pc4=-0.0043, ps4=0.0094, xl=0.1201, rise=3.0)
-        | dict(b0=1.0267, b1=0.8279, b2=0.0988, b3=-1.0763, b4=0.136),
+        run.shape(
+            stance=(0.25, 0.3653, 0.4758, 0.1443, -1.0, -0.3002, -12.7737),
+            swing=(0.2717, -1.4474, 0.7683, 0.0913, 2.0462, 5.3748),
+            path=(0.1906, -0.1316, 3.0, 4.9387, 0.4752, 0.1201),
+            pelvis=(0.0072, -0.0105, 0.0398, -0.0043, 0.0094),
+            metatarsus=(1.0267, 0.8279, 0.0988, -1.0763, 0.136),
+        ),
     ),
 }
 # Speed m/s and period s of the stages to each clip; the last is the clip's.
@@ -73,7 +78,11 @@ PACES = {
     'raptor_run_066': ((4.05, 0.66),),
 }
 # A quicker touch-down and take-off than the starts': the foot does not scuff.
-QUICKER = {'biped2d_run': {'rise': 2.0}, 'raptor_run_050': {'rise': 2.0, 'lift': 0.14}, 'raptor_run_066': {'rise': 2.0, 'lift': 0.14}}
+QUICKER = {
+    'biped2d_run': {'rise': 2.0},
+    'raptor_run_050': {'rise': 2.0, 'lift': 0.14},
+    'raptor_run_066': {'rise': 2.0, 'lift': 0.14},
+}
 NARROWER = {  # taste: shorter stances and more lean cost less but look and land harder
     'biped2d': {'ds': (0.26, 0.36), 'lean': (-0.14, 0.1)},
     'raptor': {'ds': (0.21, 0.36)},
@@ -195,7 +204,9 @@ def residuals(guess: run.Run, physics: float) -> np.ndarray:
     add(physics * 0.06 * np.where(stance, 0, moment) / made.figure.mass.sum())
     # Where the ground force must act: on the planted foot, between its low corners.
     path, pitch, _ = run.foot(guess, made.foot, step)
-    corners = np.stack([path + figure.rotate(np.array([x, -height]), pitch) for x in (heel, toe)], 1)
+    corners = np.stack(
+        [path + figure.rotate(np.array([x, -height]), pitch) for x in (heel, toe)], 1
+    )
     shift = np.where(phase < 0.5, 0, guess.speed * guess.period / 2)
     x = corners[..., 0] + shift[:, None]
     low = corners[..., 1] < LOW
@@ -245,7 +256,10 @@ def main(names: list[str]) -> None:
     for name in names or STARTS:
         found, cost = find(name)
         print(f'{name}: {found.character}, {found.speed} m/s, {found.period} s, cost {cost:.3f}')
-        print(', '.join(f'{key}={value:.4f}' for key, value in found.shape.items()), flush=True)
+        for group, keys in run.SHAPE.items():
+            if keys[0] in found.shape:
+                row = ', '.join(f'{round(found.shape[key], 4)}' for key in keys)
+                print(f'    {group}=({row}),', flush=True)
 
 
 if __name__ == '__main__':

@@ -245,35 +245,59 @@ def poses(run: Run, phase: np.ndarray, passes: int = PASSES) -> np.ndarray:
     return result
 
 
+SHAPE = {
+    'stance': ('ds', 'ff', 'ho', 'th0', 'r0', 'tto', 'rto'),
+    'swing': ('sa', 'ta', 'sb', 'tb', 'qa', 'qb'),
+    'path': ('lift', 'lsk', 'rise', 'ax', 'z', 'xl'),
+    'pelvis': ('lean', 'pc2', 'ps2', 'pc4', 'ps4'),
+    'metatarsus': ('b0', 'b1', 'b2', 'b3', 'b4'),
+}
+
+
+def shape(**groups: tuple[float, ...]) -> dict[str, float]:
+    """Returns figures by name from tuples in the order of `SHAPE`."""
+    return {
+        name: value
+        for group, values in groups.items()
+        for name, value in zip(SHAPE[group], values, strict=True)
+    }
+
+
 RUNS = {
     'biped2d_run': Run(
         'biped2d',
-        0.50,
+        0.5,
         4.656,
-        dict(ds=0.26, ff=0.3081, ho=0.45, th0=0.15, r0=-4.0, tto=-0.6981, rto=-16.0)
-        | dict(sa=0.1606, ta=-1.3018, sb=0.6651, tb=-0.5, qa=4.8866, qb=8.3628)
-        | dict(lift=0.1868, lsk=-0.0987, rise=2.0, ax=1.8035, z=0.8069, xl=0.1705)
-        | dict(lean=-0.14, pc2=0.0024, ps2=-0.0335, pc4=0.0019, ps4=-0.015),
+        shape(
+            stance=(0.26, 0.3081, 0.45, 0.15, -4.0, -0.6981, -16.0),
+            swing=(0.1606, -1.3018, 0.6651, -0.5, 4.8866, 8.3628),
+            path=(0.1868, -0.0987, 2.0, 1.8035, 0.8069, 0.1705),
+            pelvis=(-0.14, 0.0024, -0.0335, 0.0019, -0.015),
+        ),
     ),
     'raptor_run_050': Run(
         'raptor',
-        0.50,
+        0.5,
         3.95,
-        dict(ds=0.2515, ff=0.3214, ho=0.5583, th0=0.1288, r0=-1.0, tto=-0.3, rto=-13.5575)
-        | dict(sa=0.4, ta=-1.3129, sb=0.8062, tb=0.2682, qa=2.3426, qb=3.9231)
-        | dict(lift=0.1484, lsk=-0.3634, rise=2.0, ax=7.9859, z=0.4655, xl=0.0987)
-        | dict(lean=0.0386, pc2=0.0186, ps2=0.0496, pc4=-0.0058, ps4=0.0123)
-        | dict(b0=0.9764, b1=0.7932, b2=0.0325, b3=-1.0103, b4=0.2653),
+        shape(
+            stance=(0.2515, 0.3214, 0.5583, 0.1288, -1.0, -0.3, -13.5575),
+            swing=(0.4, -1.3129, 0.8062, 0.2682, 2.3426, 3.9231),
+            path=(0.1484, -0.3634, 2.0, 7.9859, 0.4655, 0.0987),
+            pelvis=(0.0386, 0.0186, 0.0496, -0.0058, 0.0123),
+            metatarsus=(0.9764, 0.7932, 0.0325, -1.0103, 0.2653),
+        ),
     ),
     'raptor_run_066': Run(
         'raptor',
         0.66,
         4.05,
-        dict(ds=0.21, ff=0.4085, ho=0.5179, th0=0.15, r0=-1.0, tto=-0.3, rto=-10.8537)
-        | dict(sa=0.4, ta=-1.5841, sb=0.85, tb=0.2106, qa=5.1561, qb=10.2316)
-        | dict(lift=0.1501, lsk=-0.3032, rise=2.0, ax=9.0, z=0.4309, xl=0.1775)
-        | dict(lean=0.0101, pc2=-0.0347, ps2=0.05, pc4=-0.0038, ps4=0.0098)
-        | dict(b0=1.2914, b1=1.058, b2=0.098, b3=-1.1418, b4=-0.0901),
+        shape(
+            stance=(0.21, 0.4085, 0.5179, 0.15, -1.0, -0.3, -10.8537),
+            swing=(0.4, -1.5841, 0.85, 0.2106, 5.1561, 10.2316),
+            path=(0.1501, -0.3032, 2.0, 9.0, 0.4309, 0.1775),
+            pelvis=(0.0101, -0.0347, 0.05, -0.0038, 0.0098),
+            metatarsus=(1.2914, 1.058, 0.098, -1.1418, -0.0901),
+        ),
     ),
 }
 RATE = 240  # frames per second

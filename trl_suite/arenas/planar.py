@@ -151,6 +151,7 @@ def _decorate(root: mjcf.RootElement) -> None:
     root.visual.quality.offsamples = 0
     getattr(root.visual, 'global').offwidth = 1920
     getattr(root.visual, 'global').offheight = 1080
+    root.statistic.extent = 3  # m; of what is looked at, not of the strip: shadows stay sharp
     root.visual.map.znear = 0.01
     root.visual.headlight.set_attributes(
         ambient=(0.35, 0.35, 0.35), diffuse=(0.45, 0.45, 0.45), specular=(0.1, 0.1, 0.1)
@@ -159,15 +160,17 @@ def _decorate(root: mjcf.RootElement) -> None:
         'texture', name='sky', type='skybox', builtin='gradient', rgb1=(0.62, 0.76, 0.92),
         rgb2=(0.95, 0.97, 1.0), width=64, height=64,
     )  # fmt: skip
+    # The checker spans the width of the strip once and its edge has the colour of the sides: where
+    # tilted boxes overlap, their sides look like one.
     root.asset.add(
-        'texture', name='ground', type='2d', builtin='checker', rgb1=(0.42, 0.46, 0.40),
-        rgb2=(0.36, 0.40, 0.35), width=64, height=64,
+        'texture', name='ground', type='2d', builtin='checker', mark='edge', width=256, height=256,
+        rgb1=(0.47, 0.52, 0.44), rgb2=(0.42, 0.47, 0.40), markrgb=(0.36, 0.38, 0.33),
     )  # fmt: skip
     root.asset.add(
-        'material', name='ground', texture='ground', texrepeat=(2, 2), texuniform=True,
-        reflectance=0, specular=0,
+        'material', name='ground', texture='ground', texuniform=True, reflectance=0, specular=0,
+        texrepeat=(2, 2),
     )  # fmt: skip
     root.worldbody.add(
-        'light', name='sun', mode='trackcom', pos=(-2, -3, 6), dir=(0.3, 0.45, -1), directional=True,
+        'light', name='sun', mode='trackcom', pos=(-2, 2, 6), dir=(0.3, -0.3, -1), directional=True,
         diffuse=(0.5, 0.5, 0.48), specular=(0.1, 0.1, 0.1), castshadow=True,
     )  # fmt: skip

@@ -277,9 +277,10 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
         path = pathlib.Path(path_or_name)
     fields: dict[str, Any] = {}
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError('not an npz archive')
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError('a single array')
+        with archive:
             for field in _FIELDS:
                 fields[field] = archive[field]
     except KeyError:

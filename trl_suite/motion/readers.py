@@ -27,7 +27,6 @@ _ZERO = 1e-6  # length below which a quaternion has no direction
 _LARGEST = 1e300  # beyond it an integer of the file may not fit a float
 
 
-
 # Joint layouts of DeepMimic's characters: name -> columns. Fixed joints (wrists) have no columns.
 _ARM = (('shoulder', 4), ('elbow', 1))
 _LEG = (('hip', 4), ('knee', 1), ('ankle', 4))
@@ -181,8 +180,8 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
     array = np.array(frames, dtype=float)
-    for i in np.flatnonzero(array[:-1, 0] <= 0):
-        raise ValueError(f'{path}: frame {i}, duration: {array[i, 0]:g} s is not positive')
+    for bad in np.flatnonzero(array[:-1, 0] <= 0):
+        raise ValueError(f'{path}: frame {bad}, duration: {array[bad, 0]:g} s is not positive')
     return array
 
 

@@ -1,0 +1,483 @@
+"""Clips and their readers: sampling against analytic motions, files and refusals."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+from absl.testing import absltest, parameterized
+from scipy.spatial.transform import Rotation
+
+from trl_suite import motion
+
+PERIOD = 0.8
+
+
+def wxyz(rotation):
+    return np.roll(rotation.as_quat(), 1, axis=-1)
+
+
+def planar(loop=True, n=9, speed=2.0, climb=0.5):
+    """x and z advance steadily, pitch is zero, two hinges are sine and cosine of the cycle."""
+    times = np.linspace(0, PERIOD, n)
+    angle = 2 * np.pi * times / PERIOD
+    poses = np.stack([speed * times, 1 + climb * times, 0 * times, np.sin(angle), np.cos(angle)], 1)
+    return motion.Clip('planar', times, poses, 'planar', ('right', 'left'), (1, 1), loop)
+
+
+def free(loop=True, rate=(0.3, -0.4, 1.2), n=33):
+    """The root and a ball joint turn at a constant rate about a fixed axis; a hinge stands."""
+    times = np.linspace(0, PERIOD, n)
+    turn = wxyz(Rotation.from_rotvec(np.outer(times, rate)))
+    poses = np.column_stack([times, -times, 1 + 0 * times, turn, turn, 0.7 + 0 * times])
+    return motion.Clip('free', times, poses, 'free', ('ball', 'hinge'), (4, 1), loop)
+
+
+class SamplingTest(parameterized.TestCase):
+    def test_passes_through_the_key_frames(self):
+        for clip in (planar(loop=False), free(loop=False)):
+            np.testing.assert_allclose(clip.pose(clip.times), clip.poses, atol=1e-12)
+
+    def test_linear_between_uneven_frames(self):
+        clip = motion.Clip('c', [0, 0.1, 0.5], [[0, 1, 0], [1, 1, 2], [5, 3, 0]], 'planar', (), ())
+        np.testing.assert_allclose(clip.pose(0.2), (2, 1.5, 1.5))
+
+    def test_any_shape_of_times(self):
+        clip = free()
+        for shape in ((), (3,), (2, 5), (0,)):
+            self.assertEqual(clip.pose(np.zeros(shape)).shape, (*shape, 12))
+            self.assertEqual(clip.velocity(np.zeros(shape)).shape, (*shape, 10))
+            self.assertEqual(clip.phase(np.zeros(shape)).shape, shape)
+
+    @parameterized.parameters(-3, -1, 0, 1, 7)
+    def test_displacement_accumulates_height_included(self, cycles):
+        clip = planar()
+        t = 0.3 * PERIOD
+        there = clip.pose(t + cycles * PERIOD) - clip.pose(t)
+        np.testing.assert_allclose(there[:2], cycles * np.array([1.6, 0.4]), atol=1e-9)
+        np.testing.assert_allclose(there[2:], 0, atol=1e-9)
+
+    def test_continuous_over_the_seams(self):
+        t = np.linspace(-2 * PERIOD, 2 * PERIOD, 4001)
+        steps = np.abs(np.diff(planar().pose(t), axis=0)).max()
+        self.assertLess(steps, 0.01)
+
+    def test_heading_does_not_accumulate(self):
+        clip = free()
+        np.testing.assert_allclose(clip.pose(PERIOD + 0.1)[3:7], clip.pose(0.1)[3:7])
+
+    def test_somersault_goes_on_turning(self):
+        times = np.linspace(0, 1, 11)
+        poses = np.stack([times, 1 + 0 * times, -2 * np.pi * times], axis=1)
+        clip = motion.Clip('flip', times, poses, 'planar', (), (), True)
+        np.testing.assert_allclose(clip.pose([-0.5, 1.25])[:, 2], (np.pi, -2.5 * np.pi))
+        np.testing.assert_allclose(clip.velocity(1.0), (1, 0, -2 * np.pi))
+
+    def test_without_loop_holds_the_ends(self):
+        clip = planar(loop=False)
+        np.testing.assert_allclose(clip.pose([-1, 9]), clip.poses[[0, -1]], atol=1e-12)
+        np.testing.assert_array_equal(clip.velocity([-0.1, 0.9]), np.zeros((2, 5)))
+
+    def test_without_loop_ends_have_a_velocity(self):
+        velocity = planar(loop=False).velocity([0, PERIOD])
+        np.testing.assert_allclose(velocity[:, :2], [[2, 0.5]] * 2)
+
+    def test_velocity_of_a_sine(self):
+        clip = planar(n=801)
+        t = np.linspace(-PERIOD, 2 * PERIOD, 97)
+        w = 2 * np.pi / PERIOD
+        velocity = clip.velocity(t)
+        np.testing.assert_allclose(velocity[:, 3], w * np.cos(w * t), atol=0.03)
+        np.testing.assert_allclose(velocity[:, 4], -w * np.sin(w * t), atol=0.03)
+        np.testing.assert_allclose(velocity[:, :3], [[2, 0.5, 0]] * 97, atol=1e-9)
+
+    def test_angular_velocity_is_in_body_axes(self):
+        # Turned by a first rotation, then spinning about a fixed world axis.
+        first, rate = Rotation.from_euler('z', 90, degrees=True), np.array([1.5, 0, 0])
+        times = np.linspace(0, PERIOD, 9)
+        turn = wxyz(Rotation.from_rotvec(np.outer(times, rate)) * first)
+        poses = np.column_stack([np.zeros((9, 3)), turn])
+        clip = motion.Clip('spin', times, poses, 'free', (), ())
+        np.testing.assert_allclose(clip.velocity(0.4)[3:], (0, -1.5, 0), atol=1e-9)
+
+    def test_slerp_turns_at_a_constant_rate(self):
+        clip = free(n=3, loop=False)
+        t = np.linspace(0.05, PERIOD - 0.05, 20)
+        expected = wxyz(Rotation.from_rotvec(np.outer(t, (0.3, -0.4, 1.2))))
+        np.testing.assert_allclose(clip.pose(t)[:, 3:7], expected, atol=1e-12)
+        np.testing.assert_allclose(clip.velocity(t)[:, 6:9], [(0.3, -0.4, 1.2)] * 20, atol=1e-9)
+
+    def test_slerp_takes_the_shorter_way(self):
+        clip = free(n=3, loop=False)
+        poses = clip.poses.copy()
+        poses[1, 3:7] *= -1
+        other = dataclasses.replace(clip, poses=poses)
+        t = np.linspace(0, PERIOD, 11)
+        rotation = Rotation.from_quat(np.roll(clip.pose(t)[:, 3:7], -1, axis=1))
+        changed = Rotation.from_quat(np.roll(other.pose(t)[:, 3:7], -1, axis=1))
+        np.testing.assert_allclose((rotation.inv() * changed).magnitude(), 0, atol=1e-9)
+
+    def test_phase(self):
+        np.testing.assert_allclose(
+            planar().phase([-0.2, 0, 0.2, 0.8, 1.0]), (0.75, 0, 0.25, 0, 0.25)
+        )
+        np.testing.assert_allclose(planar(loop=False).phase([-1, 0.2, 1]), (0, 0.25, 1))
+
+    def test_figures_of_a_cycle(self):
+        clip = planar()
+        self.assertAlmostEqual(clip.duration, PERIOD)
+        np.testing.assert_allclose(clip.displacement, (1.6, 0.4))
+        self.assertAlmostEqual(clip.speed, 2.0)
+        self.assertAlmostEqual(free().speed, np.sqrt(2))  # horizontal, x and y
+
+
+class MirrorTest(absltest.TestCase):
+    def test_planar_swaps_the_sides(self):
+        clip = planar()
+        mirrored = clip.mirrored([('right', 'left')])
+        np.testing.assert_array_equal(mirrored.poses, clip.poses[:, [0, 1, 2, 4, 3]])
+
+    def test_twice_is_the_same(self):
+        clip = free()
+        twice = clip.mirrored([]).mirrored([])
+        np.testing.assert_allclose(twice.poses, clip.poses)
+
+    def test_free_is_reflected_in_the_sagittal_plane(self):
+        clip, mirror = free(), np.diag([1, -1, 1])
+        mirrored = clip.mirrored([])
+        np.testing.assert_allclose(mirrored.poses[:, :3], clip.poses[:, :3] @ mirror)
+        for first in (3, 7):
+            turn = [
+                Rotation.from_quat(np.roll(c.poses[:, first : first + 4], -1, axis=1)).as_matrix()
+                for c in (clip, mirrored)
+            ]
+            np.testing.assert_allclose(turn[1], mirror @ turn[0] @ mirror, atol=1e-12)
+
+    def test_refusals(self):
+        with self.assertRaisesRegex(ValueError, "unknown joint 'rihgt'.*'right'"):
+            planar().mirrored([('rihgt', 'left')])
+        with self.assertRaisesRegex(ValueError, 'differ in kind'):
+            free().mirrored([('ball', 'hinge')])
+
+
+class ConstructionTest(parameterized.TestCase):
+    @parameterized.named_parameters(
+        ('one_frame', {'times': [0], 'poses': np.zeros((1, 5))}, 'times: at least 2'),
+        ('late_start', {'times': np.linspace(0.1, 1, 9)}, 'times: must start at 0'),
+        ('standing_time', {'times': [0, 0, *range(1, 8)]}, 'times: .* increase strictly'),
+        ('infinite_time', {'times': [*range(8), np.inf]}, r'times: not finite at \[8\]'),
+        ('too_few_columns', {'poses': np.zeros((9, 4))}, r'poses: shape is \(9, 4\).*\(9, 5\)'),
+        ('no_table', {'poses': np.zeros(9)}, 'poses: shape'),
+        ('ragged', {'poses': [[1, 2], [3]]}, 'poses: an array of numbers'),
+        ('not_finite', {'poses': np.full((9, 5), np.nan)}, r'poses: not finite at \[0, 0\]'),
+        ('unknown_root', {'root': 'plnar'}, "root: unknown root 'plnar'.*'planar'"),
+        ('size', {'sizes': (1, 3)}, 'sizes'),
+        ('sizes', {'sizes': (1,)}, 'sizes: 1 for 2 joints'),
+        ('twice', {'joints': ('left', 'left')}, 'joints: a name occurs twice'),
+    )
+    def test_refuses(self, change, message):
+        with self.assertRaisesRegex(ValueError, f"clip 'planar', {message}"):
+            dataclasses.replace(planar(), **change)
+
+    def test_refuses_a_quaternion_off_the_unit_sphere(self):
+        poses = free().poses.copy()
+        poses[2, 7:11] *= 1.1
+        with self.assertRaisesRegex(ValueError, 'column 7 of frame 2 has length 1.1'):
+            dataclasses.replace(free(), poses=poses)
+
+    def test_keeps_its_own_locked_copy(self):
+        poses = planar().poses.copy()
+        clip = dataclasses.replace(planar(), poses=poses)
+        poses[:] = 0
+        self.assertEqual(clip.poses[0, 1], 1)
+        with self.assertRaises(ValueError):
+            clip.poses[0, 0] = 1
+
+    def test_needs_no_physics_engine(self):
+        code = (
+            'import sys; from trl_suite import motion; motion.load(motion.names()[0]).velocity(0.1);'
+            "assert not {'mujoco', 'dm_control'} & set(sys.modules), 'imported'"
+        )
+        result = subprocess.run(
+            [sys.executable, '-c', code], env=os.environ | {'PYTHONPATH': os.pathsep.join(sys.path)}
+        )
+        self.assertEqual(result.returncode, 0)
+
+
+class FileTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+    @parameterized.parameters(planar, free)
+    def test_round_trip(self, make):
+        path = self.folder / 'clip.npz'
+        clip = dataclasses.replace(make(), name='clip', description='Größe')
+        clip.save(path)
+        for found in (motion.load(path), motion.load(str(path))):
+            for field in dataclasses.fields(clip):
+                np.testing.assert_array_equal(
+                    getattr(found, field.name), getattr(clip, field.name), field.name
+                )
+        self.assertEqual(os.listdir(self.folder), ['clip.npz'])
+
+    def test_failed_save_leaves_the_old_file(self):
+        path = self.folder / 'clip.npz'
+        planar().save(path)
+        before = path.read_bytes()
+        with (
+            self.assertRaises(RuntimeError),
+            absltest.mock.patch.object(
+                np, 'savez_compressed', side_effect=RuntimeError('disk full')
+            ),
+        ):
+            free().save(path)
+        self.assertEqual(path.read_bytes(), before)
+        self.assertEqual(os.listdir(self.folder), ['clip.npz'])
+
+    def test_unknown_name(self):
+        with self.assertRaisesRegex(ValueError, "unknown clip 'biped2d_wlak'.*'biped2d_walk'"):
+            motion.load('biped2d_wlak')
+
+    def test_no_such_file(self):
+        with self.assertRaises(FileNotFoundError):
+            motion.load(self.folder / 'none.npz')
+
+    @parameterized.named_parameters(
+        ('empty', b''),
+        ('text', b'once upon a time'),
+        ('broken_zip', b'PK\x03\x04 and no more'),
+    )
+    def test_no_archive(self, content):
+        path = self.folder / 'bad.npz'
+        path.write_bytes(content)
+        with self.assertRaisesRegex(ValueError, 'bad.npz'):
+            motion.load(path)
+
+    def test_cut_short_or_damaged(self):
+        path = self.folder / 'bad.npz'
+        planar().save(path)
+        whole = path.read_bytes()
+        for content in (whole[:-30], whole[: len(whole) // 2]):
+            path.write_bytes(content)
+            with self.assertRaisesRegex(ValueError, 'bad.npz'):
+                motion.load(path)
+        for at in range(60, len(whole) - 60, 37):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+            try:
+                motion.load(path)
+            except ValueError as error:
+                self.assertIn('bad.npz', str(error))
+
+    def test_single_array(self):
+        path = self.folder / 'bad.npz'
+        with path.open('wb') as file:
+            np.save(file, np.zeros(3))
+        with self.assertRaisesRegex(ValueError, 'bad.npz'):
+            motion.load(path)
+
+    @parameterized.named_parameters(
+        ('missing', 'loop', None, "'loop' is missing"),
+        ('objects', 'joints', np.array(['a', 1], dtype=object), "'joints'"),
+        ('kind', 'loop', np.array('yes'), "'loop' has type"),
+        ('axes', 'root', np.array(['planar']), "'root' has type"),
+        ('sizes', 'sizes', np.array([1.0, 1.0]), "'sizes' has type"),
+        ('content', 'times', np.arange(9.0) + 1, 'times: must start at 0'),
+        ('numbers', 'poses', np.array(['a', 'b']), 'poses: an array of numbers'),
+    )
+    def test_malformed_field(self, field, value, message):
+        path = self.folder / 'bad.npz'
+        planar().save(path)
+        with np.load(path) as archive:
+            fields = dict(archive)
+        del fields[field]
+        if value is not None:
+            fields[field] = value
+        np.savez(path, **fields)
+        with self.assertRaisesRegex(ValueError, f'bad.npz: .*{message}'):
+            motion.load(path)
+
+
+class ReaderTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.path = pathlib.Path(folder.name) / 'walk.txt'
+
+    def write(self, frames, **fields):
+        self.path.write_text(json.dumps({'Frames': frames} | fields))
+
+    @parameterized.product(make=(planar, free), loop=(True, False))
+    def test_round_trip(self, make, loop):
+        clip = make(loop=loop)
+        motion.write_terrainrl(clip, self.path)
+        found = motion.read_terrainrl(self.path, clip.joints, clip.sizes, clip.root)
+        np.testing.assert_allclose(found.times, clip.times, atol=1e-12)
+        np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
+        self.assertEqual(found.loop, loop)
+        self.assertEqual(found.name, 'walk')
+
+    def test_a_file_of_the_original_form(self):
+        # Tabs and blank lines; pitch +90 deg about z (up turns back), then past 180 with the
+        # quaternion's sign turned; hinge signs are kept.
+        half = np.sqrt(0.5)
+        self.path.write_text(
+            '{\n\t"Loop": true,\n\n"Frames":\t[\n'
+            f'[0.1, 1, 2, 0, {half}, 0, 0, {half}, -0.3],\n\n'
+            f'[0.2, 1.5, 2.5, 0, {half}, 0, 0, {-half}, 0.4],\t[9, 2, 3, 0, 2, 0, 0, 2, 0.5]]}}'
+        )
+        clip = motion.read_terrainrl(self.path, ['knee'], [1], 'planar')
+        np.testing.assert_allclose(clip.times, (0, 0.1, 0.3))
+        np.testing.assert_allclose(
+            clip.poses[:, [0, 1, 3]], [(1, 2, -0.3), (1.5, 2.5, 0.4), (2, 3, 0.5)]
+        )
+        # 90 to -90 to 90: half turns are ambiguous, but none is more than half a turn.
+        self.assertAlmostEqual(clip.poses[0, 2], np.pi / 2)
+        self.assertLessEqual(np.abs(np.diff(clip.poses[:, 2])).max(), np.pi + 1e-9)
+
+    def test_planar_pitch_is_continuous(self):
+        pitch = np.linspace(0.5, 12, 30)
+        signs = np.where(np.arange(30) % 3, 1, -1)  # a quaternion and its negative are the same
+        frames = [
+            [0.1, 0, 1, 0, s * np.cos(p / 2), 0, 0, s * np.sin(p / 2)]
+            for p, s in zip(pitch, signs, strict=True)
+        ]
+        self.write(frames)
+        clip = motion.read_terrainrl(self.path, (), (), 'planar')
+        np.testing.assert_allclose(clip.poses[:, 2], pitch, atol=1e-9)
+
+    def test_turns_the_frame(self):
+        # Up is y and right is z in the file: yaw about its y is yaw about our z, and so on.
+        turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
+        frame = [0.1, 1, 2, 3, *wxyz(turn), *wxyz(turn)]
+        self.write([frame, frame])
+        clip = motion.read_terrainrl(self.path, ['ball'], [4], 'free')
+        np.testing.assert_allclose(clip.poses[0, :3], (1, -3, 2))
+        expected = wxyz(Rotation.from_rotvec([0.1, -0.3, 0.2]))
+        np.testing.assert_allclose(clip.poses[0, 3:7], expected)
+        np.testing.assert_allclose(clip.poses[0, 7:11], expected)
+
+    def test_normalises_quaternions(self):
+        self.write([[0.1, 0, 1, 0, 3, 0, 0, 4], [0, 0, 1, 0, 3, 0, 0, 4]])
+        clip = motion.read_terrainrl(self.path, (), (), 'free')
+        np.testing.assert_allclose(clip.poses[0, 3:], (0.6, 0, -0.8, 0))
+
+    @parameterized.parameters((motion.HUMANOID3D, 44), (motion.DOG3D, 84))
+    def test_deepmimic_layouts(self, layout, length):
+        self.assertEqual(8 + sum(layout.values()), length)
+        frame = [1 / 30, 0, 1, 0, 1, 0, 0, 0]
+        for size in layout.values():
+            frame += [1, 0, 0, 0] if size == 4 else [0.5]
+        self.write([frame, frame], Loop='wrap')
+        clip = motion.read_deepmimic(self.path, tuple(layout), tuple(layout.values()))
+        self.assertEqual(clip.poses.shape, (2, length - 1))
+        self.assertTrue(clip.loop)
+
+    def deepmimic(self, **fields):
+        self.write(
+            [[0.1, 5, 1, 7, 1, 0, 0, 0], [0.3, 6, 1.1, 7, 1, 0, 0, 0], [0, 9, 1.4, 8, 1, 0, 0, 0]],
+            **fields,
+        )
+        return motion.read_deepmimic(self.path, (), ())
+
+    def test_deepmimic_starts_over_the_origin(self):
+        clip = self.deepmimic(Loop='none')
+        self.assertFalse(clip.loop)
+        np.testing.assert_allclose(clip.poses[:, :3], [(0, 0, 1), (1, 0, 1.1), (4, -1, 1.4)])
+
+    def test_deepmimic_keeps_its_height_over_cycles(self):
+        fields = {'RightJoints': [3], 'LeftJoints': [9], 'VelFilterCutoff': 6}
+        clip = self.deepmimic(Loop='wrap', **fields)
+        np.testing.assert_allclose(clip.displacement, (4, -1, 0), atol=1e-12)
+        climbing = self.deepmimic(Loop='wrap', CycleSyncRootHeight=True)
+        np.testing.assert_allclose(climbing.displacement, (4, -1, 0.4))
+
+    @parameterized.parameters(('CycleSyncRootPos', False), ('CycleSyncRootRot', True))
+    def test_deepmimic_refuses_other_cycles(self, field, value):
+        with self.assertRaisesRegex(ValueError, f'walk.txt: {field}: {value} is not supported'):
+            self.deepmimic(Loop='wrap', **{field: value})
+        self.deepmimic(Loop='none', **{field: value})
+
+    @parameterized.parameters(
+        (motion.read_deepmimic, True, "'wrap' or 'none'"),
+        (motion.read_terrainrl, 'wrap', 'true or false'),
+    )
+    def test_loop_of_the_other_dialect(self, read, loop, message):
+        self.write([[0.1, 0, 0, 0, 1, 0, 0, 0]] * 2, Loop=loop)
+        more = ('free',) if read is motion.read_terrainrl else ()
+        with self.assertRaisesRegex(ValueError, f'walk.txt: Loop: {message}'):
+            read(self.path, (), (), *more)
+
+    GOOD = (0.1, 0, 1, 0, 1, 0, 0, 0, 0.2)
+
+    @parameterized.named_parameters(
+        ('no_frames', {}, 'Frames: an array'),
+        ('number_for_frames', {'Frames': 3}, 'Frames: an array'),
+        ('one_frame', {'Frames': [GOOD]}, 'Frames: at least 2 are needed, found 1'),
+        ('number_for_a_frame', {'Frames': [GOOD, 3]}, 'frame 1: an array'),
+        ('ragged', {'Frames': [GOOD, GOOD, GOOD[:-1]]}, 'frame 2 has 8 numbers, frame 0 has 9'),
+        ('short', {'Frames': [GOOD[:5]] * 2}, 'frame 0 has 5 numbers'),
+        ('layout', {'Frames': [(*GOOD, 1)] * 2}, 'frame 0 has 10 .* needs 9'),
+        ('text', {'Frames': [GOOD, (*GOOD[:8], 'a')]}, "frame 1, column 8: 'a'"),
+        ('null', {'Frames': [GOOD, (None, *GOOD[1:])]}, 'frame 1, duration: None'),
+        ('truth', {'Frames': [GOOD, (0.1, True, *GOOD[2:])]}, 'frame 1, root position: True'),
+        (
+            'nan',
+            {'Frames': [GOOD, (*GOOD[:4], np.nan, 0, 0, 1, 0)]},
+            'frame 1, root quaternion: nan',
+        ),
+        ('infinite', {'Frames': [GOOD, (*GOOD[:8], np.inf)]}, 'frame 1, column 8: inf'),
+        ('huge', {'Frames': [GOOD, (*GOOD[:8], 10**400)]}, 'frame 1, column 8'),
+        ('standing', {'Frames': [GOOD, (0, *GOOD[1:]), GOOD]}, 'frame 1, duration: 0 s'),
+        ('backwards', {'Frames': [(-0.1, *GOOD[1:]), GOOD]}, 'frame 0, duration: -0.1 s'),
+        (
+            'zero',
+            {'Frames': [GOOD, (0.1, 0, 1, 0, 0, 0, 0, 0, 0)]},
+            'frame 1, root quaternion: .*zero',
+        ),
+        (
+            'off_plane',
+            {'Frames': [GOOD, (0.1, 0, 1, 0.1, 1, 0, 0, 0, 0)]},
+            'frame 1, root position',
+        ),
+        ('tilted', {'Frames': [GOOD, (0.1, 0, 1, 0, 1, 0.2, 0, 0, 0)]}, 'frame 1, root quaternion'),
+    )
+    def test_malformed(self, content, message):
+        self.path.write_text(json.dumps(content))
+        with self.assertRaisesRegex(ValueError, f'walk.txt: {message}'):
+            motion.read_terrainrl(self.path, ['knee'], [1], 'planar')
+
+    def test_zero_quaternion_of_a_joint(self):
+        good = (0.1, 0, 1, 0, 1, 0, 0, 0, 0.3, 1, 0, 0, 0)
+        self.write([good, (*good[:9], 0, 0, 0, 0)])
+        with self.assertRaisesRegex(ValueError, "frame 1, joint 'ball': the quaternion is zero"):
+            motion.read_terrainrl(self.path, ['knee', 'ball'], [1, 4], 'planar')
+
+    @parameterized.parameters('', '[1, 2', '{"Frames": [}', '[]', '\ufeff')
+    def test_not_json(self, content):
+        self.path.write_text(content)
+        with self.assertRaisesRegex(ValueError, 'walk.txt: '):
+            motion.read_terrainrl(self.path, (), (), 'planar')
+
+    def test_binary(self):
+        self.path.write_bytes(b'\xff\xfe\x00\x01')
+        with self.assertRaisesRegex(ValueError, 'walk.txt: not JSON'):
+            motion.read_terrainrl(self.path, (), (), 'planar')
+
+    def test_last_duration_is_ignored(self):
+        good = list(self.GOOD)
+        for last in (0, -1, 9):
+            self.write([good, good, [last, *good[1:]]])
+            clip = motion.read_terrainrl(self.path, ['knee'], [1], 'planar')
+            self.assertAlmostEqual(clip.duration, 0.2)
+
+
+if __name__ == '__main__':
+    absltest.main()
