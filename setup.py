@@ -30,7 +30,15 @@ setup(
     ],
     extras_require={
         'video': ['imageio[ffmpeg]', 'matplotlib'],
-        'test': ['absl-py', 'pytest', 'pytest-xdist', 'build', 'imageio[ffmpeg]', 'matplotlib', 'scipy'],
+        'test': [
+            'absl-py',
+            'pytest',
+            'pytest-xdist',
+            'build',
+            'imageio[ffmpeg]',
+            'matplotlib',
+            'scipy',
+        ],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1'],
     },
     entry_points={'console_scripts': ['trl-suite = trl_suite.cli:main']},

@@ -1,9 +1,9 @@
 """Locomotion environments over random terrain: Terrain RL Simulator on MuJoCo and dm_control.
 
-    from trl_suite import suite
+from trl_suite import suite
 
-    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1})
-    time_step = environment.reset()
+environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1})
+time_step = environment.reset()
 """
 
 import importlib
@@ -18,7 +18,7 @@ if sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get(
 __version__ = '0.1.0'
 
 _FROM_SUITE = ('ALL_IDS', 'ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN', 'build', 'load', 'make')
-__all__ = ['suite', *_FROM_SUITE]  # noqa: PLE0604
+__all__ = ['suite', *_FROM_SUITE]
 
 
 def __getattr__(name: str) -> Any:

@@ -137,7 +137,9 @@ class Environment(composer.Environment):
             raise ValueError(f'action is not an array of numbers: {error}') from None
         if action.shape != (size,):
             raise ValueError(f'action has shape {action.shape}; expected ({size},)')
-        if not np.isfinite(action).all():
+        if not np.vdot(action, action) < np.inf:  # the quick test; huge numbers pass the next
+            if np.isfinite(action).all():
+                return action
             i = int(np.flatnonzero(~np.isfinite(action))[0])
             name = self._task.action_map.names[i]
             raise ValueError(f'action[{i}] ({name}) is {action[i]}; expected finite numbers')
@@ -215,10 +217,10 @@ class Environment(composer.Environment):
           ValueError: the state belongs to another environment.
         """
         expected = self._task.world.get_state(0).shape
-        if np.shape(state.get('world')) != expected:
+        found = np.shape(state.get('world', ()))
+        if found != expected:
             raise ValueError(
-                f'the state has a world of shape {np.shape(state.get("world"))}; this environment '
-                f'needs {expected}'
+                f'the state has a world of shape {found}; this environment needs {expected}'
             )
         self._task.set_state(0, state['task'])
         self._task.world.set_state(0, state['world'])

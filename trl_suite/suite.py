@@ -69,14 +69,16 @@ def load(
         raise ValueError(errors.unknown('domain', domain_name, TASKS_BY_DOMAIN))
     if task_name not in TASKS_BY_DOMAIN[domain_name]:
         raise ValueError(
-            errors.unknown(f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name])
+            errors.unknown(
+                f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name]
+            )
         )
     row = catalogue.BY_TASK[domain_name, task_name]
     return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def make(
-    id: str,  # noqa: A002
+    id: str,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
@@ -87,7 +89,7 @@ def make(
     return build_row(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
-def find(id: str) -> Row:  # noqa: A002
+def find(id: str) -> Row:
     """Returns the row of an id or alias.
 
     Raises:

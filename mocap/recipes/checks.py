@@ -12,6 +12,9 @@ import numpy as np
 from trl_suite.motion.clip import Clip
 
 SAMPLES = 2000
+GROUP = (
+    3  # geom group of the collision boxes, the dog's tail (which collides with nothing) included
+)
 NEAR = 0.003  # m; a foot is planted while its lowest corner is lower than this
 CHARACTERS = {
     'biped2d_walk': 'biped2d',
@@ -59,12 +62,12 @@ class Report:
 
 
 def corners(character: str, clip: Clip, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the corners of every box that can collide, in the world, (times, 8, 3) by geom name."""
+    """Returns the corners of every collision box in the world, (times, 8, 3) by geom name."""
     model = figure.model(character)
     data = mujoco.MjData(model)
     poses = clip.pose(t)
     address = [model.jnt_qposadr[model.joint(name).id] for name in clip.joints]
-    boxes = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
+    boxes = [g for g in range(model.ngeom) if model.geom_group[g] == GROUP]
     found = {model.geom(g).name: np.empty((len(t), 8, 3)) for g in boxes}
     for i, pose in enumerate(poses):
         data.qpos[:3] = pose[:3]

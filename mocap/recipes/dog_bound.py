@@ -68,7 +68,6 @@ BLEND = 24  # samples over which a change of a foot's path grows and fades
 MARGIN = 0.01  # rad to the joint limits
 SOLE = ((-0.025, -0.035), (0.085, -0.035))  # heel and tip of both feet from their joint, m
 TAIL = JOINTS[8:12]
-TAIL_SWING = 0.5  # share kept: the recorded tail, which collides with nothing, dips into the ground
 
 
 class Recorder:
@@ -314,7 +313,9 @@ def clip() -> Clip:
     phase = np.arange(PHASES + 1) / PHASES
     poses[:, 0] += advance * phase[:-1]
     tail = [3 + JOINTS.index(name) for name in TAIL]
-    poses[:, tail] = TAIL_SWING * poses[:, tail] + (1 - TAIL_SWING) * poses[:, tail].mean(axis=0)
+    # The tail touches nothing in simulation and dips into the ground: let it swing about its
+    # working posture instead of the recorded mean, which hangs lower.
+    poses[:, tail] += TARGET[tail[0] - 3 : tail[-1] - 2] - poses[:, tail].mean(axis=0)
     for leg, foot in ((HIND, 0), (FRONT, 1)):
         joint, pitch = make.joints(poses)
         index = 1 + JOINTS.index(leg[-1])

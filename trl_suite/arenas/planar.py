@@ -14,7 +14,11 @@ from trl_suite.world import World
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
 POOL_LEVEL = 96  # boxes for terrain of level pieces
-POOL_SLOPED = 288  # boxes where pieces are tilted
+POOL_SLOPED = 288  # boxes where pieces may be tilted
+LEVEL_TYPES = (
+    'var2d_flat', 'var2d_gaps', 'var2d_walls', 'var2d_steps', 'var2d_mixed', 'var2d_narrow_gaps',
+    'var2d_cliffs',
+)  # fmt: skip
 FRICTION = (0.81, 0.005, 0.0001)  # 0.9 * 0.9: the original multiplies, MuJoCo takes the larger
 SOLREF = (0.005, 1)
 SOLIMP = (0.95, 0.99, 0.001)
@@ -23,6 +27,7 @@ PARKED = -60.0  # m; depth at which unused boxes lie
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
 _CELLS_PER_METRE = np.asarray(1 / SPACING)
+_REACH = 0.5 * ADVANCE + SPACING  # m; from the centre of a window to where it is laid anew
 
 
 class PlanarTerrain(composer.Arena):
@@ -45,7 +50,7 @@ class PlanarTerrain(composer.Arena):
         root.compiler.boundinertia = 0
         _decorate(root)
         ground = root.worldbody.add('body', name='terrain')
-        sloped = 'slopes' in terrain.type or 'bumps' in terrain.type
+        pool = POOL_LEVEL if terrain.type in LEVEL_TYPES else POOL_SLOPED
         self.boxes = [
             ground.add(
                 'geom', name=f'terrain_{i}', type='box', size=(0.1, boxes.HALF_WIDTH, 0.1),
@@ -53,7 +58,7 @@ class PlanarTerrain(composer.Arena):
                 pos=(0.1 * i, 0, PARKED), friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
                 condim=3, material='ground',
             )
-            for i in range(POOL_SLOPED if sloped else POOL_LEVEL)
+            for i in range(pool)
         ]  # fmt: skip
 
     @property
@@ -70,8 +75,7 @@ class PlanarTerrain(composer.Arena):
         self._offset = np.arange(world.n)[:, None] * _WINDOW
         # Of every cell its first height and the rise to the next, m; all windows in one table.
         self._cells = np.zeros((world.n * _WINDOW, 2))
-        self._lay_from = np.full((world.n, 1), np.inf)  # m; beyond these the window is laid anew
-        self._lay_to = np.full((world.n, 1), -np.inf)
+        self._centre = np.zeros((world.n, 1))  # m; of the travel that a window is good for
 
     def begin_episode(self, row: int, strip: Strip) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
@@ -80,9 +84,9 @@ class PlanarTerrain(composer.Arena):
 
     def follow(self, x: np.ndarray) -> None:
         """Keeps ground under and ahead of characters whose roots are at x, m, shape (n, 1)."""
-        moved = (x < self._lay_from) | (x > self._lay_to)
-        if moved.any():
-            for row in np.flatnonzero(moved):
+        moved = x - self._centre
+        if np.vdot(moved, moved) > _REACH**2:  # the cheap test; by rows only if it may be so
+            for row in np.flatnonzero(np.abs(moved) > _REACH).tolist():
                 # The window starts at multiples of the advance, however far a row has jumped.
                 self._lay(row, round(float(x[row, 0]) / ADVANCE) * _ADVANCE)
 
@@ -92,7 +96,8 @@ class PlanarTerrain(composer.Arena):
         u -= self._start[rows]
         cell = u.astype(np.int64)
         u -= cell
-        cell += self._offset[rows]
+        if self._world.n > 1:
+            cell += self._offset[rows]
         # Clipping only guards rows whose physics broke down; `follow` keeps the others inside.
         found = self._cells.take(cell, axis=0, mode='clip')
         u *= found[:, :, 1]
@@ -128,8 +133,7 @@ class PlanarTerrain(composer.Arena):
         cells = self._cells[row * _WINDOW : (row + 1) * _WINDOW]
         cells[:, 0] = heights
         cells[:-1, 1] = np.diff(heights)
-        self._lay_from[row] = (centre - 0.5 * _ADVANCE - 1) * SPACING
-        self._lay_to[row] = (centre + 0.5 * _ADVANCE + 1) * SPACING
+        self._centre[row] = centre * SPACING
         tolerance = boxes.TOLERANCE
         pieces = boxes.from_profile(start, heights, vertical, tolerance)
         while len(pieces.position) > len(self._geoms):  # coarser, rather than with holes

@@ -43,8 +43,9 @@ class CharacterRow:
       fall_links: links whose contact with the ground is a fall.
       end_effectors: links whose joints the imitation reward follows.
       stumble_exempt: links that may touch the ground without a stumble.
-      root_weight: weight of the root in the imitation reward.
       description: one line.
+      root_weight: weight of the root in the imitation reward.
+      path: MJCF file of a user's own character; by default xml/<name>.xml of the suite.
     """
 
     name: str
@@ -54,6 +55,7 @@ class CharacterRow:
     stumble_exempt: tuple[str, ...]
     description: str
     root_weight: float = 1.0
+    path: str | None = None
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -85,8 +87,8 @@ class Character(composer.Entity):
 
     def _build(self, row: CharacterRow, name: str | None = None) -> None:  # type: ignore[override]
         self.row = row
-        path = resources.directory('xml') / f'{row.name}.xml'
-        self._mjcf_root = mjcf.from_path(str(path))
+        path = row.path or str(resources.directory('xml') / f'{row.name}.xml')
+        self._mjcf_root = mjcf.from_path(path)
         if name is not None:
             self._mjcf_root.model = name
 
@@ -106,7 +108,7 @@ class Character(composer.Entity):
         Returns:
           The joints root_x (m), root_z (m) and root_pitch (rad, positive lifts the front).
         """
-        root = dict(limited=False, damping=0, armature=0)
+        root = {'limited': False, 'damping': 0, 'armature': 0}
         return (
             frame.add('joint', name='root_x', type='slide', axis=(1, 0, 0), **root),
             frame.add('joint', name='root_z', type='slide', axis=(0, 0, 1), **root),
@@ -236,4 +238,3 @@ def body_figures(character: Character) -> dict[str, Any]:
 def lowest_point(position: np.ndarray, matrix: np.ndarray, half_size: np.ndarray) -> float:
     """Height of the lowest corner of a box, m."""
     return float(position[2] - np.abs(matrix.reshape(3, 3)[2]) @ half_size)
-

@@ -34,7 +34,13 @@ class Muscle(NamedTuple):
     arms: tuple[Arm, ...]
 
 
-BIPED2D: tuple[Muscle, ...] = (
+def _left(muscle: Muscle) -> Muscle:
+    arms = tuple(arm._replace(joint=arm.joint.replace('right_', 'left_')) for arm in muscle.arms)
+    return muscle._replace(name=muscle.name.replace('right_', 'left_'), arms=arms)
+
+
+# fmt: off
+_BIPED_LEG = (
     Muscle('right_GLU', 0.103, 0.122, 1500, 0.5, (Arm('right_hip', -0.094, 0.5216),)),
     Muscle('right_HFL', 0.103, 0.094, 2000, 0.5, (Arm('right_hip', 0.094, 0),)),
     Muscle('right_VAS', 0.075, 0.215, 6000, 0.7, (Arm('right_knee', 0.056, -0.9616, -0.2616),)),
@@ -43,16 +49,9 @@ BIPED2D: tuple[Muscle, ...] = (
     Muscle('right_HAM', 0.094, 0.29, 3000, 0.7, (Arm('right_hip', -0.075, 0.4316), Arm('right_knee', -0.047, 0, 0),)),
     Muscle('right_RF', 0.075, 0.281, 1000, 0.7, (Arm('right_hip', 0.094, 0), Arm('right_knee', 0.056, -0.9616, -0.2616),)),
     Muscle('right_GAS', 0.047, 0.374, 1500, 0.7, (Arm('right_knee', -0.047, -0.2616, -0.7016), Arm('right_ankle', -0.047, 0.1708, -0.3492),)),
-    Muscle('left_GLU', 0.103, 0.122, 1500, 0.5, (Arm('left_hip', -0.094, 0.5216),)),
-    Muscle('left_HFL', 0.103, 0.094, 2000, 0.5, (Arm('left_hip', 0.094, 0),)),
-    Muscle('left_VAS', 0.075, 0.215, 6000, 0.7, (Arm('left_knee', 0.056, -0.9616, -0.2616),)),
-    Muscle('left_SOL', 0.037, 0.243, 4000, 0.5, (Arm('left_ankle', -0.047, 0.1708, -0.3492),)),
-    Muscle('left_TA', 0.056, 0.225, 800, 0.7, (Arm('left_ankle', 0.037, -0.3492, 0.1708),)),
-    Muscle('left_HAM', 0.094, 0.29, 3000, 0.7, (Arm('left_hip', -0.075, 0.4316), Arm('left_knee', -0.047, 0, 0),)),
-    Muscle('left_RF', 0.075, 0.281, 1000, 0.7, (Arm('left_hip', 0.094, 0), Arm('left_knee', 0.056, -0.9616, -0.2616),)),
-    Muscle('left_GAS', 0.047, 0.374, 1500, 0.7, (Arm('left_knee', -0.047, -0.2616, -0.7016), Arm('left_ankle', -0.047, 0.1708, -0.3492),)),
 )
 
+BIPED2D: tuple[Muscle, ...] = (*_BIPED_LEG, *map(_left, _BIPED_LEG))
 
 DOG: tuple[Muscle, ...] = (
     Muscle('spine0_top', 0.04, 0.03, 3000, 0.7, (Arm('spine0', 0.03, 0, 0.1),)),
@@ -101,8 +100,7 @@ DOG: tuple[Muscle, ...] = (
     Muscle('back_toe1', 0.05, 0.15, 1000, 0.7, (Arm('toe', 0.037, -0.4492, 0.0708),)),
 )
 
-
-RAPTOR: tuple[Muscle, ...] = (
+_RAPTOR_SPINE = (
     Muscle('spine0_top', 0.085, 0.1, 2500, 0.7, (Arm('spine0', 0.05, 0.16682, 0.21682),)),
     Muscle('spine0_bot', 0.085, 0.1, 2500, 0.7, (Arm('spine0', -0.05, 0.16682, 0.11682),)),
     Muscle('spine1_top', 0.05, 0.08, 2000, 0.7, (Arm('spine1', 0.05, 0.11743, 0.16743),)),
@@ -123,6 +121,8 @@ RAPTOR: tuple[Muscle, ...] = (
     Muscle('tail3_bot', 0.05, 0.0941, 1500, 0.7, (Arm('tail3', 0.03, -0.1, 0),)),
     Muscle('tail4_top', 0.05, 0.0941, 1500, 0.7, (Arm('tail4', -0.02, -0.1, -0.2),)),
     Muscle('tail4_bot', 0.05, 0.0941, 1500, 0.7, (Arm('tail4', 0.02, -0.1, 0),)),
+)
+_RAPTOR_LEG = (
     Muscle('right_GLU', 0.103, 0.122, 3000, 0.5, (Arm('right_hip', -0.035, 1),)),
     Muscle('right_HFL', 0.103, 0.094, 3000, 0.5, (Arm('right_hip', 0.07, -0.25),)),
     Muscle('right_VAS', 0.075, 0.215, 6000, 0.7, (Arm('right_knee', 0.056, -0.9616, -0.2616),)),
@@ -133,17 +133,10 @@ RAPTOR: tuple[Muscle, ...] = (
     Muscle('right_GAS', 0.047, 0.254, 1500, 0.7, (Arm('right_knee', -0.047, -0.2616, -0.7016), Arm('right_ankle', -0.047, 0.3708, -0.1492),)),
     Muscle('right_toe0', 0.05, 0.1, 1000, 0.7, (Arm('right_toe', -0.037, 0.0708, -0.4492),)),
     Muscle('right_toe1', 0.05, 0.1, 1000, 0.7, (Arm('right_toe', 0.037, -0.4492, 0.0708),)),
-    Muscle('left_GLU', 0.103, 0.122, 3000, 0.5, (Arm('left_hip', -0.035, 1),)),
-    Muscle('left_HFL', 0.103, 0.094, 3000, 0.5, (Arm('left_hip', 0.07, -0.25),)),
-    Muscle('left_VAS', 0.075, 0.215, 6000, 0.7, (Arm('left_knee', 0.056, -0.9616, -0.2616),)),
-    Muscle('left_SOL', 0.075, 0.05, 5000, 0.5, (Arm('left_ankle', -0.056, 1.2, 0.9),)),
-    Muscle('left_TA', 0.075, 0.05, 1500, 0.5, (Arm('left_ankle', 0.056, 0.9, 1.1),)),
-    Muscle('left_HAM', 0.1, 0.05, 3000, 0.7, (Arm('left_hip', -0.08, 0.5), Arm('left_knee', -0.095, -0.9, -1.3),)),
-    Muscle('left_RF', 0.075, 0.25, 1000, 0.7, (Arm('left_hip', 0.074, 0), Arm('left_knee', 0.056, -0.9616, -0.2616),)),
-    Muscle('left_GAS', 0.047, 0.254, 1500, 0.7, (Arm('left_knee', -0.047, -0.2616, -0.7016), Arm('left_ankle', -0.047, 0.3708, -0.1492),)),
-    Muscle('left_toe0', 0.05, 0.1, 1000, 0.7, (Arm('left_toe', -0.037, 0.0708, -0.4492),)),
-    Muscle('left_toe1', 0.05, 0.1, 1000, 0.7, (Arm('left_toe', 0.037, -0.4492, 0.0708),)),
 )
+
+RAPTOR: tuple[Muscle, ...] = (*_RAPTOR_SPINE, *_RAPTOR_LEG, *map(_left, _RAPTOR_LEG))
+# fmt: on
 
 # The 12-link biped carries the same leg muscles (its arms hang passively); the goat is given the
 # dog's, whose skeleton it shares.

@@ -88,7 +88,9 @@ DOG = CharacterRow(
 GOAT = CharacterRow(
     name='goat',
     joints={
-        name: dataclasses.replace(joint, weight=1.0, **({'target': 0.40041} if name == 'neck0' else {}))
+        name: dataclasses.replace(
+            joint, weight=1.0, **({'target': 0.40041} if name == 'neck0' else {})
+        )
         for name, joint in _DOG_JOINTS.items()
     },
     fall_links=('root', 'spine0'),

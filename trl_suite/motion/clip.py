@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import io
 import os
 import pathlib
-import zipfile
-import zlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -275,18 +274,19 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
         path = resources.directory('mocap') / f'{path_or_name}.npz'
     else:
         path = pathlib.Path(path_or_name)
+    content = io.BytesIO(path.read_bytes())
     fields: dict[str, Any] = {}
+    field = ''
     try:
-        archive = np.load(path, allow_pickle=False)
+        archive = np.load(content, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError('a single array')
-        with archive:
-            for field in _FIELDS:
-                fields[field] = archive[field]
-    except KeyError:
-        raise ValueError(f'{path}: field {field!r} is missing') from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        where = f'field {_FIELDS[len(fields)]!r}' if fields else 'not a readable clip'
+        for field in _FIELDS:
+            if field not in archive:
+                raise ValueError('is missing')
+            fields[field] = archive[field]
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        where = f'field {field!r}' if field else 'no readable clip'
         raise ValueError(f'{path}: {where}: {error}') from None
     for field, kind, dims in (
         ('root', 'U', 0),

@@ -76,10 +76,11 @@ class Reference:
         )  # fmt: skip
         self._width = self._table.shape[1] // 2
         joints, bodies = len(links) - 1, 2 * len(links)
-        sizes = dict(
-            angles=joints + 1, rates=joints + 1, effectors=2 * len(effectors), com_velocity=2,
-            height=1, positions=bodies, velocities=bodies, phase=1, quarter=bins,
-        )  # fmt: skip
+        sizes = {
+            'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
+            'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'phase': 1,
+            'quarter': bins,
+        }  # fmt: skip
         stops = np.cumsum(list(sizes.values()))
         self.columns = {
             name: slice(int(stop) - size, int(stop))
@@ -92,7 +93,8 @@ class Reference:
         i = u.astype(np.int64)
         found = self._table.take(i, axis=0)
         step = found[:, self._width :]
-        step *= (u - i)[:, None]
+        u -= i
+        step *= u[:, None]
         step += found[:, : self._width]
         return step
 

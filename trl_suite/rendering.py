@@ -1,0 +1,411 @@
+"""Pictures without a screen: frames, videos, film strips, and plots of terrain.
+
+    from trl_suite import rendering, suite
+
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1})
+    environment.reset()
+    image = rendering.frame(environment, ghost=True)  # (480, 640, 3) uint8
+
+    policy = lambda time_step: environment.task.clip_action(0)
+    rendering.video(rendering.frames(environment, policy, steps=90), 'rollout.mp4')
+
+Files appear under their names when they are complete, never before. Drawing needs an OpenGL
+library, chosen by the environment variable MUJOCO_GL before Python starts: egl or osmesa without a
+screen, glfw with one. Videos, PNG files and plots need `pip install 'trl_suite[video]'`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import operator
+import os
+import pathlib
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite import errors
+from trl_suite import terrain as terrains
+
+if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
+    import dm_env
+    from dm_control import composer
+
+    Policy = Callable[[dm_env.TimeStep], np.ndarray]
+
+CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
+GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
+GHOST_BEHIND = 0.45  # m; the ghost stands this much farther from the camera than the character
+STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
+VIDEO_SUFFIXES = ('.mp4', '.gif')
+IMAGE_SUFFIXES = ('.png',)
+
+Path = str | os.PathLike[str]
+
+
+def frame(
+    environment: composer.Environment,
+    height: int = 480,
+    width: int = 640,
+    camera: str | int = 'side',
+    ghost: bool = False,
+) -> np.ndarray:
+    """Draws the current state.
+
+    Args:
+      environment: any composer environment, after `reset`.
+      height: pixels.
+      width: pixels.
+      camera: name of a camera, short ('side', 'front') or full ('biped2d/side'), or its number; -1
+        is a camera that looks at the whole model.
+      ghost: also draw the reference clip, translucent and set back a little to the side. It walks
+        its own way from the start of the episode, so the distance between the two shows.
+
+    Returns:
+      The picture, shape (height, width, 3), uint8.
+
+    Raises:
+      ValueError: unknown camera, a size that is not positive or above the model's limit, or a ghost
+        where the task has no reference clip.
+      RuntimeError: there is no OpenGL to draw with; the message names MUJOCO_GL and its choices.
+    """
+    physics = environment.physics
+    limits = physics.model.vis.global_
+    for name, size, limit in (
+        ('height', height, limits.offheight),
+        ('width', width, limits.offwidth),
+    ):
+        if not 0 < operator.index(size) <= limit:
+            raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
+    if ghost and not hasattr(environment.task, 'reference_pose'):
+        raise ValueError(
+            f'a {type(environment.task).__name__} task has no reference clip to draw as a ghost'
+        )
+    camera_id = _camera(physics, camera)
+    _check_gl(physics)
+    return physics.render(
+        height, width, camera_id, scene_callback=_ghost(environment.task) if ghost else None
+    )
+
+
+def frames(
+    environment: composer.Environment, policy: Policy, steps: int = 256, **options: Any
+) -> Iterator[np.ndarray]:
+    """Runs a policy from a reset on, over ends of episodes, and draws every state.
+
+    Args:
+      environment: is reset and stepped.
+      policy: time step -> action; not asked at the end of an episode.
+      steps: control steps.
+      **options: of `frame`.
+
+    Yields:
+      One picture per state: steps of them, one more for every reset.
+    """
+    time_step = environment.reset()
+    yield frame(environment, **options)
+    for _ in range(steps):
+        if time_step.last():
+            time_step = environment.reset()
+            yield frame(environment, **options)
+        time_step = environment.step(policy(time_step))
+        yield frame(environment, **options)
+
+
+def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:
+    """Writes pictures as a video; what `Video` does, in one call.
+
+    Args:
+      frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as `frames`.
+      path: where to write; .mp4 (h264) or .gif.
+      fps: pictures per second; 30 is real time. A .gif can only last whole 1/100 s per picture.
+
+    Raises:
+      ValueError: another suffix, no pictures, pictures of different sizes, or an odd size for h264.
+      ImportError: the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    with Video(path, fps) as writer:
+        for image in frames:
+            writer.add(image)
+
+
+class Video:
+    """A video to which pictures are added one by one, so that none is kept in memory.
+
+    Used as a context manager; the file appears at the end, and not at all after an exception.
+    Arguments and errors are those of `video`.
+    """
+
+    def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
+        self._path = check_path(path, VIDEO_SUFFIXES)
+        if not 0 < fps < np.inf:
+            raise ValueError(f'fps is {fps}; expected a positive number')
+        self._fps = fps
+        self._imageio = _optional('imageio.v2')
+        if self._path.suffix == '.mp4':
+            _optional('imageio_ffmpeg')
+        self._shape: tuple[int, ...] | None = None
+        self._files = contextlib.ExitStack()
+
+    def __enter__(self) -> Video:
+        self._part = self._files.enter_context(replacing(self._path))
+        if self._path.suffix == '.mp4':
+            options: dict[str, Any] = {
+                # imageio would scale frames up to multiples of 16 by itself.
+                'fps': self._fps, 'codec': 'libx264', 'macro_block_size': 1, 'quality': 7,
+                'ffmpeg_log_level': 'error',
+            }  # fmt: skip
+        else:
+            options = {'duration': 1000 / self._fps, 'loop': 0}  # ms per frame; play for ever
+        self._writer = self._imageio.get_writer(self._part, **options)
+        return self
+
+    def add(self, image: np.ndarray) -> None:
+        """Adds a picture, shape (h, w, 3), uint8."""
+        image = _image(image)
+        if self._shape is None:
+            self._shape = image.shape
+            if self._path.suffix == '.mp4' and (image.shape[0] % 2 or image.shape[1] % 2):
+                raise ValueError(
+                    f'{self._path}: frames are {image.shape[1]}x{image.shape[0]} pixels; h264 needs '
+                    'even numbers'
+                )
+        elif image.shape != self._shape:
+            raise ValueError(
+                f'{self._path}: a frame has shape {image.shape}, those before it {self._shape}'
+            )
+        self._writer.append_data(image)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.close()
+        except Exception:
+            if kind is None:
+                self._files.__exit__(OSError, OSError(), None)
+                raise
+        if kind is None and not (self._part.exists() and self._part.stat().st_size):
+            reason = 'no frames were given' if self._shape is None else 'the encoder wrote nothing'
+            error = ValueError(f'{self._path}: {reason}')
+            self._files.__exit__(ValueError, error, None)
+            raise error
+        self._files.__exit__(kind, error, traceback)
+
+
+def film_strip(
+    frames: Iterable[np.ndarray], path: Path | None = None, columns: int = 8
+) -> np.ndarray:
+    """Puts evenly spaced pictures side by side, the first and the last among them.
+
+    Args:
+      frames: pictures (h, w, 3) uint8, all of one size.
+      path: where to write it as .png; not written if None.
+      columns: how many pictures; all of them if there are fewer.
+
+    Returns:
+      The strip, shape (h, about columns * w, 3), uint8.
+
+    Raises:
+      ValueError: no pictures, pictures of different sizes, columns below 1, or another suffix.
+      ImportError: a path is given and the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    if columns < 1:
+        raise ValueError(f'columns is {columns}; expected at least 1')
+    images = [_image(image) for image in frames]
+    if not images:
+        raise ValueError('a film strip needs at least one frame')
+    if len({image.shape for image in images}) > 1:
+        raise ValueError('the frames of a film strip must all have the same size')
+    chosen = spread(len(images), columns)
+    margin = np.full((len(images[0]), STRIP_MARGIN, 3), 255, np.uint8)
+    parts = [part for i in chosen for part in (margin, images[i])]
+    strip = np.concatenate(parts[1:], axis=1)
+    if path is not None:
+        imageio = _optional('imageio.v3')
+        with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
+            imageio.imwrite(part, strip)
+    return strip
+
+
+def spread(count: int, chosen: int) -> list[int]:
+    """Returns up to `chosen` indices of `count`, evenly spaced, first and last among them."""
+    if chosen == 1:
+        return [0]
+    return sorted(set(np.linspace(0, count - 1, min(chosen, count)).round().astype(int).tolist()))
+
+
+def plot_terrain(
+    terrain: Any,
+    path: Path,
+    draws: int = 3,
+    length: float = 40.0,
+    seed: int = 0,
+    blend: float = 0.0,
+) -> None:
+    """Plots several draws of a planar terrain below each other.
+
+    Args:
+      terrain: what `trl_suite.terrain.load` takes.
+      path: where to write; .png.
+      draws: how many.
+      length: how far ahead of the start, m.
+      seed: draw i is the strip with the seed sequence (seed, i).
+      blend: which of the terrain's parameter sets.
+
+    Raises:
+      ValueError: bad arguments; see also `trl_suite.terrain.load`.
+      ImportError: the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    terrain = terrains.load(terrain)
+    target = check_path(path, IMAGE_SUFFIXES)
+    if draws < 1:
+        raise ValueError(f'draws is {draws}; expected at least 1')
+    if not 0 < length <= 10_000:
+        raise ValueError(f'length is {length}; expected metres in (0, 10000]')
+    if seed < 0:
+        raise ValueError(f'seed is {seed}; expected 0 or more')
+    # Figures of their own class draw without a screen and leave the user's pyplot alone.
+    figure = _optional('matplotlib.figure').Figure(
+        figsize=(10, 0.8 + 1.3 * draws), layout='constrained'
+    )
+    panels = figure.subplots(draws, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    first = round(-2 / terrains.SPACING)
+    count = round(length / terrains.SPACING) - first + 1
+    x = (first + np.arange(count)) * terrains.SPACING
+    grounds = []
+    for i in range(draws):
+        strip = terrains.Strip(terrain, np.random.SeedSequence((seed, i)), blend=blend)
+        grounds.append(strip.window(first, count)[0])
+    low, high = min(map(np.min, grounds)), max(map(np.max, grounds))
+    room = 0.15 * max(high - low, 1.0)
+    for panel, heights in zip(panels, grounds, strict=True):
+        panel.fill_between(x, heights, low - room, color='0.75', linewidth=0)
+        panel.plot(x, heights, color='0.2', linewidth=1)
+        panel.axvline(0, color='tab:red', linewidth=0.8, linestyle=':')  # where episodes start
+        panel.set_ylabel('z (m)')
+    panels[0].set(
+        xlim=(x[0], x[-1]), ylim=(low - room, high + room), title=f'{terrain.name} ({terrain.type})'
+    )
+    panels[-1].set_xlabel('x (m)')
+    with replacing(target) as part:
+        figure.savefig(part, dpi=100)
+
+
+def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
+    """Returns a path that can be written, so that nobody waits for a file that cannot be.
+
+    Raises:
+      ValueError: the suffix is none of the given ones.
+      OSError: the folder does not exist, or the path is a folder.
+    """
+    path = pathlib.Path(path)
+    if path.suffix not in suffixes:
+        raise ValueError(
+            f'{path}: unknown suffix {path.suffix!r}; expected {" or ".join(suffixes)}'
+        )
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f'{path}: the folder {str(path.parent)!r} does not exist')
+    if path.is_dir():
+        raise IsADirectoryError(f'{path}: is a folder')
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Yields a temporary path beside `path` that takes its place once all went well."""
+    part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _image(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise ValueError(
+            f'a frame has shape {image.shape} and type {image.dtype}; expected (h, w, 3) of uint8'
+        )
+    return image
+
+
+def _optional(name: str) -> Any:
+    """Imports a module of the extra 'video'."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition('.')[0]
+        raise ImportError(
+            f"{package} is needed for this and missing; pip install 'trl_suite[video]'"
+        ) from error
+
+
+def _camera(physics: Any, camera: str | int) -> int:
+    names = [physics.model.id2name(i, 'camera') for i in range(physics.model.ncam)]
+    if not isinstance(camera, str):
+        if not -1 <= operator.index(camera) < len(names):
+            raise ValueError(f'camera is {camera}; expected -1 to {len(names) - 1}')
+        return int(camera)
+    if camera and camera in names:
+        return names.index(camera)
+    found = [i for i, name in enumerate(names) if name and name.rpartition('/')[2] == camera]
+    if len(found) > 1:
+        raise ValueError(f'several cameras are named {camera!r}: {[names[i] for i in found]}')
+    if not found:
+        known = {*filter(None, names), *(n.rpartition('/')[2] for n in names if n)}
+        raise ValueError(errors.unknown('camera', camera, known))
+    return found[0]
+
+
+def _check_gl(physics: Any) -> None:
+    """Makes the drawing context at the first picture."""
+    try:
+        _ = physics.contexts
+    # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
+    except Exception as error:
+        raise RuntimeError(no_gl(error)) from error
+
+
+def no_gl(error: Exception) -> str:
+    """Returns the sentence for a machine on which nothing can be drawn."""
+    set_to = os.environ.get('MUJOCO_GL')
+    state = 'is not set' if set_to is None else f'is {set_to!r}'
+    reason = str(error).strip().partition('\n')[0].rstrip('.')
+    return (
+        f'no picture can be drawn, since no OpenGL context could be made ({reason}); MUJOCO_GL '
+        f'{state}, set it to egl or osmesa (no screen needed) or glfw (with a screen) before '
+        'Python starts'
+    )
+
+
+def _ghost(task: Any) -> Callable[[Any, Any], None]:
+    """Returns a scene callback that adds the reference pose to what is drawn."""
+    import mujoco
+
+    def add(physics: Any, scene: Any) -> None:
+        # Data of its own on the same model: neither the model nor the simulation is touched.
+        model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
+        data.qpos[task._pose_qpos] = task.reference_pose(0)
+        mujoco.mj_kinematics(model, data)
+        before = scene.ngeom
+        mujoco.mjv_addGeoms(
+            model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC,
+            scene,
+        )  # fmt: skip
+        for geom in scene.geoms[before : scene.ngeom]:
+            geom.pos[1] += GHOST_BEHIND
+            geom.rgba = GHOST_COLOUR
+            geom.matid = -1
+
+    return add
