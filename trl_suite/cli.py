@@ -1,0 +1,389 @@
+"""The command line: `trl-suite` or `python -m trl_suite`.
+
+    trl-suite list --domain plaid --tag original
+    trl-suite info PD_Dog2D_Gaps_Terrain-v0
+    trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy clip --video dog.mp4 --ghost
+    trl-suite terrain slopes_mixed --output slopes.png
+
+Bad input ends with one line on stderr and exit status 2. The engine is imported only by the
+commands that need it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import pathlib
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+import trl_suite
+from trl_suite import catalogue, errors, rendering
+
+if TYPE_CHECKING:
+    import dm_env
+
+    from trl_suite.environment import Environment
+
+POLICIES = ('random', 'zero', 'clip')
+SHOWN_EPISODES = 8  # episodes that a rollout prints one by one
+PROGRESS_DELAY = 2.0  # s before a progress bar appears
+_FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
+
+# Unit and meaning of the observation blocks.
+_BLOCKS = {
+    'terrain': ('m', 'ground heights from 0.5 m behind to 3 m ahead, above the ground at the root'),
+    'pose': ('m', 'root height above ground; then x, z of each link centre from the root'),
+    'velocity': ('m/s', 'x, z velocity of each link centre'),
+    'strain': ('1', 'strain of each muscle fibre'),
+    'phase': ('1', 'phase of the clip in [0, 1); then the one-hot of its quarter'),
+    'target': (
+        'm, m/s',
+        "the clip's root height; its link centres from its root; their velocities",
+    ),
+}
+
+# What differs from the original, as (applies to a row?, sentence); docs/differences.md has reasons.
+_DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
+    (
+        lambda row: 'completion' in row.tags,
+        'not in the registry of the original: a combination that its papers name or imply',
+    ),
+    (lambda row: True, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
+    (lambda row: True, 'actions are in [-1, 1] and clipped; the original takes physical units'),
+    (
+        lambda row: row.actuation == 'position',
+        'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
+    ),
+    (
+        lambda row: row.actuation == 'position' and row.character in ('dog', 'goat', 'raptor'),
+        'targets of hips and shoulder are angles to the parent link, not to the world',
+    ),
+    (
+        lambda row: row.actuation == 'torque',
+        'joints have passive damping and an armature of 0.01 kg m^2; torque stays at 0.75 of limits',
+    ),
+    (
+        lambda row: row.actuation == 'velocity',
+        'joints have an armature of 0.01 kg m^2; the damping gain is the servo',
+    ),
+    (
+        lambda row: row.actuation == 'muscle',
+        "MuJoCo's muscle curves fitted to the original's, rigid tendons, constant moment arms",
+    ),
+    (
+        lambda row: row.actuation == 'muscle' and row.character in ('goat', 'biped2d_full'),
+        'the original has no muscles for this character; they are borrowed',
+    ),
+    (lambda row: row.clip is not None, "the clip is our own, close to the original's in gait and speed"),
+    (lambda row: row.clip is not None, 'the start phase is drawn uniformly instead of swept'),
+    (
+        lambda row: row.terrain == 'mixed_humanoid',
+        'the terrain is inferred: slopes_mixed_humanoid without slopes',
+    ),
+    (
+        lambda row: isinstance(row.terrain, str) and row.terrain != 'flat',
+        'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
+    ),
+    (lambda row: True, f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)'),
+)  # fmt: skip
+
+
+def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
+    """Runs a command.
+
+    Args:
+      argv: arguments, without the program's name; by default those of the process.
+      prog: name of the program in the help.
+
+    Returns:
+      The exit status: 0; 2 after an error, with one line on stderr; 130 after an interrupt.
+    """
+    try:
+        arguments = _parser(prog).parse_args(argv)
+        arguments.command(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except KeyboardInterrupt:
+        print('trl-suite: interrupted', file=sys.stderr)
+        return 130
+    except (ValueError, ImportError, RuntimeError, OSError) as error:
+        print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f'{message} (see {self.prog} --help)')
+
+
+def _parser(prog: str) -> argparse.ArgumentParser:
+    parser = _Parser(prog=prog, description='Locomotion environments over random terrain.')
+    parser.add_argument('--version', action='version', version=f'trl-suite {trl_suite.__version__}')
+    commands = parser.add_subparsers(required=True, metavar='command', parser_class=_Parser)
+
+    def add(name: str, function: Callable[[Any], None], text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + '.',
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )  # fmt: skip
+        command.set_defaults(command=function)
+        return command
+
+    command = add('list', _list, 'list the environments of the catalogue')
+    for name in _FILTERS:
+        command.add_argument(f'--{name}', help=f'only those of one {name}')
+
+    command = add('info', _info, 'tell everything about one environment')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+
+    command = add('rollout', _rollout, 'run a policy, over ends of episodes')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+    command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+    command.add_argument('--steps', type=_positive, default=256, help='control steps')
+    command.add_argument('--policy', default='random', choices=POLICIES, help='what acts')
+    command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
+    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+    command.add_argument('--columns', type=_positive, default=8, help='pictures in the strip')
+    command.add_argument('--trajectory', type=pathlib.Path, metavar='FILE', help='an .npz')
+    command.add_argument('--ghost', action='store_true', help='draw the reference clip as well')
+    command.add_argument('--size', type=_size, default='640x480', metavar='WxH', help='in pixels')
+    command.add_argument('--camera', default='side', help='name of a camera')
+
+    command = add('terrain', _terrain, 'plot draws of a terrain')
+    command.add_argument('terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file')
+    command.add_argument('--draws', type=_positive, default=3, help='how many')
+    command.add_argument('--length', type=float, default=40.0, help='in metres')
+    command.add_argument('--seed', type=int, default=0, help='of the draws')
+    command.add_argument('--blend', type=float, default=0.0, help='which of the parameter sets')
+    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a .png')
+    return parser
+
+
+def _positive(text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if int(text) > 0:
+            return int(text)
+    raise argparse.ArgumentTypeError(f'{text!r} is not a positive integer')
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r'(\d+)x(\d+)', text)
+    if not match:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a size such as 640x480')
+    return int(match[1]), int(match[2])
+
+
+# list
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    chosen = list(catalogue.ROWS)
+    for name in _FILTERS:
+        value = getattr(arguments, name)
+        if value is None:
+            continue
+        known = {item for row in catalogue.ROWS for item in _values(row, name)}
+        if value not in known:
+            raise ValueError(errors.unknown(name, value, known))
+        chosen = [row for row in chosen if value in _values(row, name)]
+    if chosen:
+        cells = [(row.id, f'{row.domain}/{row.task}', row.description) for row in chosen]
+        print(_table(('id', 'domain/task', 'description'), cells, indent=''))
+    print(f'{len(chosen)} environment{"" if len(chosen) == 1 else "s"}')
+
+
+def _values(row: catalogue.Row, name: str) -> frozenset[str]:
+    return row.tags if name == 'tag' else frozenset({str(getattr(row, name))})
+
+
+def _table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str = '  ') -> str:
+    """Aligns cells in columns; numbers to the right."""
+    rows = [[f'{c:.4g}' if isinstance(c, float) else str(c) for c in row] for row in cells]
+    first = next(iter(rows), [''] * len(header))
+    right = [re.fullmatch(r'[-+.\de]+|inf|-', cell) is not None for cell in first]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    return '\n'.join(
+        indent
+        + '  '.join(
+            cell.rjust(width) if to_right else cell.ljust(width)
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        ).rstrip()
+        for row in (list(header), *rows)
+    )
+
+
+# info
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    suite = _suite()
+    row = suite.find(arguments.id)
+    environment = suite.build_row(row, {}, {})
+    print(f'{row.id}\n  {row.description}')
+    print(f'  also {", ".join((f"{row.domain}/{row.task}", *row.aliases))}; tags:', end=' ')
+    print(', '.join(sorted(row.tags)))
+    for title, text in _sections(row, environment):
+        print(f'\n{title}\n{text}')
+
+
+def _sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str, str]]:
+    from trl_suite.tasks.imitation import Imitation
+
+    task: Any = environment.task
+    if isinstance(task, Imitation):
+        yield from _character(environment)
+    action_map = environment.action_map
+    size = max(part.stop for part in environment.blocks.values())
+    yield (
+        f'Observation: {size} numbers, in this order',
+        _table(
+            ('block', 'from', 'to', 'size', 'unit', 'meaning'),
+            (
+                (name, part.start, part.stop, part.stop - part.start, *_BLOCKS.get(name, ('', '')))
+                for name, part in environment.blocks.items()
+            ),
+        ),
+    )
+    limits = _limits(environment)
+    yield (
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = centre + half '
+        f'range * action, in {action_map.unit}',
+        _table(
+            ('drives', 'centre', 'half range', limits[0]),
+            zip(action_map.names, *(_floats(v) for v in (
+                action_map.centre, action_map.half_range, limits[1]
+            )), strict=True),
+        ),
+    )  # fmt: skip
+    if isinstance(task, Imitation):
+        yield from _rules(environment)
+    control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
+    yield (
+        'Time',
+        f'  control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
+        f'{row.step_limit} steps, {row.step_limit * task.control_timestep:.3g} s',
+    )
+    yield (
+        'Differs from the original (reasons in docs/differences.md)',
+        '\n'.join(f'  - {text}' for applies, text in _DIFFERENCES if applies(row)),
+    )
+
+
+def _floats(values: Any) -> list[float]:
+    return [float(value) for value in values]
+
+
+def _character(environment: Environment) -> Iterator[tuple[str, str]]:
+    from trl_suite import characters
+
+    task: Any = environment.task
+    character = task.character
+    row = character.row
+    figures = characters.body_figures(characters.make(row))
+    yield (
+        f'Character: {row.name}',
+        f'  {row.description}\n  {figures["mass"]:.4g} kg, stands {figures["standing_height"]:.3g} m '
+        f'high at the root, {len(row.links)} links, {len(row.joints)} joints',
+    )
+    masses = _floats(environment.physics.bind(character.bodies).mass)
+    cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', '')]
+    for (name, joint), mass, (low, high), limit in zip(
+        row.joints.items(), masses[1:], character.joint_ranges, character.torque_limits, strict=True
+    ):
+        reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
+        cells.append((name, mass, reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}', joint.weight))
+    header = ('link and its joint', 'kg', 'rad', 'N m', 'kp', 'kd', 'weight in reward')
+    yield 'Links', _table(header, cells)
+
+
+def _limits(environment: Environment) -> tuple[str, Sequence[float]]:
+    """Returns what limits each action's effect, and how much."""
+    task: Any = environment.task
+    actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
+    if environment.action_map.quantity == 'excitation':
+        return 'peak force (N)', np.asarray(actuators.gainprm)[:, 2]
+    limits = dict(zip(task.character.row.joints, task.character.torque_limits, strict=True))
+    return 'torque limit (N m)', [limits[name] for name in environment.action_map.names]
+
+
+def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
+    from trl_suite.tasks import rewards
+
+    task: Any = environment.task
+    ground, clip, row = task.arena.terrain, task.clip, task.character.row
+    parameters = ', '.join(f'{name} {value:g}' for name, value in ground.parameters().items())
+    sets = len(ground.parameter_sets)
+    more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
+    yield f'Terrain: {ground.name} ({ground.type})', f'  {parameters or "no parameters"}{more}'
+    yield (
+        f'Clip: {clip.name}',
+        f'  {clip.description}; period {clip.duration:.4g} s, {clip.speed:.3g} m/s',
+    )
+    yield (
+        'Reward: sum of weight * exp(-scale * squared error), at most 1; 0 after a fall',
+        _table(
+            ('term', 'weight', 'scale'),
+            ((name, *values) for name, values in rewards.IMITATION_TERMS.items()),
+        ),
+    )
+    yield (
+        'Termination (discount 0)',
+        f'  a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step;\n'
+        '  or the physics diverges',
+    )
+
+
+# rollout
+
+
+def _rollout(arguments: argparse.Namespace) -> None:
+    width, height = arguments.size
+    for path, suffixes in (
+        (arguments.video, rendering.VIDEO_SUFFIXES),
+        (arguments.strip, rendering.IMAGE_SUFFIXES),
+        (arguments.trajectory, ('.npz',)),
+    ):
+        if path is not None:  # now, rather than after the work
+            rendering.check_path(path, suffixes)
+    suite = _suite()
+    environment = suite.make(arguments.id, {'random': arguments.seed})
+    policy = _policy(arguments.policy, environment, arguments.seed)
+    in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
+    pictures: list[np.ndarray] = []
+    record = _Record(environment)
+
+    with contextlib.ExitStack() as stack:
+        video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
+        for steps, (time_step, action) in enumerate(
+            _run(environment, policy, arguments.steps, record)
+        ):
+            record.add(time_step, action)
+            strip_wants = arguments.strip is not None and record.steps in in_strip
+            if video or strip_wants:
+                image = rendering.frame(
+                    environment, height, width, arguments.camera, arguments.ghost
+                )
+                if video:
+                    video.add(image)
+                if strip_wants:
+                    in_strip.discard(record.steps)
+                    pictures.append(image)
+            del steps
+    if arguments.strip is not None:
+        rendering.film_strip(pictures, arguments.strip, len(pictures))
+    if arguments.trajectory is not None:
+        record.save(arguments.trajectory, suite.find(arguments.id).id, arguments.seed)
+    print(record.summary())
