@@ -28,7 +28,6 @@ MUSCLE_DAMPING_DIVISOR = 100.0  # the force-velocity curve damps as well
 TORQUE_SCALE = 0.75  # of the limit at full action
 VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
 POSITION_HALF_RANGE = 1.5  # rad at full action
-_LOW, _HIGH = np.full((), -1.0), np.ones(())  # of actions; arrays are quicker than scalars
 EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
 
 
@@ -55,8 +54,8 @@ class ActionMap:
 
     def control(self, action: np.ndarray) -> np.ndarray:
         """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
-        control = np.maximum(action, _LOW)
-        np.minimum(control, _HIGH, out=control)
+        control = np.maximum(action, -1.0)
+        np.minimum(control, 1.0, out=control)
         control *= self.half_range
         control += self.centre
         return control

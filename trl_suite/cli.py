@@ -17,6 +17,7 @@ import os
 import pathlib
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -66,7 +67,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     ),
     (
         lambda row: row.actuation == 'torque',
-        'joints have passive damping and an armature of 0.01 kg m^2; torque stays at 0.75 of limits',
+        'joints have passive damping and an armature of 0.01 kg m^2; action 1 is 0.75 of the limit',
     ),
     (
         lambda row: row.actuation == 'velocity',
@@ -163,7 +164,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--camera', default='side', help='name of a camera')
 
     command = add('terrain', _terrain, 'plot draws of a terrain')
-    command.add_argument('terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file')
+    command.add_argument(
+        'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
+    )
     command.add_argument('--draws', type=_positive, default=3, help='how many')
     command.add_argument('--length', type=float, default=40.0, help='in metres')
     command.add_argument('--seed', type=int, default=0, help='of the draws')
@@ -210,11 +213,12 @@ def _values(row: catalogue.Row, name: str) -> frozenset[str]:
 
 
 def _table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str = '  ') -> str:
-    """Aligns cells in columns; numbers to the right."""
+    """Aligns cells in columns, numbers to the right."""
     rows = [[f'{c:.4g}' if isinstance(c, float) else str(c) for c in row] for row in cells]
-    first = next(iter(rows), [''] * len(header))
-    right = [re.fullmatch(r'[-+.\de]+|inf|-', cell) is not None for cell in first]
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    number = re.compile(r'([-+]?\d[-+.\de]*)?')
+    right = [all(number.fullmatch(cell) for cell in column[1:]) for column in columns]
     return '\n'.join(
         indent
         + '  '.join(
@@ -223,6 +227,10 @@ def _table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str
         ).rstrip()
         for row in (list(header), *rows)
     )
+
+
+def _fold(text: str) -> str:
+    return textwrap.fill(text, 100, initial_indent='  ', subsequent_indent='  ')
 
 
 # info
@@ -258,9 +266,10 @@ def _sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[st
         ),
     )
     limits = _limits(environment)
+    unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
     yield (
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = centre + half '
-        f'range * action, in {action_map.unit}',
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = centre + '
+        'half range * action',
         _table(
             ('drives', 'centre', 'half range', limits[0]),
             zip(action_map.names, *(_floats(v) for v in (
@@ -304,12 +313,14 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
         row.joints.items(), masses[1:], character.joint_ranges, character.torque_limits, strict=True
     ):
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
-        cells.append((name, mass, reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}', joint.weight))
-    header = ('link and its joint', 'kg', 'rad', 'N m', 'kp', 'kd', 'weight in reward')
+        cells.append(
+            (name, mass, reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}', joint.weight)
+        )
+    header = ('link and joint', 'kg', 'range (rad)', 'limit (N m)', 'kp', 'kd', 'reward weight')
     yield 'Links', _table(header, cells)
 
 
-def _limits(environment: Environment) -> tuple[str, Sequence[float]]:
+def _limits(environment: Environment) -> tuple[str, Any]:
     """Returns what limits each action's effect, and how much."""
     task: Any = environment.task
     actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
@@ -327,7 +338,10 @@ def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
     parameters = ', '.join(f'{name} {value:g}' for name, value in ground.parameters().items())
     sets = len(ground.parameter_sets)
     more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
-    yield f'Terrain: {ground.name} ({ground.type})', f'  {parameters or "no parameters"}{more}'
+    yield (
+        f'Terrain: {ground.name} ({ground.type})',
+        _fold(f'{parameters or "no parameters"}{more}'),
+    )
     yield (
         f'Clip: {clip.name}',
         f'  {clip.description}; period {clip.duration:.4g} s, {clip.speed:.3g} m/s',
@@ -341,8 +355,10 @@ def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
     )
     yield (
         'Termination (discount 0)',
-        f'  a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step;\n'
-        '  or the physics diverges',
+        _fold(
+            f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
+            'or the physics diverges'
+        ),
     )
 
 
@@ -350,40 +366,157 @@ def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
 
 
 def _rollout(arguments: argparse.Namespace) -> None:
-    width, height = arguments.size
     for path, suffixes in (
         (arguments.video, rendering.VIDEO_SUFFIXES),
         (arguments.strip, rendering.IMAGE_SUFFIXES),
         (arguments.trajectory, ('.npz',)),
     ):
-        if path is not None:  # now, rather than after the work
+        if path is not None:  # before the work rather than after it
             rendering.check_path(path, suffixes)
     suite = _suite()
     environment = suite.make(arguments.id, {'random': arguments.seed})
     policy = _policy(arguments.policy, environment, arguments.seed)
+    width, height = arguments.size
     in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
     pictures: list[np.ndarray] = []
     record = _Record(environment)
-
     with contextlib.ExitStack() as stack:
         video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
-        for steps, (time_step, action) in enumerate(
-            _run(environment, policy, arguments.steps, record)
-        ):
+        for done, time_step, action in _run(environment, policy, arguments.steps):
             record.add(time_step, action)
-            strip_wants = arguments.strip is not None and record.steps in in_strip
-            if video or strip_wants:
-                image = rendering.frame(
-                    environment, height, width, arguments.camera, arguments.ghost
-                )
-                if video:
-                    video.add(image)
-                if strip_wants:
-                    in_strip.discard(record.steps)
-                    pictures.append(image)
-            del steps
+            into_strip = arguments.strip is not None and done in in_strip
+            if not (video or into_strip):
+                continue
+            image = rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
+            if video:
+                video.add(image)
+            if into_strip:
+                in_strip.discard(done)  # the start that follows an end has the same number
+                pictures.append(image)
     if arguments.strip is not None:
-        rendering.film_strip(pictures, arguments.strip, len(pictures))
+        rendering.film_strip(pictures, arguments.strip, arguments.columns)
     if arguments.trajectory is not None:
-        record.save(arguments.trajectory, suite.find(arguments.id).id, arguments.seed)
+        with rendering.replacing(arguments.trajectory) as part:
+            np.savez_compressed(
+                part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
+            )
     print(record.summary())
+
+
+def _suite() -> Any:
+    try:
+        from trl_suite import suite
+    except ModuleNotFoundError:
+        raise
+    # What dm_control dies of where the library that MUJOCO_GL names is missing.
+    except (AttributeError, ImportError) as error:
+        raise RuntimeError(rendering.no_gl(error)) from error
+    return suite
+
+
+def _policy(name: str, environment: Environment, seed: int) -> rendering.Policy:
+    size = len(environment.action_map)
+    if name == 'zero':
+        return lambda time_step: np.zeros(size)
+    if name == 'random':
+        generator = np.random.default_rng(seed)
+        return lambda time_step: generator.uniform(-1, 1, size)
+    task: Any = environment.task
+    return lambda time_step: np.clip(task.clip_action(0), -1, 1)
+
+
+def _run(
+    environment: Environment, policy: rendering.Policy, steps: int
+) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
+    """Yields steps done, every time step, and the action taken from it: zeros where none is."""
+    import tqdm  # dm_control brings it
+
+    none = np.zeros(len(environment.action_map))
+    time_step, done = environment.reset(), 0
+    # disable=None: no bar where stderr is not a terminal.
+    with tqdm.tqdm(total=steps, delay=PROGRESS_DELAY, disable=None, unit='step') as bar:
+        while True:
+            action = none if done == steps or time_step.last() else policy(time_step)
+            yield done, time_step, action
+            if done == steps:
+                return
+            if time_step.last():
+                time_step = environment.reset()
+            else:
+                time_step = environment.step(action)
+                done += 1
+                bar.update()
+
+
+class _Record:
+    """What a rollout leaves behind: a row per time step, and an entry per episode."""
+
+    def __init__(self, environment: Environment) -> None:
+        self._environment = environment
+        self._rows: list[tuple[Any, ...]] = []
+        self._episodes: list[dict[str, Any]] = []
+
+    def add(self, time_step: dm_env.TimeStep, action: np.ndarray) -> None:
+        environment = self._environment
+        first = time_step.first()
+        self._rows.append((
+            np.concatenate([np.ravel(part) for part in time_step.observation.values()]), action,
+            0.0 if first else time_step.reward, 1.0 if first else time_step.discount,
+            int(time_step.step_type), environment.physics.data.qpos.copy(),
+        ))  # fmt: skip
+        if first:
+            self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'goes on'})
+            return
+        episode, info = self._episodes[-1], environment.info
+        episode['steps'] += 1
+        episode['return'] += time_step.reward
+        episode['distance'] = info.get('distance', 0.0)
+        if time_step.last():
+            cut = 'was cut' if time_step.discount else 'failed'
+            episode['end'] = next((end for end in ('fell', 'diverged') if info.get(end)), cut)
+
+    def arrays(self) -> dict[str, Any]:
+        """The rows as arrays; actions[i] was taken from observations[i], if step i had any."""
+        names = ('observations', 'actions', 'rewards', 'discounts', 'step_types', 'qpos')
+        return {
+            name: np.array(column)
+            for name, column in zip(names, zip(*self._rows, strict=True), strict=True)
+        }
+
+    def summary(self) -> str:
+        shown = self._episodes[:SHOWN_EPISODES]
+        lines = [
+            _table(
+                ('episode', 'steps', 'return', 'distance (m)', 'end'),
+                (
+                    (i, e['steps'], f'{e["return"]:.2f}', f'{e["distance"]:.2f}', e['end'])
+                    for i, e in enumerate(shown, 1)
+                ),
+                indent='',
+            )
+        ]
+        if len(self._episodes) > len(shown):
+            lines.append(f'... and {len(self._episodes) - len(shown)} more')
+        steps, total, distance = (
+            sum(e[name] for e in self._episodes) for name in ('steps', 'return', 'distance')
+        )
+        count = len(self._episodes)
+        lines.append(
+            f'{steps} steps in {count} episode{"" if count == 1 else "s"}: return {total:.2f}, '
+            f'{total / steps:.3f} per step; {distance:.2f} m'
+        )
+        return '\n'.join(lines)
+
+
+# terrain
+
+
+def _terrain(arguments: argparse.Namespace) -> None:
+    name = pathlib.Path(arguments.terrain)
+    known = name.name if name.suffix not in ('.json', '.txt') else name.stem
+    output = arguments.output or pathlib.Path(f'terrain_{known}.png')
+    rendering.plot_terrain(
+        arguments.terrain, output, arguments.draws, arguments.length, arguments.seed,
+        arguments.blend,
+    )  # fmt: skip
+    print(output)

@@ -21,6 +21,7 @@ import importlib
 import operator
 import os
 import pathlib
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -371,10 +372,21 @@ def _camera(physics: Any, camera: str | int) -> int:
 def _check_gl(physics: Any) -> None:
     """Makes the drawing context at the first picture."""
     try:
+        # GLFW without a screen would warn, and leave a half-made context that fails once more
+        # when Python ends.
+        backend = getattr(importlib.import_module('dm_control._render'), 'BACKEND', None)
+        if backend == 'glfw' and not _screen():
+            raise RuntimeError('GLFW finds no screen')
         _ = physics.contexts
     # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
+
+
+def _screen() -> bool:
+    return sys.platform != 'linux' or bool(
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    )
 
 
 def no_gl(error: Exception) -> str:
@@ -383,9 +395,9 @@ def no_gl(error: Exception) -> str:
     state = 'is not set' if set_to is None else f'is {set_to!r}'
     reason = str(error).strip().partition('\n')[0].rstrip('.')
     return (
-        f'no picture can be drawn, since no OpenGL context could be made ({reason}); MUJOCO_GL '
-        f'{state}, set it to egl or osmesa (no screen needed) or glfw (with a screen) before '
-        'Python starts'
+        f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
+        'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
+        'disable (no pictures)'
     )
 
 
@@ -396,7 +408,7 @@ def _ghost(task: Any) -> Callable[[Any, Any], None]:
     def add(physics: Any, scene: Any) -> None:
         # Data of its own on the same model: neither the model nor the simulation is touched.
         model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
-        data.qpos[task._pose_qpos] = task.reference_pose(0)
+        data.qpos[task.figure.pose_qpos] = task.reference_pose(0)
         mujoco.mj_kinematics(model, data)
         before = scene.ngeom
         mujoco.mjv_addGeoms(

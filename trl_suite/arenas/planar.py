@@ -26,7 +26,7 @@ PARKED = -60.0  # m; depth at which unused boxes lie
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
-_CELLS_PER_METRE = np.asarray(1 / SPACING)
+_CELLS_PER_METRE = 1 / SPACING
 _REACH = 0.5 * ADVANCE + SPACING  # m; from the centre of a window to where it is laid anew
 
 
@@ -73,8 +73,8 @@ class PlanarTerrain(composer.Arena):
         self.strips: list[Strip | None] = [None] * world.n
         self._start = np.zeros((world.n, 1))  # vertex number of a window's first vertex
         self._offset = np.arange(world.n)[:, None] * _WINDOW
-        # Of every cell its first height and the rise to the next, m; all windows in one table.
-        self._cells = np.zeros((world.n * _WINDOW, 2))
+        # Of every cell its first height and the rise to the next, m.
+        self._heights, self._rises = np.zeros((2, world.n, _WINDOW))
         self._centre = np.zeros((world.n, 1))  # m; of the travel that a window is good for
 
     def begin_episode(self, row: int, strip: Strip) -> None:
@@ -93,21 +93,23 @@ class PlanarTerrain(composer.Arena):
     def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
         u = x * _CELLS_PER_METRE
-        u -= self._start[rows]
-        cell = u.astype(np.int64)
-        u -= cell
+        start = np.empty_like(u)
+        start[...] = self._start[rows]  # packed: quicker than broadcasting
+        u -= start
+        whole = np.floor(u)
+        u -= whole
+        cell = whole.astype(np.int64)
         if self._world.n > 1:
             cell += self._offset[rows]
         # Clipping only guards rows whose physics broke down; `follow` keeps the others inside.
-        found = self._cells.take(cell, axis=0, mode='clip')
-        u *= found[:, :, 1]
-        u += found[:, :, 0]
+        u *= self._rises.take(cell, mode='clip')
+        u += self._heights.take(cell, mode='clip')
         return u
 
     def slope(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
-        cell = (x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
-        return self._cells.take(cell + self._offset[rows], axis=0, mode='clip')[:, :, 1] / SPACING
+        cell = np.floor(x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
+        return self._rises.take(cell + self._offset[rows], mode='clip') / SPACING
 
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
@@ -130,9 +132,8 @@ class PlanarTerrain(composer.Arena):
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
         self._start[row] = start
-        cells = self._cells[row * _WINDOW : (row + 1) * _WINDOW]
-        cells[:, 0] = heights
-        cells[:-1, 1] = np.diff(heights)
+        self._heights[row] = heights
+        self._rises[row, :-1] = np.diff(heights)
         self._centre[row] = centre * SPACING
         tolerance = boxes.TOLERANCE
         pieces = boxes.from_profile(start, heights, vertical, tolerance)

@@ -17,8 +17,9 @@ _UPRIGHT = np.pi / 2  # rad; beyond it a trunk may point backwards
 class PlanarFigure:
     """Kinematics of one character in every simulation of a world, over a leading batch axis.
 
-    Within the loop, bodies and joints stand in the engine's order, so that all of a character is
-    one slice of every array; only the observation is put into link order.
+    Everything is in link order: `take` with precomputed addresses both orders and packs the engine's
+    arrays, and arithmetic on packed arrays of equal shape costs a third of what broadcasting does.
+    That is why repeated operands (the root under every link) are taken, not broadcast.
 
     Attributes:
       pose_qpos, pose_dof: addresses of x, z, pitch and the joints in link order.
@@ -66,14 +67,24 @@ class PlanarFigure:
         self.links = world.body_ids([body.full_identifier for body in character.bodies])
         self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
         self._geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
-        # Columns of end effectors in the flat xpos: all x, then all z.
+        links, root_body = self.links, self.links[0]
+        count = len(links)
+        # Addresses in flat arrays, x and z by turns.
+        self._xz = np.stack([3 * links, 3 * links + 2], axis=1).ravel()
+        self._zx = np.stack([3 * links + 2, 3 * links], axis=1).ravel()
+        self._linear = np.stack([6 * links + 3, 6 * links + 5], axis=1).ravel()
+        self._spin = np.repeat(6 * links + 1, 2)
+        self._root_xz = np.tile(self.pose_qpos[:2], count)
+        self._com_zx = np.tile([3 * root_body + 2, 3 * root_body], count)
+        self._com_x = np.full(len(self.effectors), 3 * root_body)
+        # Columns of end effectors: all x, then all z.
         self._effector_xz = np.concatenate([3 * self.effectors, 3 * self.effectors + 2])
-        self._fall = _span(world.sensor_addresses(self._fall_sensors))
-        self._bodies = _span(self.links)
-        order = self.links - self._bodies.start
-        self._link_order = None if (order == np.arange(len(order))).all() else order
-        mass = world.models[0].body_mass[self._bodies]
-        self._share = (mass / mass.sum())[None]
+        # v = w x r in the x-z plane is (w z, -w x) for w about +y.
+        self._cross = np.tile([1.0, -1.0], count)[None]
+        mass = world.models[0].body_mass[links]
+        self._share = np.kron((mass / mass.sum())[:, None], np.eye(2))  # (2 * links, 2)
+        falls = world.sensor_addresses(self._fall_sensors)  # added one after the other
+        self._fall = slice(int(falls[0]), int(falls[-1]) + 1)
         # One ground query serves samples, root and end effectors.
         self._ground_x = np.zeros((world.n, len(self._samples) + len(self.effectors)))
 
@@ -96,53 +107,43 @@ class PlanarFigure:
           com_velocity: where the velocity of the centre of mass is written, (rows, 2), m/s.
 
         Returns:
-          A namespace for `measure`. Of use to tasks: `x`, `z` (rows, 1), `pitch` (rows,), `angles`
-          and `rates` (rows, 1 + J) of pitch and joints in the engine's order, `height` (rows, 1) of
-          the root above the ground, `fall` (rows, F) contact counts, and after `measure` `facing`.
+          A namespace for `measure`. Of use to tasks: `x`, `z`, `pitch` (rows, 1), `qpos` and `qvel`
+          (rows, ...), `rates` of the joints, some of them perhaps twice, `height` (rows, 1) of the
+          root above the ground, `fall` (rows, F) contact counts, and after `measure` `facing`.
         """
-        world, bodies = self._world, self._bodies
+        world = self._world
         x, z, pitch = self.pose_qpos[:3]
         out = observation[rows]
         pose = out[:, blocks['pose']]
-        shape = (len(out), bodies.stop - bodies.start, 2)
-        position, velocity = pose[:, 1:].reshape(shape), out[:, blocks['velocity']].reshape(shape)
-        # Computed in the engine's order; out of place where the link order differs.
-        position_out, velocity_out = position, velocity
-        if self._link_order is not None:
-            position, velocity = np.empty(shape), np.empty(shape)
+        count, effector_count = len(out), len(self.effectors)
         ground_x = self._ground_x[rows]
-        count = len(self.effectors)
+        samples = len(self._samples)
         return SimpleNamespace(
             rows=rows,
             facing=None,
-            root=world.qpos[rows, None, x : z + 1],
+            qpos=world.qpos[rows],
+            qvel=world.qvel[rows],
             x=world.qpos[rows, x, None],
             z=world.qpos[rows, z, None],
-            pitch=world.qpos[rows, pitch],
-            angles=world.qpos[rows, _span(self.pose_qpos[2:])],
-            rates=world.qvel[rows, _span(self.pose_dof[2:])],
-            xpos=world.xpos[rows].reshape(len(out), -1),
-            xipos=world.xipos[rows, bodies, ::2],
-            spin=world.cvel[rows, bodies, 1:2],
-            linear_x=world.cvel[rows, bodies, 3],
-            linear_z=world.cvel[rows, bodies, 5],
-            com=world.subtree_com[rows, bodies.start, None, ::2],
-            com_x=world.subtree_com[rows, bodies.start, :1],
+            pitch=world.qpos[rows, pitch, None],
+            rates=world.qvel[rows, self.pose_dof[2:].min() : self.pose_dof[2:].max() + 1],
+            xpos=world.xpos[rows].reshape(count, -1),
+            xipos=world.xipos[rows].reshape(count, -1),
+            cvel=world.cvel[rows].reshape(count, -1),
+            com=world.subtree_com[rows].reshape(count, -1),
             fall=world.sensordata[rows, self._fall],
             height=pose[:, :1],
+            position=pose[:, 1:],
+            velocity=out[:, blocks['velocity']],
             terrain=out[:, blocks.get('terrain', slice(0, 0))],
-            position=position,
-            velocity=velocity,
-            velocity_x=velocity[:, :, 0],
-            velocity_z=velocity[:, :, 1],
-            position_out=position_out,
-            velocity_out=velocity_out,
             ground_x=ground_x,
-            sample_x=ground_x[:, : len(self._samples)],
-            effector_ground_x=ground_x[:, len(self._samples) :],
+            sample_x=ground_x[:, :samples],
+            effector_ground_x=ground_x[:, samples:],
+            offsets=np.tile(self._samples, (count, 1)),
+            under=np.empty((count, samples - 1)),
             effectors=effectors,
-            effector_x=effectors[:, :count],
-            effector_z=effectors[:, count:],
+            effector_x=effectors[:, :effector_count],
+            effector_z=effectors[:, effector_count:],
             com_velocity=com_velocity[:, None],
         )
 
@@ -151,33 +152,36 @@ class PlanarFigure:
         # A trunk that points backwards looks backwards. A sum of squares is the cheapest test.
         v.facing = None
         if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2:
-            v.facing = np.where(np.cos(v.pitch) < 0, -1.0, 1.0)[:, None]
-        np.subtract(v.xipos, v.root, out=v.position)
+            v.facing = np.where(np.cos(v.pitch) < 0, -1.0, 1.0)
+        v.xipos.take(self._xz, axis=1, out=v.position, mode='clip')
+        v.position -= v.qpos.take(self._root_xz, axis=1)
         # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
-        turning = v.xipos - v.com
-        turning *= v.spin
-        np.add(v.linear_x, turning[:, :, 1], out=v.velocity_x)
-        np.subtract(v.linear_z, turning[:, :, 0], out=v.velocity_z)
-        np.matmul(self._share, v.velocity, out=v.com_velocity)
+        v.cvel.take(self._linear, axis=1, out=v.velocity, mode='clip')
+        turning = v.xipos.take(self._zx, axis=1)
+        turning -= v.com.take(self._com_zx, axis=1)
+        turning *= v.cvel.take(self._spin, axis=1)
+        turning *= self._cross
+        v.velocity += turning
+        # Row by row, so that a row's sum does not depend on how many rows there are.
+        np.matmul(v.velocity[:, None], self._share, out=v.com_velocity)
 
         samples = len(self._samples) - 1
         v.xpos.take(self._effector_xz, axis=1, out=v.effectors, mode='clip')
-        np.add(v.x, self._samples if v.facing is None else v.facing * self._samples, out=v.sample_x)
+        v.sample_x[...] = v.x
+        v.sample_x += v.offsets if v.facing is None else v.offsets * v.facing
         v.effector_ground_x[...] = v.effector_x
         ground = self.arena.height(v.ground_x, v.rows)
-        under_root = ground[:, samples, None]
-        np.subtract(v.z, under_root, out=v.height)
+        v.height[...] = v.z
+        v.height -= ground[:, samples : samples + 1]
         if samples:
-            np.subtract(ground[:, :samples], under_root, out=v.terrain)
-        v.effector_x -= v.com_x
+            v.under[...] = ground[:, samples : samples + 1]
+            np.subtract(ground[:, :samples], v.under, out=v.terrain)
+        v.effector_x -= v.com.take(self._com_x, axis=1)
         v.effector_z -= ground[:, samples + 1 :]
 
         if v.facing is not None:
-            v.position[:, :, 0] *= v.facing
-            v.velocity_x *= v.facing
-        if self._link_order is not None:
-            v.position_out[...] = v.position[:, self._link_order]
-            v.velocity_out[...] = v.velocity[:, self._link_order]
+            v.position[:, ::2] *= v.facing
+            v.velocity[:, ::2] *= v.facing
 
     def place(self, row: int, pose: np.ndarray, rate: np.ndarray) -> None:
         """Puts the character of one simulation at x = 0 onto the ground.
@@ -211,10 +215,3 @@ class PlanarFigure:
         x = centre[:, 0] + extent[:, 0] * np.array([[-1], [0], [1]])
         ground = self.ground(row, x.ravel()).reshape(x.shape)
         return float(np.max(ground - (centre[:, 2] - extent[:, 2])))
-
-
-def _span(ids: np.ndarray) -> slice:
-    """The slice that ids which are neighbours, in whatever order, lie in."""
-    first, last = int(ids.min()), int(ids.max())
-    assert last - first + 1 == len(ids), ids
-    return slice(first, last + 1)

@@ -153,14 +153,15 @@ class Imitation(Task):
             figure.effectors, PHASE_BINS,
         )  # fmt: skip
         columns = self.reference.columns
+        # Pitch and joints.
+        self._angles, self._rates = figure.pose_qpos[2:], figure.pose_dof[2:]
         self._phase_step = self.control_timestep / self.reference.period
         self._target_columns = slice(columns['height'].start, columns['velocities'].stop)
         self._phase_columns = slice(columns['quarter'].start - 1, columns['quarter'].stop)
         # What each squared difference contributes to each error, (features compared, terms).
         effectors = len(figure.effectors)
-        weights = row.weights[np.argsort(figure.pose_qpos[2:])]
         parts = {
-            'angles': weights, 'rates': weights, 'effectors': np.full(2 * effectors, 1 / effectors),
+            'angles': row.weights, 'rates': row.weights, 'effectors': np.full(2 * effectors, 1 / effectors),
             'com_velocity': np.full(2, rewards.COM_ERROR_FACTOR), 'height': np.ones(1),
         }  # fmt: skip
         self._compared = {name: columns[name] for name in parts}
@@ -252,8 +253,8 @@ class Imitation(Task):
         self.figure.measure(v)
         # What the reward compares, side by side with the same features of the reference.
         reference = self.reference.features(v.phase)
-        v.angles_out[...] = v.angles
-        v.rates_out[...] = v.rates
+        v.qpos.take(self._angles, axis=1, out=v.angles_out, mode='clip')
+        v.qvel.take(self._rates, axis=1, out=v.rates_out, mode='clip')
         v.height_out[...] = v.height
         error = v.compared - reference[:, : v.compared.shape[1]]
         if v.facing is not None:

@@ -8,13 +8,14 @@ import numpy as np
 from trl_suite.motion import Clip
 
 SAMPLES = 1024  # per cycle; linear interpolation between them errs by less than 0.02 mm
+_SAMPLES = np.full(1, float(SAMPLES))
 
 
 class Reference:
     """Kinematics of a looping planar clip, tabulated once over the phase.
 
     Features of one phase, all independent of the ground and of the distance walked; see `columns`:
-      angles (1 + J,) pitch and joint angles in the engine's order, rad; rates (1 + J,) rad/s;
+      angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
       effectors (2 * E,) end effectors: all x ahead of the centre of mass, then all z above 0, m;
       com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
@@ -50,7 +51,6 @@ class Reference:
         poses, rates = clip.pose(times), clip.velocity(times)
         mass = model.body_mass[links]
         share = mass / mass.sum()
-        engine_order = 2 + np.argsort(pose_qpos[2:])
         rows = []
         for pose, rate in zip(poses, rates, strict=True):
             data.qpos[pose_qpos] = pose
@@ -63,18 +63,15 @@ class Reference:
             effector = data.xpos[effectors][:, ::2] - (com[0], 0)
             rows.append(
                 np.concatenate([
-                    pose[engine_order], rate[engine_order], effector.T.ravel(), share @ velocity,
+                    pose[2:], rate[2:], effector.T.ravel(), share @ velocity,
                     pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(),
                 ])
             )  # fmt: skip
         table = np.array(rows)
         quarter = np.repeat(np.eye(bins), SAMPLES // bins, axis=0)
-        # Each row beside its step to the next: one look-up serves an interpolation.
-        self._table = np.concatenate(
-            [table[:-1], np.zeros((SAMPLES, 1)), quarter, np.diff(table, axis=0),
-             np.zeros((SAMPLES, 1 + bins))], axis=1,
-        )  # fmt: skip
-        self._width = self._table.shape[1] // 2
+        constant = np.zeros((SAMPLES, 1 + bins))
+        self._table = np.concatenate([table[:-1], np.zeros((SAMPLES, 1)), quarter], axis=1)
+        self._steps = np.concatenate([np.diff(table, axis=0), constant], axis=1)
         joints, bodies = len(links) - 1, 2 * len(links)
         sizes = {
             'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
@@ -89,14 +86,16 @@ class Reference:
 
     def features(self, phase: np.ndarray) -> np.ndarray:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
-        u = phase * SAMPLES
-        i = u.astype(np.int64)
-        found = self._table.take(i, axis=0)
-        step = found[:, self._width :]
-        u -= i
-        step *= u[:, None]
-        step += found[:, : self._width]
-        return step
+        u = phase * _SAMPLES
+        sample = np.floor(u)
+        u -= sample
+        index = sample.astype(np.int64)
+        found = self._steps.take(index, axis=0)
+        blend = np.empty_like(found)
+        blend[...] = u[:, None]  # packed: quicker than broadcasting
+        found *= blend
+        found += self._table.take(index, axis=0)
+        return found
 
 
 def link_velocities(centres: np.ndarray, cvel: np.ndarray, about: np.ndarray) -> np.ndarray:

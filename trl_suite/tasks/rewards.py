@@ -16,8 +16,8 @@ IMITATION_TERMS: dict[str, tuple[float, float]] = {
 }
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
-_WEIGHTS = np.array([weight for weight, _ in IMITATION_TERMS.values()])
-_SCALES = np.array([-scale for _, scale in IMITATION_TERMS.values()])
+_WEIGHTS = np.array([[weight for weight, _ in IMITATION_TERMS.values()]])
+_SCALES = np.array([[-scale for _, scale in IMITATION_TERMS.values()]])
 
 
 def imitation(errors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
