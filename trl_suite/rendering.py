@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
 
 CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
 GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
-GHOST_BEHIND = 0.45  # m; the ghost stands this much farther from the camera than the character
+GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)

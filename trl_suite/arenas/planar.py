@@ -13,12 +13,9 @@ from trl_suite.world import World
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
-POOL_LEVEL = 96  # boxes for terrain of level pieces
-POOL_SLOPED = 288  # boxes where pieces may be tilted
-LEVEL_TYPES = (
-    'var2d_flat', 'var2d_gaps', 'var2d_walls', 'var2d_steps', 'var2d_mixed', 'var2d_narrow_gaps',
-    'var2d_cliffs',
-)  # fmt: skip
+PROBES = 6  # draws by which the pool of boxes is sized
+SPARE = 1.3  # times the most boxes of any probe
+COARSEST = 0.1  # m; tolerance up to which pieces are merged if the pool should not suffice
 FRICTION = (0.81, 0.005, 0.0001)  # 0.9 * 0.9: the original multiplies, MuJoCo takes the larger
 SOLREF = (0.005, 1)
 SOLIMP = (0.95, 0.99, 0.001)
@@ -50,7 +47,6 @@ class PlanarTerrain(composer.Arena):
         root.compiler.boundinertia = 0
         _decorate(root)
         ground = root.worldbody.add('body', name='terrain')
-        pool = POOL_LEVEL if terrain.type in LEVEL_TYPES else POOL_SLOPED
         self.boxes = [
             ground.add(
                 'geom', name=f'terrain_{i}', type='box', size=(0.1, boxes.HALF_WIDTH, 0.1),
@@ -58,7 +54,7 @@ class PlanarTerrain(composer.Arena):
                 pos=(0.1 * i, 0, PARKED), friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
                 condim=3, material='ground',
             )
-            for i in range(pool)
+            for i in range(_pool_size(terrain))
         ]  # fmt: skip
 
     @property
@@ -139,6 +135,12 @@ class PlanarTerrain(composer.Arena):
         pieces = boxes.from_profile(start, heights, vertical, tolerance)
         while len(pieces.position) > len(self._geoms):  # coarser, rather than with holes
             tolerance *= 2
+            if tolerance > COARSEST:
+                raise ValueError(
+                    f'terrain {self.terrain.name!r} needs {len(pieces.position)} boxes for '
+                    f'{BEHIND + AHEAD:g} m, where {PROBES} draws led to expect no more than '
+                    f'{len(self._geoms)}: its features must be spread more evenly'
+                )
             pieces = boxes.from_profile(start, heights, vertical, tolerance)
         used, unused = np.split(self._geoms, [len(pieces.position)])
         model = self._world.models[row]
@@ -148,6 +150,16 @@ class PlanarTerrain(composer.Arena):
         model.geom_pos[unused] = ((centre + _AHEAD) * SPACING, 0, PARKED)
         model.geom_size[unused] = 0.1
         self._world.set_const(row)
+
+
+def _pool_size(terrain: Terrain) -> int:
+    """How many boxes a window of a terrain may take, from a few fixed draws."""
+    most = 0
+    for blend in range(max(1, len(terrain.parameter_sets))):
+        for seed in range(PROBES):
+            window = Strip(terrain, seed, blend=blend).window(seed * _WINDOW, _WINDOW)
+            most = max(most, len(boxes.from_profile(seed * _WINDOW, *window).position))
+    return round(SPARE * most) + PROBES
 
 
 def _decorate(root: mjcf.RootElement) -> None:

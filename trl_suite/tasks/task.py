@@ -75,12 +75,16 @@ class Task(composer.Task):
 
     def simulate(self) -> None:
         """Advances the physics by one control step."""
-        self.world.step(self.physics_steps_per_control_step)
+        self.world.step(self._substeps)
 
     # Composer's interface: one simulation.
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self.bind(World(physics))
+
+    def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
+        super().set_timesteps(control_timestep, physics_timestep)
+        self._substeps = self.physics_steps_per_control_step  # composer's is slow to ask
 
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
