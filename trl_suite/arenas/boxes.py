@@ -19,7 +19,7 @@ TOLERANCE = 0.004  # m; how far the profile may stray from a piece that is doubl
 LEVEL_THICKNESS = 4.0  # m; level boxes face the sides of the deepest gaps (2.5 m)
 TILTED_THICKNESS = 1.0  # m
 OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
-LEAN = 0.03  # m; how far the end of a tilted box may lean out behind the post at a face
+LEAN = 0.9  # of the way to the next face; how far the lower end of a tilted box may lean out
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
 EPSILON = 1e-9
 
@@ -123,12 +123,13 @@ def from_profile(
     angle = np.arctan(slope)
     sine, cosine = np.sin(angle), np.cos(angle)
     thickness = np.where(tilted, TILTED_THICKNESS, LEVEL_THICKNESS)
-    # The ends of a tilted box lean; next to a post they must not lean out behind it.
-    beside = np.zeros(len(a), dtype=bool)
-    beside[:-1] |= post[1:] & joined
-    beside[1:] |= post[:-1] & joined
+    # The lower end of a tilted box leans out: to the right where the ground rises, else to the left.
+    # It must not come out of the next face on that side.
+    right_face = np.minimum.accumulate(np.where(at_right, x1, np.inf)[::-1])[::-1]
+    left_face = np.maximum.accumulate(np.where(at_left, x0, -np.inf))
+    room = LEAN * np.where(slope > 0, right_face - x1, x0 - left_face)
     thickness = np.where(
-        beside & tilted, np.minimum(thickness, LEAN / np.maximum(np.abs(sine), EPSILON)), thickness
+        tilted, np.minimum(thickness, room / np.maximum(np.abs(sine), EPSILON)), thickness
     )
     position = np.zeros((len(a), 3))
     position[:, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine

@@ -7,7 +7,7 @@ import numpy as np
 
 from trl_suite.motion import Clip
 
-SAMPLES = 1024  # per cycle; linear interpolation between them errs by less than 0.02 mm
+SAMPLES = 1024  # per cycle; in our clips links are placed within 0.5 mm of the exact pose
 _SAMPLES = np.full(1, float(SAMPLES))
 
 
