@@ -26,6 +26,7 @@ setup(
         'dm-env',
         'numpy>=2.0',
         'lxml',
+        'tqdm',
         'trimesh',
     ],
     extras_require={

@@ -196,7 +196,9 @@ class FiguresTest(parameterized.TestCase):
         np.testing.assert_allclose(data.crb[1][:3], (xx, zz, yy), atol=1e-5)
         boxes = model.geom_group == 3
         corners = data.geom_xpos[boxes, 2] - np.einsum(
-            'ij,ij->i', np.abs(data.geom_xmat[boxes].reshape(-1, 3, 3)[:, 2]), model.geom_size[boxes]
+            'ij,ij->i',
+            np.abs(data.geom_xmat[boxes].reshape(-1, 3, 3)[:, 2]),
+            model.geom_size[boxes],
         )
         self.assertAlmostEqual(-corners.min(), figures.height, delta=5e-5)
 

@@ -6,14 +6,20 @@ environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1}
 time_step = environment.reset()
 """
 
+import ctypes.util
 import importlib
 import os
 import sys
 from typing import Any
 
-if sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
+if (
+    sys.platform == 'linux'
+    and 'MUJOCO_GL' not in os.environ
+    and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
+    and ctypes.util.find_library('EGL')  # without it dm_control could not even be imported
+):
     # dm_control would choose GLFW, which cannot draw without a display. This creates no context.
-    os.environ.setdefault('MUJOCO_GL', 'egl')
+    os.environ['MUJOCO_GL'] = 'egl'
 
 __version__ = '0.1.0'
 

@@ -113,6 +113,8 @@ class Environment(composer.Environment):
         if self._reset_next_step:
             return self.reset()
         task, physics = self._task, self._physics_proxy
+        if self._extra_observables:
+            self._observation_updater.prepare_for_next_control_step()
         self._hooks.before_step(physics, action, self._random_state)
         task.simulate()
         self._hooks.after_step(physics, self._random_state)

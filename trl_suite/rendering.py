@@ -43,7 +43,6 @@ GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
-_LIBRARIES = ('egl', 'osmesa', 'glfw')
 
 Path = str | os.PathLike[str]
 
@@ -373,39 +372,44 @@ def _camera(physics: Any, camera: str | int) -> int:
 def _check_gl(physics: Any) -> None:
     """Makes the drawing context at the first picture."""
     try:
-        # GLFW without a screen would warn, and leave a half-made context that fails once more
-        # when Python ends.
-        if _backend() == 'glfw' and not _screen():
-            raise RuntimeError('GLFW finds no screen')
+        _use_chosen_library()
         _ = physics.contexts
     # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
 
 
-def no_gl(error: Exception) -> str:
-    """Returns the sentence for a machine on which nothing can be drawn."""
-    set_to = os.environ.get('MUJOCO_GL')
-    state = 'is not set' if set_to is None else f'is {set_to!r}'
-    taken = _backend()
-    if set_to in _LIBRARIES and taken in _LIBRARIES and taken != set_to:
-        state += f', but dm_control was imported before and took {taken}'
-    reason = str(error).strip().partition('\n')[0].rstrip('.')
-    return (
-        f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
-        'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
-        'disable (no pictures)'
-    )
+def _use_chosen_library() -> None:
+    """Lets dm_control take the library that MUJOCO_GL names now, if the one it took cannot draw.
 
-
-def _backend() -> str | None:
-    """Which library dm_control took when it was imported."""
-    return getattr(sys.modules.get('dm_control._render'), 'BACKEND', None)
+    dm_control reads the variable when it is imported. Who imports it before this package, as sorted
+    imports do, leaves it with GLFW, also where there is no screen.
+    """
+    render = sys.modules.get('dm_control._render')
+    if getattr(render, 'BACKEND', None) != 'glfw' or _screen():
+        return
+    if os.environ.get('MUJOCO_GL') not in ('egl', 'osmesa'):
+        # GLFW itself would warn, and leave a half-made context that fails once more at exit.
+        raise RuntimeError('GLFW finds no screen')
+    assert render is not None
+    importlib.reload(render)
 
 
 def _screen() -> bool:
     return sys.platform != 'linux' or bool(
         os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    )
+
+
+def no_gl(error: Exception) -> str:
+    """Returns the sentence for a machine on which nothing can be drawn."""
+    set_to = os.environ.get('MUJOCO_GL')
+    state = 'is not set' if set_to is None else f'is {set_to!r}'
+    reason = str(error).strip().partition('\n')[0].rstrip('.')
+    return (
+        f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
+        'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
+        'disable (no pictures)'
     )
 
 

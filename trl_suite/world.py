@@ -7,6 +7,7 @@ environment (n = 1, over one `dm_control` Physics) and a batch.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 
 import mujoco
@@ -25,7 +26,7 @@ _DIVERGED = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BAD
 
 
 class World:
-    """One simulation, as arrays with a leading axis of 1, over a dm_control Physics.
+    """n simulations: what tasks may read, write and ask.
 
     Attributes:
       n: number of simulations.
@@ -53,61 +54,45 @@ class World:
     ten_length: np.ndarray
     actuator_force: np.ndarray
 
-    def __init__(self, physics: mjcf.Physics) -> None:
-        self.n = 1
-        # The raw pointers, not the physics: dm_control hands out weak proxies of it.
-        self._model, self._data = physics.model.ptr, physics.data.ptr
-        self.models = [self._model]
-        self._scratch = mujoco.MjData(self._model)
-        self._divergence = self._data.warning.number[_DIVERGED]
-        for field in WRITABLE + READABLE:
-            view = getattr(self._data, field)[None]
-            if field in READABLE:
-                view.flags.writeable = False
-            setattr(self, field, view)
+    def __init__(self, model: mujoco.MjModel, models: list[mujoco.MjModel]) -> None:
+        self.n = len(models)
+        self.models = models
+        self._model = model
+        self._scratch = mujoco.MjData(model)  # mj_setConst overwrites the state of its data
 
+    # The verbs; rows are numbers of simulations.
+
+    @abc.abstractmethod
     def step(self, nstep: int) -> None:
-        """Advances all simulations by `nstep` substeps in C, positions and velocities current.
+        """Advances all simulations by `nstep` substeps in C, positions and velocities current."""
 
-        The order of dm_control's default (`legacy_step`): finish the open step, run the others,
-        and begin the next, so that kinematics belong to the new state.
-        """
-        mujoco.mj_step2(self._model, self._data)
-        if nstep > 1:
-            mujoco.mj_step(self._model, self._data, nstep - 1)
-        mujoco.mj_step1(self._model, self._data)
-
+    @abc.abstractmethod
     def forward(self, row: int) -> None:
         """Recomputes everything that depends on a written state."""
-        mujoco.mj_forward(self._model, self._data)
 
+    @abc.abstractmethod
     def reset(self, row: int) -> None:
         """Puts one simulation into the model's initial state, warnings cleared."""
-        mujoco.mj_resetData(self._model, self._data)
 
+    @abc.abstractmethod
     def set_const(self, row: int) -> None:
-        """Makes edits of a row's static geoms take effect."""
-        # mj_setConst overwrites qpos, hence the scratch data; without it bodies fall through.
-        mujoco.mj_setConst(self._model, self._scratch)
+        """Makes edits of a row's static geoms take effect; without it bodies fall through them."""
 
+    @abc.abstractmethod
     def get_state(self, row: int) -> np.ndarray:
         """Returns the full integration state of one simulation."""
-        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
-        mujoco.mj_getState(self._model, self._data, state, STATE)
-        return state
 
+    @abc.abstractmethod
     def set_state(self, row: int, state: np.ndarray) -> None:
         """Restores one simulation so that it continues bit for bit."""
-        mujoco.mj_setState(self._model, self._data, state, STATE)
-        mujoco.mj_forward(self._model, self._data)
 
+    @abc.abstractmethod
     def any_diverged(self) -> bool:
         """Whether `diverged` holds for any simulation; the cheap test of every step."""
-        return any(self._divergence.tolist())
 
+    @abc.abstractmethod
     def diverged(self) -> np.ndarray:
         """Returns which simulations met a non-finite or huge state since their reset, (n,)."""
-        return np.array([self.any_diverged()])
 
     def body_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_BODY, names)
@@ -135,3 +120,50 @@ class World:
             missing = [name for name, i in zip(names, ids, strict=True) if i < 0]
             raise ValueError(f'the model has no {kind.name[6:].lower()} named {missing}')
         return ids
+
+
+class PhysicsWorld(World):
+    """One simulation over a dm_control Physics."""
+
+    def __init__(self, physics: mjcf.Physics) -> None:
+        # The raw pointers, not the physics: dm_control hands out weak proxies of it.
+        model, self._data = physics.model.ptr, physics.data.ptr
+        super().__init__(model, [model])
+        self._divergence = self._data.warning.number[_DIVERGED]
+        for field in WRITABLE + READABLE:
+            view = getattr(self._data, field)[None]
+            if field in READABLE:
+                view.flags.writeable = False
+            setattr(self, field, view)
+
+    def step(self, nstep: int) -> None:
+        # The order of dm_control's default (`legacy_step`): finish the open step, run the others,
+        # and begin the next, so that kinematics belong to the new state.
+        mujoco.mj_step2(self._model, self._data)
+        if nstep > 1:
+            mujoco.mj_step(self._model, self._data, nstep - 1)
+        mujoco.mj_step1(self._model, self._data)
+
+    def forward(self, row: int) -> None:
+        mujoco.mj_forward(self._model, self._data)
+
+    def reset(self, row: int) -> None:
+        mujoco.mj_resetData(self._model, self._data)
+
+    def set_const(self, row: int) -> None:
+        mujoco.mj_setConst(self._model, self._scratch)
+
+    def get_state(self, row: int) -> np.ndarray:
+        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        mujoco.mj_getState(self._model, self._data, state, STATE)
+        return state
+
+    def set_state(self, row: int, state: np.ndarray) -> None:
+        mujoco.mj_setState(self._model, self._data, state, STATE)
+        mujoco.mj_forward(self._model, self._data)
+
+    def any_diverged(self) -> bool:
+        return any(self._divergence.tolist())
+
+    def diverged(self) -> np.ndarray:
+        return np.array([self.any_diverged()])

@@ -85,6 +85,8 @@ class PlanarTerrain(composer.Arena):
             for row in np.flatnonzero(np.abs(moved) > _REACH).tolist():
                 # The window starts at multiples of the advance, however far a row has jumped.
                 self._lay(row, round(float(x[row, 0]) / ADVANCE) * _ADVANCE)
+                # Contacts of the open step name boxes that now lie elsewhere.
+                self._world.forward(row)
 
     def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""

@@ -25,12 +25,15 @@ class Joint:
       kd: damping gain, N m s/rad.
       weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
       target: working posture of position control, rad.
+      original_range: limits in rad by which the original scales position actions, where they are
+        not the limits that act.
     """
 
     kp: float
     kd: float
     weight: float
     target: float = 0.0
+    original_range: tuple[float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

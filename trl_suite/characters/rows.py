@@ -6,9 +6,13 @@ import dataclasses
 
 from trl_suite.characters.character import CharacterRow, Joint
 
+# The dog's pelvis box is rotated; the original measures these two limits against it (they act 0.61
+# rad higher), but scales actions by the file's numbers.
+_FILE_RANGE = (-1.57, 1.57)
+
 # Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order.
 _DOG_JOINTS = {
-    'spine0': Joint(200, 20, 0.5),
+    'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
     'spine1': Joint(200, 20, 0.5),
     'spine2': Joint(200, 20, 0.5),
     'spine3': Joint(200, 20, 0.5),
@@ -24,7 +28,7 @@ _DOG_JOINTS = {
     'elbow': Joint(80, 8, 1, 0.87117),
     'wrist': Joint(80, 8, 1, 0.11488),
     'finger': Joint(80, 8, 1, -0.46365),
-    'hip': Joint(130, 13, 1, 0.61719),
+    'hip': Joint(130, 13, 1, 0.61719, original_range=_FILE_RANGE),
     'knee': Joint(50, 5, 1, -1.31193),
     'ankle': Joint(50, 5, 1, 1.32022),
     'toe': Joint(50, 5, 1, -0.62549),

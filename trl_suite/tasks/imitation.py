@@ -334,7 +334,12 @@ def position_range(
 ) -> dict[str, Any]:
     """Centre and half range of position control, rad (see `Imitation`)."""
     if centre == 'original':
-        ranges = character.joint_ranges
+        ranges = np.array([
+            joint.original_range or limits
+            for joint, limits in zip(
+                character.row.joints.values(), character.joint_ranges.tolist(), strict=True
+            )
+        ])  # fmt: skip
         free = ~np.isfinite(ranges).all(1)
         ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
         scale = 2 * (ranges[:, 1] - ranges[:, 0]) if half_range is None else half_range

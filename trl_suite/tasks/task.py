@@ -12,7 +12,7 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from trl_suite.actuation import ActionMap
-from trl_suite.world import World
+from trl_suite.world import PhysicsWorld, World
 
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
@@ -42,6 +42,7 @@ class Task(composer.Task):
     reward: np.ndarray
     failed: np.ndarray
     diverged: np.ndarray
+    _begun = False  # whether no step was taken since composer's reset
 
     # What a family implements.
 
@@ -80,7 +81,7 @@ class Task(composer.Task):
     # Composer's interface: one simulation.
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        self.bind(World(physics))
+        self.bind(PhysicsWorld(physics))
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
         super().set_timesteps(control_timestep, physics_timestep)
@@ -90,10 +91,15 @@ class Task(composer.Task):
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
         self.begin_episode(0, episode_seed(random_state))
+        self._begun = True
 
     def before_step(
         self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
     ) -> None:
+        if self._begun:
+            # A plain composer.Environment leaves a reset with the actuators' velocities at zero.
+            self.world.forward(0)
+            self._begun = False
         self.act(np.asarray(action, dtype=float)[None])
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:

@@ -1,0 +1,313 @@
+"""Tests of trl_suite.actuation: what an action means, and what a joint can get."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+
+from trl_suite import actuation, characters, motion, resources, suite
+from trl_suite.tasks import imitation
+
+TIMESTEP = 1 / 300  # s
+MUSCLES = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
+JOINTS = {'biped2d': 6, 'biped2d_full': 11, 'dog': 20, 'goat': 20, 'raptor': 18}
+PAIRS = tuple(
+    (name, model) for name in JOINTS for model in ('torque', 'velocity', 'position', 'muscle')
+)
+
+
+class Mounted:
+    """A character whose root is welded to the world, without gravity and contacts."""
+
+    def __init__(self, name, model, **options):
+        arena = composer.Arena()
+        option = arena.mjcf_model.option
+        option.timestep, option.integrator, option.gravity = TIMESTEP, 'implicitfast', (0, 0, 0)
+        option.flag.contact = 'disable'
+        self.character = characters.make(name)
+        arena.attach(self.character)
+        self.map = actuation.add(self.character, model, TIMESTEP, **options)
+        physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+        self.model, self.data = physics.model.ptr, physics.data.ptr
+        self._physics = physics
+        names = [joint.full_identifier for joint in self.character.joints]
+        ids = [self.model.joint(name).id for name in names]
+        self.qpos, self.dof = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
+        self.joints = list(self.character.row.joints.values())
+        ids = [self.model.actuator(f'{name}/{each}').id for each in self.map.names]
+        self.actuators = np.array(ids)
+
+    def act(self, action):
+        self.data.ctrl[self.actuators] = self.map.control(np.asarray(action, float))
+
+    def forward(self):
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, seconds):
+        mujoco.mj_step(self.model, self.data, round(seconds / TIMESTEP))
+
+    @property
+    def torque(self):
+        return self.data.qfrc_actuator[self.dof]
+
+
+class ActionMapTest(parameterized.TestCase):
+    """An affine map that can be read."""
+
+    @parameterized.parameters(*PAIRS)
+    def test_affine_clipped_and_invertible(self, name, model):
+        mapping = Mounted(name, model).map
+        size = MUSCLES[name] if model == 'muscle' else JOINTS[name]
+        self.assertLen(mapping, size)
+        self.assertLen(set(mapping.names), size)
+        self.assertEqual(mapping.centre.shape, (size,))
+        self.assertEqual(mapping.half_range.shape, (size,))
+        rng = np.random.default_rng(0)
+        action = rng.uniform(-1, 1, (5, size))
+        control = mapping.control(action)
+        np.testing.assert_allclose(control, mapping.centre + mapping.half_range * action)
+        np.testing.assert_allclose(mapping.action(control), action, atol=1e-12)
+        far = rng.uniform(1, 9, size)
+        np.testing.assert_array_equal(mapping.control(far), mapping.control(np.ones(size)))
+        np.testing.assert_array_equal(mapping.control(-far), mapping.control(-np.ones(size)))
+
+    def test_the_given_action_is_not_changed(self):
+        mapping, action = Mounted('biped2d', 'torque').map, np.full(6, 3.0)
+        mapping.control(action)
+        np.testing.assert_array_equal(action, 3.0)
+
+    @parameterized.parameters(
+        ('torque', 'torque', 'N m'), ('velocity', 'target velocity', 'rad/s'),
+        ('position', 'target angle', 'rad'), ('muscle', 'excitation', '1'),
+    )  # fmt: skip
+    def test_what_a_control_is(self, model, quantity, unit):
+        mapping = Mounted('dog', model).map
+        self.assertEqual((mapping.quantity, mapping.unit), (quantity, unit))
+
+    @parameterized.parameters(*JOINTS)
+    def test_names_are_those_of_the_joints_in_link_order(self, name):
+        for model in ('torque', 'velocity', 'position'):
+            names = Mounted(name, model).map.names
+            self.assertEqual(names, characters.CHARACTERS[name].links[1:])
+
+    def test_torque_is_three_quarters_of_the_limit(self):
+        mapping = Mounted('biped2d_full', 'torque').map
+        full = dict(zip(mapping.names, mapping.control(np.ones(11)), strict=True))
+        # Limits 150, 125, 100 at hip, knee, ankle; 100, 75 at shoulder, elbow; 50 at the neck.
+        for joint, torque in (
+            ('right_hip', 112.5), ('left_knee', 93.75), ('right_ankle', 75), ('left_shoulder', 75),
+            ('right_forearm', 56.25), ('neck', 37.5),
+        ):  # fmt: skip
+            self.assertAlmostEqual(full[joint], torque)
+        np.testing.assert_array_equal(mapping.centre, 0)
+
+    def test_velocity_is_five_turns_a_second(self):
+        mapping = Mounted('raptor', 'velocity').map
+        np.testing.assert_allclose(mapping.half_range, 31.4159265, rtol=1e-8)
+        np.testing.assert_array_equal(mapping.centre, 0)
+
+    def test_excitation_is_between_a_hundredth_and_one(self):
+        mapping = Mounted('dog', 'muscle').map
+        np.testing.assert_allclose(mapping.control(-np.ones(44)), 0.01)
+        np.testing.assert_allclose(mapping.control(np.ones(44)), 1)
+
+    def test_position_without_options_is_the_posture_and_1_5_rad(self):
+        mapping = Mounted('raptor', 'position').map
+        np.testing.assert_array_equal(mapping.half_range, 1.5)
+        centre = dict(zip(mapping.names, mapping.centre, strict=True))
+        self.assertAlmostEqual(centre['right_hip'], 0.46487)
+        self.assertAlmostEqual(centre['left_knee'], -1.456)
+
+    def test_position_options(self):
+        reach = np.linspace(0.5, 1.5, 6)
+        mapping = Mounted('biped2d', 'position', centre=[0.1] * 6, half_range=reach).map
+        np.testing.assert_allclose(mapping.control(np.ones(6)), 0.1 + reach)
+        for options in (
+            {'centre': [0.0]}, {'centre': [np.nan] * 6}, {'half_range': 0}, {'half_range': -1},
+        ):  # fmt: skip
+            with self.assertRaisesRegex(ValueError, 'centre and half_range'):
+                Mounted('biped2d', 'position', **options)
+
+    def test_environment_centres_position_control_on_the_clip(self):
+        environment = suite.make('PD_Dog2D_LLC_Imitate_Flat-v0', {'random': 0})
+        clip = motion.load('dog_bound')
+        times = np.linspace(0, clip.duration, 2000, endpoint=False)
+        mean = clip.pose(times)[:, 3:].mean(0)
+        np.testing.assert_allclose(environment.action_map.centre, mean, atol=2e-3)
+        np.testing.assert_array_equal(environment.action_map.half_range, 1.5)
+
+    def test_original_map_spans_four_times_the_range_of_the_file(self):
+        task_kwargs = {'centre': 'original'}
+        mapping = suite.build('biped2d', task_kwargs=task_kwargs).action_map
+        knee = mapping.names.index('right_knee')
+        self.assertAlmostEqual(mapping.centre[knee], -1.57)
+        self.assertAlmostEqual(mapping.half_range[knee], 6.28)
+        mapping = suite.build('dog', task_kwargs=task_kwargs).action_map
+        figures = {
+            joint: (centre, reach)
+            for joint, centre, reach in zip(
+                mapping.names, mapping.centre, mapping.half_range, strict=True
+            )
+        }
+        np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # turns freely
+        np.testing.assert_allclose(figures['elbow'], (1.57, 6.28))
+        # Limits of the file, [-1.57, 1.57], not those that act, [-0.96, 2.18].
+        np.testing.assert_allclose(figures['hip'], (0, 6.28), atol=1e-9)
+        np.testing.assert_allclose(figures['spine0'], (0, 6.28), atol=1e-9)
+
+    def test_centres(self):
+        self.assertCountEqual(imitation.CENTRES, ('clip', 'posture', 'original'))
+        mapping = suite.build('raptor', task_kwargs={'centre': 'posture'}).action_map
+        self.assertAlmostEqual(mapping.centre[mapping.names.index('left_hip')], 0.46487)
+        mapping = suite.build('raptor', task_kwargs={'half_range': 0.7}).action_map
+        np.testing.assert_array_equal(mapping.half_range, 0.7)
+
+    def test_refusals(self):
+        with self.assertRaisesRegex(ValueError, "unknown actuation 'postion'.*'position'"):
+            actuation.add(characters.make('dog'), 'postion', TIMESTEP)
+        row = dataclasses.replace(
+            characters.CHARACTERS['biped2d'],
+            name='mine',
+            path=str(resources.directory('xml') / 'biped2d.xml'),
+        )
+        with self.assertRaisesRegex(ValueError, "'mine' has no muscles.*biped2d.*dog.*raptor"):
+            actuation.add(characters.make(row), 'muscle', TIMESTEP)
+        self.assertLen(actuation.add(characters.make(row), 'position', TIMESTEP), 6)
+
+
+class ServoTest(parameterized.TestCase):
+    """What the compiled actuators do, by their formulas."""
+
+    @parameterized.parameters(*JOINTS)
+    def test_position_law(self, name):
+        mounted = Mounted(name, 'position')
+        data, limits = mounted.data, mounted.character.torque_limits
+        kp = np.array([joint.kp for joint in mounted.joints])
+        kd = np.array([joint.kd for joint in mounted.joints])
+        rng = np.random.default_rng(1)
+        angle, rate = rng.uniform(-1, 1, kp.shape), rng.uniform(-1, 1, kp.shape)
+        action = rng.uniform(-1, 1, kp.shape)
+        data.qpos[mounted.qpos], data.qvel[mounted.dof] = angle, rate
+        mounted.act(action)
+        mounted.forward()
+        passive = -data.qfrc_damper[mounted.dof] / rate
+        # A fiftieth of the torque limit acts outside the clamp, the rest of kd inside.
+        np.testing.assert_allclose(passive, np.minimum(limits / 50, kd))
+        spring = kp * (mounted.map.centre + 1.5 * action - angle)
+        inside = np.clip(spring - (kd - passive) * rate, -limits, limits)
+        np.testing.assert_allclose(mounted.torque, inside, atol=1e-9)
+
+    @parameterized.parameters(*JOINTS)
+    def test_velocity_law(self, name):
+        mounted = Mounted(name, 'velocity')
+        kd = np.array([joint.kd for joint in mounted.joints])
+        limits = mounted.character.torque_limits
+        rng = np.random.default_rng(1)
+        rate, action = rng.uniform(-9, 9, kd.shape), rng.uniform(-1, 1, kd.shape)
+        mounted.data.qvel[mounted.dof] = rate
+        mounted.act(action)
+        mounted.forward()
+        force = np.clip(kd * (10 * np.pi * action - rate), -limits, limits)
+        np.testing.assert_allclose(mounted.torque, force, atol=1e-9)
+        np.testing.assert_array_equal(mounted.data.qfrc_damper, 0)  # all of kd is the servo's
+
+    @parameterized.parameters(*JOINTS)
+    def test_torque_law(self, name):
+        mounted = Mounted(name, 'torque')
+        action = np.random.default_rng(1).uniform(-1, 1, JOINTS[name])
+        mounted.act(action)
+        mounted.forward()
+        limits = mounted.character.torque_limits
+        np.testing.assert_allclose(mounted.torque, 0.75 * limits * action)
+
+    @parameterized.parameters(*PAIRS)
+    def test_every_joint_has_armature(self, name, model):
+        mounted = Mounted(name, model)
+        np.testing.assert_array_equal(mounted.model.dof_armature[mounted.dof], 0.01)
+        np.testing.assert_array_equal(mounted.model.dof_frictionloss, 0)
+
+    @parameterized.parameters(*JOINTS)
+    def test_position_control_reaches_its_target(self, name):
+        mounted = Mounted(name, 'position')
+        low, high = mounted.character.joint_ranges.T
+        target = np.clip(np.random.default_rng(2).uniform(-0.5, 0.5, low.shape), low + 0.1,
+                         high - 0.1)  # fmt: skip
+        mounted.act(mounted.map.action(target))
+        mounted.step(20)
+        np.testing.assert_allclose(mounted.data.qpos[mounted.qpos], target, atol=1e-4)
+
+    @parameterized.parameters(('raptor', 'tail4'), ('dog', 'tail3'))
+    def test_velocity_control_reaches_its_target(self, name, joint):
+        mounted = Mounted(name, 'velocity')
+        action = np.zeros(len(mounted.map))
+        i = mounted.map.names.index(joint)
+        action[i] = 0.1
+        mounted.act(action)
+        mounted.step(1.5)
+        rate = mounted.data.qvel[mounted.dof[i]]
+        self.assertAlmostEqual(rate, np.pi, delta=0.02 * np.pi)
+
+    @parameterized.parameters(
+        *((name, model) for name in ('biped2d', 'dog') for model in actuation.ACTUATIONS)
+    )
+    def test_limits_of_joints_hold(self, name, model):
+        for direction in (-1, 1):
+            mounted = Mounted(name, model)
+            action = np.full(len(mounted.map), float(direction))
+            if model == 'muscle':
+                action *= np.random.default_rng(0).choice((-1.0, 1.0), len(mounted.map))
+            mounted.act(action)
+            low, high = mounted.character.joint_ranges.T
+            for i in range(900):
+                mounted.step(TIMESTEP)
+                angle = mounted.data.qpos[mounted.qpos]
+                beyond = np.maximum(low - angle, angle - high).max()
+                # An impact at tens of rad/s goes deeper than what full effort holds.
+                self.assertLess(beyond, 0.3 if i < 600 else 0.05)
+
+
+class TorqueLimitTest(parameterized.TestCase):
+    """No model lets a joint exceed its limit, whatever happens."""
+
+    @parameterized.parameters(*PAIRS)
+    def test_in_a_violent_rollout(self, name, model):
+        environment = suite.build(name, model, 'slopes_mixed', task_kwargs={'random': 3})
+        environment.reset()
+        task = environment.task
+        compiled, data = environment.physics.model.ptr, environment.physics.data.ptr
+        dof = compiled.jnt_dofadr[
+            [compiled.joint(joint.full_identifier).id for joint in task.character.joints]
+        ]
+        limits, mapping = task.character.torque_limits, task.action_map
+        rng = np.random.default_rng(4)
+        highest = np.zeros(len(limits))
+        for _ in range(6):
+            data.qvel[dof] += rng.uniform(-30, 30, len(dof))
+            for _ in range(10):
+                data.ctrl[:] = mapping.control(rng.choice((-1.0, 1.0), len(mapping)))
+                for _ in range(10):
+                    mujoco.mj_step(compiled, data)
+                    np.maximum(highest, np.abs(data.qfrc_actuator[dof]), out=highest)
+        np.testing.assert_array_less(highest, limits * (1 + 1e-9))
+        np.testing.assert_array_equal(data.warning.number[:7], 0)
+        # The test means something: the limits are met.
+        share = (highest / limits).max()
+        self.assertGreater(share, 0.75 - 1e-9 if model == 'torque' else 0.99)
+        if model == 'torque':
+            self.assertLessEqual(share, 0.75 + 1e-9)
+
+    @parameterized.parameters(*MUSCLES)
+    def test_all_muscles_at_once(self, name):
+        mounted = Mounted(name, 'muscle')
+        mounted.data.qvel[:] = 20  # lengthening muscles pull with up to 1.5 of their peak force
+        mounted.act(np.ones(len(mounted.map)))
+        mounted.forward()
+        np.testing.assert_array_less(
+            np.abs(mounted.torque), mounted.character.torque_limits * (1 + 1e-9)
+        )
+
+
+if __name__ == '__main__':
+    absltest.main()

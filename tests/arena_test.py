@@ -1,0 +1,387 @@
+"""Tests of trl_suite.arenas: the collision geometry is the profile, wherever the character is."""
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import mjcf
+
+from trl_suite import suite, terrain
+from trl_suite.arenas import PlanarTerrain, boxes
+from trl_suite.world import PhysicsWorld
+
+TIMESTEP = 1 / 300  # s
+GRAVITY = 9.8  # m/s^2; the original's
+CELL = terrain.SPACING
+BEHIND, AHEAD = 5.9, 17.9  # m; how far the window of boxes reaches about where it was laid
+LEVEL = (
+    'flat', 'gaps_humanoid', 'walls_humanoid', 'steps_humanoid', 'mixed_humanoid', 'gaps', 'walls',
+    'steps', 'mixed', 'cliffs_rugged', 'narrow_gaps_raptor', 'tight_gaps', 'stairs',
+)  # fmt: skip
+# Largest and root mean square deviation of 0.1 m pieces from the profile, m.
+SLOPED = {
+    'inclines': (0.005, 0.002), 'slopes': (0.006, 0.002), 'slopes_mixed': (0.006, 0.002),
+    'slopes_mixed_humanoid': (0.006, 0.002), 'slopes_gaps_raptor': (0.007, 0.002),
+    'slopes_narrow_gaps': (0.006, 0.002), 'slopes_humanoid': (0.025, 0.006),
+}  # fmt: skip
+OF_ROWS = (
+    'flat', 'inclines', 'steps_humanoid', 'slopes_humanoid', 'gaps_humanoid', 'walls_humanoid',
+    'mixed_humanoid', 'slopes_mixed_humanoid',
+)  # fmt: skip
+
+
+class Ground:
+    """An arena by itself, or with one planar body on it."""
+
+    def __init__(self, source, seed=0, timestep=TIMESTEP, body=None, **strip):
+        self.arena = PlanarTerrain(terrain.load(source))
+        root = self.arena.mjcf_model
+        root.option.timestep = timestep
+        if body is not None:
+            element = root.worldbody.add('body', name='body')
+            element.add('joint', name='x', type='slide', axis=(1, 0, 0))
+            element.add('joint', name='z', type='slide', axis=(0, 0, 1))
+            element.add('joint', name='pitch', type='hinge', axis=(0, -1, 0))
+            element.add('geom', name='body', **body)
+        self._physics = mjcf.Physics.from_mjcf_model(root)
+        self.model, self.data = self._physics.model.ptr, self._physics.data.ptr
+        self.world = PhysicsWorld(self._physics)
+        self.arena.bind(self.world)
+        self.strip = terrain.Strip(self.arena.terrain, seed, **strip)
+        self.arena.begin_episode(0, terrain.Strip(self.arena.terrain, seed, **strip))
+        self.world.forward(0)
+
+    def follow(self, x):
+        self.arena.follow(np.array([[float(x)]]))
+        self.world.forward(0)
+
+    def ray(self, start, direction):
+        """Where a ray meets the ground first: distance, normal, and whether it is the ground."""
+        geom, normal = np.zeros(1, np.int32), np.zeros(3)
+        distance = mujoco.mj_ray(
+            self.model, self.data, np.array(start, float), np.array(direction, float), None, True,
+            -1, geom, normal,
+        )  # fmt: skip
+        ground = geom[0] >= 0 and self.model.body(self.model.geom_bodyid[geom[0]]).name == 'terrain'
+        return distance, normal, ground
+
+    def heights(self, xs):
+        """Heights of the collision geometry."""
+        found = []
+        top = float(self.strip.height(xs).max()) + 3
+        for x in xs:
+            distance, _, ground = self.ray((x, 0, top), (0, 0, -1))
+            found.append(top - distance if ground else np.nan)
+        return np.array(found)
+
+
+def faces_of(strip, low, high):
+    """Middles of the vertical cells between two places, and heights on both sides, m."""
+    first = round(low / CELL)
+    heights, vertical = strip.window(first, round((high - low) / CELL))
+    numbers = np.flatnonzero(vertical[1:]) + 1
+    return (first + numbers - 0.5) * CELL, heights[numbers - 1], heights[numbers]
+
+
+def away_from_faces(strip, xs):
+    """Those of xs that do not lie in a vertical cell, 0.0125 m to both sides of its face."""
+    faces = faces_of(strip, xs.min() - 1, xs.max() + 1)[0]
+    if not len(faces):
+        return xs
+    return xs[np.abs(xs[:, None] - faces).min(1) > 0.5 * CELL + 1e-9]
+
+
+class GeometryTest(parameterized.TestCase):
+    """Ray casts against the profile."""
+
+    def sample(self, source, seed, centre):
+        ground = Ground(source, seed)
+        ground.follow(centre)
+        xs = np.random.default_rng(seed).uniform(centre - BEHIND, centre + AHEAD, 1500)
+        xs = away_from_faces(ground.strip, xs)
+        self.assertGreater(len(xs), 1000)
+        return ground.heights(xs) - ground.strip.height(xs)
+
+    @parameterized.parameters(*LEVEL)
+    def test_level_ground(self, source):
+        for seed, centre in ((0, 0), (1, 48), (2, -30)):
+            np.testing.assert_allclose(self.sample(source, seed, centre), 0, atol=1e-6)
+
+    @parameterized.parameters(*SLOPED)
+    def test_sloped_ground(self, source):
+        largest, typical = SLOPED[source]
+        for seed, centre in ((0, 0), (1, 48), (2, -30), (3, 96)):
+            error = self.sample(source, seed, centre)
+            self.assertLess(np.abs(error).max(), largest)
+            self.assertLess(np.sqrt(np.mean(error**2)), typical)
+
+    @parameterized.parameters(
+        'gaps_humanoid', 'walls_humanoid', 'steps_humanoid', 'mixed_humanoid', 'cliffs_rugged',
+        'tight_gaps', 'slopes_mixed_humanoid', 'slopes_mixed', 'slopes_gaps_raptor',
+    )  # fmt: skip
+    def test_faces_are_vertical(self, source):
+        met = 0
+        for seed in range(4):
+            ground = Ground(source, seed)
+            for face, left, right in zip(*faces_of(ground.strip, -5, 17), strict=True):
+                if abs(right - left) < 0.03:
+                    continue
+                sign = 1.0 if right > left else -1.0  # towards higher ground
+                low, high = min(left, right), max(left, right)
+                for share in (0.1, 0.5, 0.9):
+                    start = (face - sign * 0.015, 0, low + share * (high - low))
+                    distance, normal, hit = ground.ray(start, (sign, 0, 0))
+                    self.assertTrue(hit)
+                    self.assertAlmostEqual(distance, 0.015, delta=1e-9)
+                    np.testing.assert_allclose(normal, (-sign, 0, 0), atol=1e-12)
+                    met += 1
+        self.assertGreater(met, 40)
+
+    @parameterized.parameters('slopes_mixed_humanoid', 'slopes_gaps_raptor', 'slopes_narrow_gaps')
+    def test_gaps_in_slopes_are_empty(self, source):
+        """No lower end of a tilted box leans out of a side of a gap."""
+        gaps = 0
+        for seed in range(5):
+            ground = Ground(source, seed)
+            faces = faces_of(ground.strip, -5, 17)
+            drop = faces[1] - faces[2]
+            for i in np.flatnonzero((drop[:-1] > 0.5) & (drop[1:] < -0.5)):
+                left, right = faces[0][i : i + 2]
+                xs = np.linspace(left + 0.0126, right - 0.0126, 9)
+                error = ground.heights(xs) - ground.strip.height(xs)
+                self.assertLess(np.abs(error).max(), 0.02, f'gap at {left}')
+                gaps += 1
+        self.assertGreater(gaps, 5)
+
+    def test_ground_does_not_depend_on_the_window(self):
+        for source in ('slopes_mixed_humanoid', 'slopes_humanoid', 'mixed_humanoid'):
+            ground = Ground(source, 5)
+            xs = away_from_faces(ground.strip, np.linspace(2, 14, 1201))
+            first = ground.heights(xs)
+            ground.follow(6.5)
+            np.testing.assert_allclose(ground.heights(xs), first, atol=1e-9)
+
+    def test_a_strip_two_metres_wide(self):
+        ground = Ground('steps_humanoid')
+        for lateral, hit in ((0.99, True), (-0.99, True), (1.01, False)):
+            self.assertEqual(ground.ray((3, lateral, 5), (0, 0, -1))[2], hit)
+
+    def test_solver_and_friction(self):
+        ground = Ground('mixed_humanoid')
+        option = ground.model.opt
+        self.assertEqual(option.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL)
+        self.assertEqual(option.integrator, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+        self.assertEqual(option.noslip_iterations, 0)
+        np.testing.assert_array_equal(option.gravity, (0, 0, -GRAVITY))
+        np.testing.assert_allclose(ground.model.geom_friction[:, 0], 0.81)
+        np.testing.assert_array_equal(ground.model.geom_condim, 3)
+
+
+class QueryTest(parameterized.TestCase):
+    """Height and slope come from the strip, not from the boxes."""
+
+    @parameterized.parameters('slopes_humanoid', 'gaps_humanoid', 'cliffs_rugged')
+    def test_height_and_slope(self, source):
+        ground = Ground(source, 4)
+        for centre in (0.0, 9.0, -40.0, 500.0):
+            ground.follow(centre)
+            xs = np.random.default_rng(1).uniform(centre - 3, centre + 12, (1, 400))
+            np.testing.assert_allclose(ground.arena.height(xs), ground.strip.height(xs), atol=1e-10)
+            np.testing.assert_allclose(ground.arena.slope(xs), ground.strip.slope(xs), atol=1e-9)
+
+    def test_heights_at_vertices(self):
+        ground = Ground('slopes_humanoid', 4)
+        heights, _ = ground.strip.window(-100, 400)
+        xs = np.arange(-100, 300)[None] * CELL
+        np.testing.assert_allclose(ground.arena.height(xs)[0], heights, atol=1e-10)
+
+
+class PoolTest(parameterized.TestCase):
+    """The pool of boxes holds every window, at full resolution."""
+
+    @parameterized.parameters(*OF_ROWS, 'cliffs_rugged', 'narrow_gaps_raptor', 'slopes_steps_hard')
+    def test_pool_is_never_exceeded(self, source):
+        ground = PlanarTerrain(terrain.load(source))
+        pool, most = len(ground.boxes), 0
+        for seed in range(100, 140):
+            strip = terrain.Strip(ground.terrain, seed)
+            for centre in range(-1, 10):
+                first = (centre - 1) * 240  # windows of 24 m are laid every 6 m
+                window = strip.window(first, 961)
+                most = max(most, len(boxes.from_profile(first, *window).position))
+        self.assertLessEqual(most, pool)
+
+    def test_rows_use_these_terrains(self):
+        self.assertEqual({suite.find(id_).terrain for id_ in suite.ALL_IDS}, set(OF_ROWS))
+
+    def test_unused_boxes_are_out_of_reach(self):
+        ground = Ground('steps_humanoid')
+        deep = ground.model.geom_pos[:, 2] < -50
+        self.assertTrue(deep.any())
+        self.assertFalse(deep.all())
+
+    def test_boxes_follow_each_other(self):
+        strip = terrain.Strip(terrain.load('slopes_mixed_humanoid'), 3)
+        pieces = boxes.from_profile(-240, *strip.window(-240, 961))
+        self.assertTrue((np.diff(pieces.position[:, 0]) > -0.5).all())
+        self.assertTrue((pieces.half_size > 0).all())
+        np.testing.assert_allclose(np.linalg.norm(pieces.quaternion, axis=1), 1)
+
+
+class DynamicsTest(parameterized.TestCase):
+    """Bodies on boxes that were moved after compiling."""
+
+    @parameterized.parameters(
+        ('gaps_humanoid', 0.0), ('cliffs_rugged', 9.0), ('steps_humanoid', 48.0),
+    )  # fmt: skip
+    def test_a_ball_rests_at_the_exact_height(self, source, x):
+        ball = {'type': 'sphere', 'size': (0.1,), 'mass': 1}
+        ground = Ground(source, 2, body=ball)
+        ground.follow(x)
+        places = x + np.linspace(-2, 6, 200)
+        heights = np.array([ground.strip.height(p + np.linspace(-0.3, 0.3, 25)) for p in places])
+        level = places[np.ptp(heights, axis=1) < 1e-9]
+        self.assertNotEmpty(level)
+        for place in level[:: len(level) // 3]:
+            below = float(ground.strip.height(place))
+            ground.data.qpos[:] = (place, below + 0.3, 0)
+            ground.data.qvel[:] = 0
+            mujoco.mj_step(ground.model, ground.data, 900)
+            np.testing.assert_allclose(ground.data.qpos[:2], (place, below + 0.1), atol=1e-4)
+
+    def slide(self, source, seed, start, speed, seconds):
+        """Slides a frictionless foot; returns travel and its speed over that of no losses."""
+        foot = {
+            'type': 'box', 'size': (0.0885, 0.04, 0.025), 'mass': 5, 'condim': 1, 'priority': 1,
+            'solref': (0.005, 1), 'solimp': (0.95, 0.99, 0.001),
+        }  # fmt: skip
+        ground = Ground(source, seed, body=foot)
+        model, data, strip = ground.model, ground.data, ground.strip
+        ground.follow(start)
+        pitch = np.arctan((strip.height(start + 0.08) - strip.height(start - 0.08)) / 0.16)
+        below = strip.height(start + np.linspace(-0.09, 0.09, 19)).max()
+        data.qpos[:] = (start, below + 0.025, pitch)
+        data.qvel[:] = (speed * np.cos(pitch), speed * np.sin(pitch), 0)
+        mujoco.mj_forward(model, data)
+        energy = 0.5 * speed**2 + GRAVITY * data.qpos[1]
+        for _ in range(round(30 * seconds)):
+            ground.arena.follow(data.qpos[:1][None])
+            mujoco.mj_step(model, data, 10)
+        ideal = np.sqrt(2 * (energy - GRAVITY * data.qpos[1]))
+        self.assertLess(abs(data.qpos[1] - strip.height(data.qpos[0])), 0.06)
+        return data.qpos[0] - start, np.hypot(data.qvel[0], data.qvel[1]) / ideal
+
+    def test_a_foot_slides_over_level_ground(self):
+        travel, ratio = self.slide('flat', 0, 0, 2, 8)
+        self.assertAlmostEqual(travel, 16, delta=0.02)
+        self.assertAlmostEqual(ratio, 1, delta=0.002)
+
+    def test_a_foot_slides_over_abutting_boxes(self):
+        lip = 1e-6  # m; keeps level boxes apart that would be merged at equal heights
+        steps = {
+            'StepSpacingMin': 0.2, 'StepSpacingMax': 0.4, 'StepH0Min': 0, 'StepH0Max': lip,
+            'StepH1Min': -lip, 'StepH1Max': 0,
+        }  # fmt: skip
+        for seed in range(3):
+            source = {'Type': 'var2d_steps', 'Params': [steps]}
+            strip = terrain.Strip(terrain.load(source), seed)
+            self.assertGreater(len(boxes.from_profile(0, *strip.window(0, 240)).position), 12)
+            travel, ratio = self.slide(source, seed, 0, 2, 3)
+            self.assertAlmostEqual(travel, 6, delta=0.02)
+            self.assertAlmostEqual(ratio, 1, delta=0.002)
+
+    def test_level_ground_is_one_box(self):
+        strip = terrain.Strip(terrain.load('flat'), 0)
+        self.assertLen(boxes.from_profile(-240, *strip.window(-240, 961)).position, 1)
+
+    def test_a_foot_slides_down_a_slope(self):
+        for seed in range(4):
+            travel, ratio = self.slide('inclines', seed, 12, -1, 3)
+            self.assertLess(travel, -8)
+            self.assertGreater(ratio, 0.95)
+
+
+class LongWalkTest(parameterized.TestCase):
+    """The ground never ends, and laying it anew is not felt."""
+
+    @parameterized.parameters('slopes_mixed_humanoid', 'cliffs_rugged')
+    def test_two_hundred_metres(self, source):
+        ground, largest = Ground(source, 7), 0.006
+        rng = np.random.default_rng(0)
+        for x in np.arange(0, 200, 1.7):
+            ground.follow(x)
+            xs = away_from_faces(ground.strip, rng.uniform(x - 2.9, x + 14, 12))
+            error = ground.heights(xs) - ground.strip.height(xs)
+            self.assertLess(np.abs(error).max(initial=0), largest)
+            np.testing.assert_allclose(
+                ground.arena.height(xs[None])[0], ground.strip.height(xs), atol=1e-10
+            )
+
+    def test_a_jump_and_back(self):
+        ground = Ground('slopes_humanoid', 7)
+        xs = np.linspace(-2, 10, 300)
+        before = ground.heights(xs)
+        for x in (900.0, -333.0, 0.0):
+            ground.follow(x)
+        np.testing.assert_array_equal(ground.heights(xs), before)
+
+    def test_environment_lays_ground_under_a_walker(self):
+        environment = suite.make('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'random': 3})
+        environment.reset()
+        physics, arena = environment.physics, environment.task.arena
+        strip = terrain.Strip.from_state(arena.strips[0].state())
+        for x in np.arange(0.0, 200.0, 2.5):
+            with physics.reset_context():
+                physics.named.data.qpos['biped2d_full/root_x/'] = x
+                physics.named.data.qpos['biped2d_full/root_z/'] = 20.0
+            observation = environment.step(np.zeros(11)).observation
+            x = physics.named.data.qpos['biped2d_full/root_x/'][0]
+            samples = strip.height(x + np.linspace(-0.5, 3, 50)) - strip.height(x)
+            np.testing.assert_allclose(observation['terrain'], samples, atol=1e-9)
+            geom = np.zeros(1, np.int32)
+            distance = mujoco.mj_ray(
+                physics.model.ptr, physics.data.ptr, np.array([x, 0.9, 19.0]),
+                np.array([0.0, 0.0, -1.0]), None, True, -1, geom, None,
+            )  # fmt: skip
+            self.assertGreater(distance, 0)
+            if len(away_from_faces(strip, np.array([x]))):
+                self.assertAlmostEqual(19.0 - distance, float(strip.height(x)), delta=0.007)
+
+    def test_moving_far_boxes_does_not_change_a_trajectory(self):
+        """What makes it safe to lay ground ahead in mid-episode."""
+        states = []
+        for disturb in (False, True):
+            environment = suite.make('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'random': 11})
+            environment.reset()
+            model = environment.physics.model.ptr
+            trajectory = []
+            for i in range(40):
+                if disturb and i in (7, 19, 20):
+                    x = environment.info['distance']
+                    far = np.flatnonzero(
+                        (model.geom_pos[:, 0] > x + 6) & (model.geom_bodyid == 1)
+                    )  # fmt: skip
+                    self.assertGreater(len(far), 20)
+                    model.geom_pos[far, 0] += 3.0
+                    environment.task.world.set_const(0)
+                action = np.random.default_rng(i).uniform(-1, 1, 20)
+                trajectory.append(environment.step(action).observation['pose'])
+            states.append(np.array(trajectory))
+        np.testing.assert_array_equal(*states)
+
+    def test_laying_the_same_window_again_does_not_change_a_trajectory(self):
+        states = []
+        for disturb in (False, True):
+            environment = suite.make('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'random': 11})
+            environment.reset()
+            arena, trajectory = environment.task.arena, []
+            for i in range(40):
+                if disturb:
+                    arena.restore(0, arena.state(0))
+                action = np.random.default_rng(i).uniform(-1, 1, 20)
+                trajectory.append(environment.step(action).observation['pose'])
+            states.append(np.array(trajectory))
+        np.testing.assert_array_equal(*states)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,391 @@
+"""Every command of the command line, what it prints, what it leaves, and how it fails."""
+
+import contextlib
+import io
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import tempfile
+from unittest import mock
+
+import imageio.v3 as iio
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import catalogue, cli, rendering, suite
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+SIZE = ('--size', '160x120')
+
+
+def run(*arguments):
+    """Runs a command in this process; returns exit status, stdout and stderr."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            status = cli.main(arguments)
+        except SystemExit as stop:  # argparse, after --help and --version
+            status = stop.code
+    return status, out.getvalue(), err.getvalue()
+
+
+class CommandTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.enterContext(contextlib.chdir(folder.name))
+        self.folder = pathlib.Path(folder.name)
+
+    def assert_only(self, *names):
+        self.assertCountEqual([path.name for path in self.folder.iterdir()], names)
+
+    def output(self, *arguments):
+        status, out, err = run(*arguments)
+        self.assertEqual((status, err), (0, ''))
+        return out
+
+    def assert_refused(self, message, *arguments):
+        status, out, err = run(*arguments)
+        self.assertEqual((status, out), (2, ''))
+        self.assertRegex(err, f'^trl-suite: error: [^\n]*{message}[^\n]*\n$')
+
+
+class ListTest(CommandTest):
+    def test_lists_everything_on_one_line_each(self):
+        lines = self.output('list').splitlines()
+        self.assertEqual(lines[-1], '42 environments')
+        self.assertLen(lines, 44)
+        self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
+        listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
+        self.assertEqual(listed, list(suite.ALL_TASKS))
+        for line, row in zip(lines[1:-1], catalogue.ROWS, strict=True):
+            self.assertEndsWith(line, row.description)
+
+    @parameterized.parameters(
+        (('--domain', 'imitation'), 14),
+        (('--domain', 'plaid'), 28),
+        (('--actuation', 'velocity'), 3),
+        (('--actuation', 'muscle'), 4),
+        (('--character', 'raptor'), 13),
+        (('--terrain', 'gaps_humanoid'), 3),
+        (('--tag', 'original'), 30),
+        (('--tag', 'blind'), 4),
+        (('--domain', 'plaid', '--character', 'dog', '--tag', 'original'), 6),
+        (('--actuation', 'muscle', '--domain', 'plaid'), 0),
+    )
+    def test_filters(self, filters, count):
+        lines = self.output('list', *filters).splitlines()
+        self.assertEqual(lines[-1], f'{count} environments')
+        self.assertLen(lines, count + 2 if count else 1)
+
+    def test_one_is_singular(self):
+        out = self.output('list', '--domain', 'plaid', '--terrain', 'flat', '--character', 'dog',
+                          '--tag', 'blind')  # fmt: skip
+        self.assertEndsWith(out, '\n1 environment\n')
+
+    @parameterized.parameters(
+        ('--domain', 'plad', "unknown domain 'plad'; did you mean 'plaid'"),
+        ('--character', 'bog', "unknown character 'bog'; did you mean 'dog'"),
+        ('--actuation', 'muscles', "unknown actuation 'muscles'; did you mean 'muscle'"),
+        ('--terrain', 'gap_humanoid', "did you mean 'gaps_humanoid'"),
+        ('--tag', 'xyz', "unknown tag 'xyz'; known: blind, completion"),
+    )
+    def test_unknown_values(self, name, value, message):
+        self.assert_refused(message, 'list', name, value)
+
+
+class InfoTest(CommandTest):
+    @parameterized.parameters(*catalogue.BY_ID)
+    def test_speaks_about_every_environment(self, id_):
+        out = self.output('info', id_)
+        self.assertStartsWith(out, f'{id_}\n')
+        self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
+        for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Clip', 'Reward',
+                      'Termination', 'Time', 'Differs'):  # fmt: skip
+            self.assertIn(f'\n{title}', out)
+
+    def test_figures(self):
+        # Sizes from the original's registry, limits from its character file.
+        out = self.output('info', GAPS)
+        self.assertIn('Observation: 104 numbers', out)
+        self.assertRegex(out, r'\n  terrain +0 +50 +50 +m ')
+        self.assertRegex(out, r'\n  phase +99 +104 +5 ')
+        self.assertIn('Action: 11 numbers in [-1, 1]; target angle in rad', out)
+        self.assertRegex(out, r'\n  right_knee +-0\.4\d* +1\.5 +125\n')
+        self.assertRegex(out, r'\n  right_knee +2\.5 +-3 to 0 +125 +200 +20 +0\.3\n')
+        self.assertIn('49 kg', out)
+        self.assertIn('GapWMin 0.25, GapWMax 0.3', out)
+        self.assertIn('period 1 s, 1.5 m/s', out)
+        self.assertIn('control 30 Hz, physics 300 Hz', out)
+        self.assertIn('256 steps, 8.53 s', out)
+
+    def test_muscles_have_peak_forces(self):
+        out = self.output('info', 'MTU_Biped2D_LLC_Imitate_Flat-v0')
+        self.assertIn('Action: 16 numbers in [-1, 1]; excitation = centre', out)
+        self.assertRegex(out, r'\n  right_VAS +0\.505 +0\.495 +6000\n')
+        self.assertRegex(out, r'\n  strain +29 +45 +16 ')
+
+    def test_an_alias_is_as_good(self):
+        self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
+
+    def test_only_the_differences_that_apply(self):
+        differences = {
+            'not in the registry': 'completion',
+            'the terrain is inferred': 'mixed_humanoid',
+            'rigid tendons': 'muscle',
+            'angles to the parent link': 'PD targets of a dog or raptor',
+            'exactly vertical': 'terrain',
+        }
+        for id_, expected in (
+            ('PD_Biped2D_LLC_Imitate_Flat-v0', set()),
+            ('Vel_Dog2D_LLC_Imitate_Flat-v0', {'completion'}),
+            ('MTU_Raptor2D_LLC_Imitate_Flat-v0', {'muscle'}),
+            ('PD_Dog2D_Gaps_Terrain-v0', {'PD targets of a dog or raptor', 'terrain'}),
+            (
+                'PD_Raptor2D_Mixed_Terrain-v0',
+                {'completion', 'mixed_humanoid', 'PD targets of a dog or raptor', 'terrain'},
+            ),
+        ):
+            with self.subTest(id_):
+                out = self.output('info', id_)
+                self.assertEqual({v for k, v in differences.items() if k in out}, expected)
+
+    def test_unknown(self):
+        self.assert_refused("did you mean 'PD_Biped2D_Gaps_Terrain-v0'", 'info', GAPS[:-1])
+        self.assert_refused("did you mean 'plaid/dog_gaps'", 'info', 'plaid/dog_gap')
+
+
+class RolloutTest(CommandTest):
+    @parameterized.parameters('random', 'zero', 'clip')
+    def test_trajectory_is_what_the_environment_does(self, policy):
+        steps = 100
+        out = self.output(
+            'rollout', GAPS, '--seed', '3', '--steps', str(steps), '--policy', policy,
+            '--trajectory', 'a.npz',
+        )  # fmt: skip
+        self.assert_only('a.npz')
+        with np.load('a.npz') as data:
+            t = dict(data)
+        self.assertEqual((str(t['id']), int(t['seed'])), (GAPS, 3))
+        episodes = int((t['step_types'] == 0).sum())
+        self.assertGreater(episodes, 1)  # it ran over ends of episodes
+        self.assertLen(t['rewards'], steps + episodes)
+        self.assertEqual(t['observations'].shape, (steps + episodes, 104))
+        self.assertEqual(t['qpos'].shape, (steps + episodes, 14))
+        self.assertLessEqual(np.abs(t['actions']).max(), 1)
+        ends = np.flatnonzero(t['step_types'] == 2)
+        np.testing.assert_array_equal(t['actions'][[*ends, -1]], 0)  # nothing is done there
+
+        # The recorded actions lead a fresh environment through the recorded states, bit for bit.
+        environment = suite.make(GAPS, {'random': 3})
+        action = np.zeros(11)
+        for i in range(len(t['rewards'])):
+            time_step = environment.step(action)
+            observation = np.concatenate(list(time_step.observation.values()))
+            np.testing.assert_array_equal(observation, t['observations'][i])
+            np.testing.assert_array_equal(environment.physics.data.qpos, t['qpos'][i])
+            self.assertEqual(int(time_step.step_type), t['step_types'][i])
+            if not time_step.first():
+                self.assertEqual(
+                    (time_step.reward, time_step.discount), (t['rewards'][i], t['discounts'][i])
+                )
+            action = t['actions'][i]
+            if policy == 'clip' and time_step.mid() and i + 1 < len(t['rewards']):
+                expected = np.clip(environment.task.clip_action(0), -1, 1)
+                np.testing.assert_array_equal(action, expected)
+
+        self.assertRegex(
+            out,
+            rf'\n{steps} steps in {episodes} episodes: return {t["rewards"].sum():.2f}, '
+            rf'{t["rewards"].sum() / steps:.3f} per step; -?[\d.]+ m\n$',
+        )
+        starts = np.flatnonzero(t['step_types'] == 0)
+        lengths = np.diff([*starts, len(t['rewards'])]) - 1
+        for i, length in enumerate(lengths[: cli.SHOWN_EPISODES], 1):
+            end = 'goes on' if i == episodes and t['step_types'][-1] != 2 else 'fell'
+            self.assertRegex(out, rf'\n +{i} +{length} +[\d.]+ +-?[\d.]+ +{end}\n')
+
+    def test_an_episode_that_is_cut(self):
+        def short(id_, task_kwargs):
+            return suite.build('raptor', task_kwargs={**task_kwargs, 'step_limit': 3})
+
+        with mock.patch.object(suite, 'make', short):
+            out = self.output('rollout', 'imitation/pd_raptor', '--steps', '6', '--policy', 'clip')
+        episodes = out.splitlines()[1:-1]
+        self.assertLen(episodes, 2)
+        for i, line in enumerate(episodes, 1):
+            self.assertRegex(line, rf'^ +{i} +3 +[\d.]+ +[\d.]+  was cut$')
+
+    def test_many_episodes_are_summed_up(self):
+        out = self.output('rollout', GAPS, '--steps', '600', '--seed', '1')
+        lines = out.splitlines()
+        self.assertLen(lines, cli.SHOWN_EPISODES + 3)
+        self.assertRegex(lines[-2], r'^\.\.\. and \d+ more$')
+
+    def test_pictures(self):
+        self.output(
+            'rollout', GAPS, '--steps', '60', '--policy', 'clip', '--video', 'a.mp4', '--strip',
+            'a.png', '--columns', '5', '--ghost', *SIZE,
+        )  # fmt: skip
+        self.assert_only('a.mp4', 'a.png')
+        meta = iio.immeta('a.mp4', plugin='FFMPEG')
+        self.assertEqual((meta['size'], meta['fps']), ((160, 120), 30.0))
+        frames = iio.imread('a.mp4', plugin='FFMPEG')
+        self.assertGreaterEqual(len(frames), 61)  # every state, starts included
+        strip = iio.imread('a.png')
+        self.assertEqual(strip.shape, (120, 5 * 160 + 4 * rendering.STRIP_MARGIN, 3))
+        # The first picture of the strip is the first of the video; compression blurs the latter.
+        difference = np.abs(strip[:, :160].astype(int) - frames[0])
+        self.assertLess(difference.mean(), 4)
+
+    def test_a_gif_from_another_camera(self):
+        self.output('rollout', GAPS, '--steps', '2', '--video', 'a.gif', '--camera', 'front', *SIZE)
+        self.assertLen(iio.imread('a.gif'), 3)
+
+    @parameterized.parameters(
+        ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
+        ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip',
+         '--video', 'a.mp4'),
+        ("suffix '.avi'; expected .mp4 or .gif", GAPS, '--video', 'a.avi'),
+        ("suffix '.jpg'; expected .png", GAPS, '--strip', 'a.jpg'),
+        ("suffix ''; expected .npz", GAPS, '--trajectory', 'a'),
+        ("the folder 'no' does not exist", GAPS, '--trajectory', 'no/a.npz'),
+        ("unknown camera 'sid'; did you mean 'side'", GAPS, '--video', 'a.mp4', '--camera', 'sid'),
+        ('width is 4000; expected 1 to 1920', GAPS, '--video', 'a.mp4', '--size', '4000x100'),
+        ('h264 needs even', GAPS, '--video', 'a.mp4', '--size', '161x121'),
+        ("'big' is not a size such as 640x480", GAPS, '--size', 'big'),
+        ("'0' is not a positive integer", GAPS, '--steps', '0'),
+        ("'x' is not a positive integer", GAPS, '--steps', 'x'),
+        ("invalid choice: 'walk'", GAPS, '--policy', 'walk'),
+        (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
+        ('required: ID', '--seed', '1'),
+        ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
+    )  # fmt: skip
+    def test_refusals_leave_nothing_behind(self, message, *arguments):
+        self.assert_refused(message, 'rollout', *arguments)
+        self.assert_only()
+
+    def test_an_interrupt_leaves_nothing_behind(self):
+        frame, calls = rendering.frame, []
+
+        def interrupted(*arguments):
+            calls.append(arguments)
+            if len(calls) == 3:
+                raise KeyboardInterrupt
+            return frame(*arguments)
+
+        with mock.patch.object(rendering, 'frame', interrupted):
+            status, out, err = run('rollout', GAPS, '--video', 'a.mp4', '--trajectory', 'a.npz')
+        self.assertEqual((status, out, err), (130, '', 'trl-suite: interrupted\n'))
+        self.assert_only()
+
+
+class TerrainTest(CommandTest):
+    def test_a_preset(self):
+        self.assertEqual(self.output('terrain', 'gaps'), 'terrain_gaps.png\n')
+        self.assert_only('terrain_gaps.png')
+        self.output('terrain', 'gaps', '--draws', '1', '--length', '5', '--output', 'b.png')
+        self.assertLess(iio.imread('b.png').shape[0], iio.imread('terrain_gaps.png').shape[0])
+
+    def test_a_file(self):
+        (self.folder / 'own').mkdir()
+        (self.folder / 'own' / 'mine.json').write_text('{"Type": "var2d_gaps"}')
+        self.assertEqual(self.output('terrain', 'own/mine.json'), 'terrain_mine.png\n')
+        self.assert_only('own', 'terrain_mine.png')
+
+    def test_refusals(self):
+        pathlib.Path('bad.json').write_text('{"Type": "var2d_gap"}')
+        for message, *arguments in (
+            ("unknown terrain 'gasp'; did you mean 'gaps'", 'gasp'),
+            ("unknown terrain type 'var2d_gap'", 'bad.json'),
+            ('No such file', 'none.json'),
+            ("'0' is not a positive integer", 'gaps', '--draws', '0'),
+            ('length is 0.0', 'gaps', '--length', '0'),
+            ('seed is -2', 'gaps', '--seed', '-2'),
+            ("unknown suffix '.pdf'", 'gaps', '--output', 'a.pdf'),
+        ):
+            with self.subTest(message):
+                self.assert_refused(message, 'terrain', *arguments)
+        self.assert_only('bad.json')
+
+
+class ProgramTest(CommandTest):
+    def test_version(self):
+        self.assertRegex(self.output('--version'), r'^trl-suite \d+\.\d+\.\d+\n$')
+
+    def test_no_or_another_command(self):
+        self.assert_refused('required: command', *())
+        self.assert_refused("invalid choice: 'lst'", 'lst')
+
+    def test_a_missing_extra_is_named(self):
+        with mock.patch.dict(sys.modules, {'imageio.v2': None}):
+            self.assert_refused("pip install 'trl_suite", 'rollout', GAPS, '--video', 'a.mp4')
+
+    def test_other_errors_are_not_hidden(self):
+        # A defect of ours must keep its traceback.
+        with (
+            mock.patch.object(cli, '_values', lambda *_: 1 / 0),
+            self.assertRaises(ArithmeticError),
+        ):
+            run('list', '--tag', 'blind')
+
+    def test_as_a_module(self):
+        done = self.program('list', '--tag', 'blind')
+        self.assertEqual((done.returncode, done.stderr), (0, ''))
+        self.assertEndsWith(done.stdout, '\n4 environments\n')
+        self.assertStartsWith(self.program('--help').stdout, 'usage: python -m trl_suite [-h]')
+
+    def test_without_opengl(self):
+        done = self.program('rollout', GAPS, '--video', 'a.mp4', MUJOCO_GL='disable')
+        self.assertEqual((done.returncode, done.stdout), (2, ''))
+        self.assertRegex(done.stderr, "^trl-suite: error: nothing can be drawn.* is 'disable'.*\n$")
+        self.assert_only()
+        done = self.program('rollout', GAPS, '--steps', '5', MUJOCO_GL='disable')
+        self.assertEqual((done.returncode, done.stderr), (0, ''))  # without pictures all is well
+
+    def test_a_broken_library_or_a_wrong_name(self):
+        done = self.program('info', GAPS, MUJOCO_GL='nonsense')
+        self.assertEqual((done.returncode, done.stdout), (2, ''))
+        self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
+
+    def test_a_reader_that_stops_reading(self):
+        with subprocess.Popen(
+            [sys.executable, '-m', 'trl_suite', 'list'], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        ) as process:  # fmt: skip
+            process.stdout.close()
+            self.assertEqual((process.stderr.read(), process.wait()), (b'', 141))
+
+    def program(self, *arguments, **variables):
+        return subprocess.run(
+            [sys.executable, '-m', 'trl_suite', *arguments], capture_output=True, text=True,
+            env={**os.environ, **variables}, timeout=60, check=False,
+        )  # fmt: skip
+
+
+class ReadmeTest(CommandTest):
+    text = (pathlib.Path(__file__).parents[1] / 'README.md').read_text(encoding='utf-8')
+
+    @parameterized.parameters(*range(len(re.findall('```python', text))))
+    def test_code_runs(self, i):
+        code = re.findall(r'```python\n(.*?)```', self.text, re.DOTALL)[i]
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=False
+        )
+        self.assertEqual((done.returncode, done.stderr), (0, ''))
+
+    def test_commands_run(self):
+        commands = re.findall(r'^(?:.* && \S*/)?trl-suite (.*)$', self.text, re.MULTILINE)
+        self.assertLen(commands, 5)
+        for command in commands:
+            with self.subTest(command):
+                pictures = SIZE if command.startswith('rollout') else ()
+                self.output(*command.split(), *pictures)
+        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png')
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,3 @@
+"""Chooses how to render before any test imports dm_control."""
+
+import trl_suite  # noqa: F401

@@ -1,0 +1,513 @@
+"""Tests of trl_suite.environment, over every environment of the catalogue."""
+
+import dm_env
+import numpy as np
+import pytest
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+from dm_env import test_utils
+
+from trl_suite import characters, motion, suite, terrain
+from trl_suite.arenas import PlanarTerrain
+from trl_suite.environment import Environment
+from trl_suite.tasks.imitation import Imitation
+
+# Links and joints of each figure; muscles where it has any.
+FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
+SMALL_BIPED = (7, 6, 16)  # of the Imitation family
+# Sizes as the original's papers and programs have them.
+SIZES = {
+    'PD_Biped2D_Gaps_Terrain-v0': (104, 11), 'PD_Dog2D_Steps_Terrain-v0': (140, 20),
+    'PD_Raptor2D_Walls_Terrain-v0': (132, 18), 'PD_Biped2D_Flat-v0': (54, 11),
+    'PD_Biped2D_Incline-v0': (54, 11), 'PD_Dog2D_Flat-v0': (90, 20), 'PD_Raptor2D_Flat-v0': (82, 18),
+    'PD_Biped2D_LLC_Imitate_Flat-v0': (58, 6), 'Torque_Biped2D_LLC_Imitate_Flat-v0': (58, 6),
+    'MTU_Biped2D_LLC_Imitate_Flat-v0': (74, 16), 'PD_Dog2D_LLC_Imitate_Flat-v0': (170, 20),
+    'Torque_Dog2D_LLC_Imitate_Flat-v0': (170, 20), 'MTU_Dog2D_LLC_Imitate_Flat-v0': (214, 44),
+    'PD_Raptor2D_LLC_Imitate_Flat-v0': (154, 18), 'Torque_Raptor2D_LLC_Imitate_Flat-v0': (154, 18),
+    'MTU_Raptor2D_LLC_Imitate_Flat-v0': (194, 40), 'Vel_Dog2D_LLC_Imitate_Flat-v0': (170, 20),
+}  # fmt: skip
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+EXAMPLES = (
+    GAPS, 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
+    'Torque_Biped2D_LLC_Imitate_Flat-v0', 'Vel_Dog2D_LLC_Imitate_Flat-v0',
+)  # fmt: skip
+
+
+def expected_blocks(id_):
+    """Blocks and their sizes by the rules: terrain, pose 2n + 1, velocity 2n, extras."""
+    figure = id_.split('_')[1]
+    links, _, units = SMALL_BIPED if 'LLC' in id_ and figure == 'Biped2D' else FIGURES[figure]
+    sizes = {'terrain': 50} if '_Terrain-' in id_ else {}
+    sizes |= {'pose': 2 * links + 1, 'velocity': 2 * links}
+    if id_.startswith('MTU'):
+        sizes['strain'] = units
+    return sizes | ({'target': 4 * links + 1} if 'LLC' in id_ else {'phase': 5})
+
+
+def random_actions(environment, steps, seed=0):
+    spec = environment.action_spec()
+    return np.random.default_rng(seed).uniform(spec.minimum, spec.maximum, (steps, *spec.shape))
+
+
+def rollout(environment, actions):
+    """Flat arrays of what an environment returns: observations, rewards, discounts, types."""
+    steps = [environment.reset(), *(environment.step(action) for action in actions)]
+    observations = [np.concatenate([np.ravel(v) for v in s.observation.values()]) for s in steps]
+    return (
+        np.array(observations),
+        np.array([np.nan if s.reward is None else s.reward for s in steps]),
+        np.array([np.nan if s.discount is None else s.discount for s in steps]),
+        [s.step_type for s in steps],
+    )
+
+
+def contract(id_):
+    """dm_env's own tests for one environment, across ends of episodes."""
+
+    class Contract(test_utils.EnvironmentTestMixin, absltest.TestCase):
+        def make_object_under_test(self):
+            return suite.make(id_, {'random': 0, 'step_limit': 12})
+
+        def make_action_sequence(self):
+            return random_actions(self.environment, 30)
+
+        def test_specs(self):
+            spec = self.environment.action_spec()
+            self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
+            self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
+
+    Contract.__name__ = Contract.__qualname__ = f'Contract_{id_}'.replace('-', '_')
+    return Contract
+
+
+for _id in suite.ALL_IDS:
+    _class = contract(_id)
+    globals()[_class.__name__] = _class
+del _class  # else it would be collected twice
+
+
+class EveryRowTest(parameterized.TestCase):
+    """What holds for all environments."""
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_blocks(self, id_):
+        environment = suite.make(id_, {'random': 0})
+        blocks = expected_blocks(id_)
+        spec = environment.observation_spec()
+        self.assertEqual(list(spec), list(blocks))  # terrain first
+        self.assertEqual({name: each.shape[0] for name, each in spec.items()}, blocks)
+        stop = 0
+        for name, part in environment.blocks.items():
+            self.assertEqual(part, slice(stop, stop + blocks[name]))
+            stop = part.stop
+        for each in spec.values():
+            self.assertEqual(each.dtype, np.float64)
+
+    @parameterized.parameters(*((id_, *sizes) for id_, sizes in SIZES.items()))
+    def test_sizes(self, id_, observation, action):
+        environment = suite.make(id_, {'random': 0}, {'flat_observation': True})
+        self.assertEqual(environment.observation_spec()['observations'].shape, (observation,))
+        self.assertEqual(environment.action_spec().shape, (action,))
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_random_rollout(self, id_):
+        self.wander(id_, 200)
+
+    @pytest.mark.slow
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_long_random_rollout(self, id_):
+        self.wander(id_, 5000)
+
+    def wander(self, id_, steps):
+        environment = suite.make(id_, {'random': 1})
+        observations, rewards, discounts, types = rollout(
+            environment, random_actions(environment, steps)
+        )
+        self.assertTrue(np.isfinite(observations).all())
+        self.assertLess(np.abs(observations).max(), 1e4)
+        first = np.array([each is dm_env.StepType.FIRST for each in types])
+        self.assertTrue(np.isfinite(rewards[~first]).all())
+        self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
+        self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
+        last = np.array([each is dm_env.StepType.LAST for each in types])
+        self.assertTrue(last.any())  # random actions fall
+        np.testing.assert_array_equal(rewards[discounts == 0], 0)
+        np.testing.assert_array_equal(last[discounts == 0], True)
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_flat_observation_is_the_blocks_side_by_side(self, id_):
+        blocks = suite.make(id_, {'random': 2})
+        flat = suite.make(id_, {'random': 2}, {'flat_observation': True})
+        actions = random_actions(blocks, 20)
+        for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_plain_composer_environment_agrees(self, id_):
+        ours = suite.make(id_, {'random': 3})
+        theirs = composer.Environment(
+            suite.build_task(suite.find(id_)), random_state=3, strip_singleton_obs_buffer_dim=True
+        )
+        np.testing.assert_array_equal(theirs.action_spec().minimum, -1)
+        np.testing.assert_array_equal(theirs.action_spec().maximum, 1)
+        actions = random_actions(ours, 40)
+        for mine, composers in zip(rollout(ours, actions), rollout(theirs, actions), strict=True):
+            np.testing.assert_array_equal(mine, composers)
+
+
+class ActionTest(parameterized.TestCase):
+    """Bad actions are refused with a sentence; far ones are clipped."""
+
+    @parameterized.parameters(
+        (np.nan, 'action\\[2\\] \\(right_ankle\\) is nan'),
+        (np.inf, 'action\\[2\\] \\(right_ankle\\) is inf'),
+        (-np.inf, 'action\\[2\\] \\(right_ankle\\) is -inf'),
+    )
+    def test_not_finite(self, value, message):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        action = np.zeros(11)
+        action[2] = value
+        before = environment.physics.data.time
+        with self.assertRaisesRegex(ValueError, message):
+            environment.step(action)
+        self.assertEqual(environment.physics.data.time, before)
+        self.assertTrue(environment.step(np.zeros(11)).mid())
+
+    @parameterized.parameters(((),), ((1, 11),), ((10,),), ((12,),))
+    def test_wrong_shape(self, shape):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        with self.assertRaisesRegex(ValueError, r'shape .*; expected \(11,\)'):
+            environment.step(np.zeros(shape))
+
+    def test_not_numbers(self):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        with self.assertRaisesRegex(ValueError, 'not an array of numbers'):
+            environment.step(['left'] * 11)
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_far_actions_are_clipped(self, id_):
+        poses = []
+        for size in (1.0, 5.0, 1e200):
+            environment = suite.make(id_, {'random': 4})
+            environment.reset()
+            action = size * np.sign(random_actions(environment, 1)[0])
+            poses.append(environment.step(action).observation['pose'])
+        np.testing.assert_array_equal(poses[0], poses[1])
+        np.testing.assert_array_equal(poses[0], poses[2])
+
+    def test_the_given_action_is_left_alone(self):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        action = np.full(11, 2.0)
+        environment.step(action)
+        np.testing.assert_array_equal(action, 2.0)
+        environment.step(list(action))
+
+    def test_control_is_thirty_hertz(self):
+        for substeps in (4, 10, 20):
+            environment = suite.make(GAPS, {'random': 0, 'substeps': substeps})
+            environment.reset()
+            self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
+            self.assertAlmostEqual(environment.physics.timestep(), 1 / (30 * substeps))
+            for _ in range(3):
+                environment.step(np.zeros(11))
+            self.assertAlmostEqual(environment.physics.data.time, 0.1, delta=1e-9)
+
+
+def held(**options):
+    """A biped held in the air so that it never falls."""
+    environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 0, **options})
+    environment.reset()
+    return environment
+
+
+def lift(environment):
+    data = environment.physics.named.data
+    data.qpos['biped2d/root_z/'] = 5.0
+    data.qvel['biped2d/root_z/'] = 0.0
+    data.qpos['biped2d/root_pitch/'] = 0.0
+    environment.physics.forward()
+
+
+class EpisodeTest(parameterized.TestCase):
+    """How episodes end and begin."""
+
+    def length(self, environment):
+        for i in range(1, 1000):
+            lift(environment)
+            step = environment.step(np.zeros(6))
+            if step.last():
+                return i, step
+        return None
+
+    def test_every_row_is_cut_after_256_steps(self):
+        for id_ in suite.ALL_IDS:
+            self.assertEqual(suite.find(id_).step_limit, 256)
+        self.assertEqual(suite.make(GAPS).step_limit, 256)
+
+    @parameterized.parameters(({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.5}, 15))
+    def test_a_cut_is_no_failure(self, options, steps):
+        environment = held(**options)
+        count, step = self.length(environment)
+        self.assertEqual(count, steps)
+        self.assertEqual(step.discount, 1.0)
+        self.assertGreater(step.reward, 0)
+        self.assertFalse(environment.info['fell'])
+        self.assertTrue(environment.step(np.zeros(6)).first())
+        self.assertEqual(self.length(environment)[0], steps)
+
+    def test_no_limit(self):
+        environment = held(step_limit=None)
+        for _ in range(300):
+            lift(environment)
+            self.assertTrue(environment.step(np.zeros(6)).mid())
+
+    @parameterized.parameters(*suite.ALL_IDS[::3])
+    def test_a_fall_is_a_failure(self, id_):
+        environment = suite.make(id_, {'random': 5})
+        environment.reset()
+        for action in random_actions(environment, 250, seed=1):
+            step = environment.step(action)
+            if step.last():
+                break
+        self.assertTrue(step.last())
+        self.assertEqual((step.discount, step.reward), (0.0, 0.0))
+        self.assertTrue(environment.info['fell'])
+        self.assertFalse(environment.info['diverged'])
+        self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
+        # A fall link touches the ground, as the engine's list of contacts says.
+        data, model = environment.physics.data.ptr, environment.physics.model.ptr
+        bodies = {model.body(b).name.split('/')[-1] for b in model.geom_bodyid[data.contact.geom]
+                  [(model.geom_bodyid[data.contact.geom] == model.body('terrain').id).any(1)]
+                  .ravel()}  # fmt: skip
+        fall_links = environment.task.character.row.fall_links
+        self.assertNotEmpty(bodies & set(fall_links))
+        step = environment.step(action)
+        self.assertTrue(step.first())
+        self.assertFalse(environment.info['fell'])
+
+    def test_touching_with_other_links_is_no_fall(self):
+        environment = held()
+        with environment.physics.reset_context():
+            qpos = environment.physics.named.data.qpos
+            qpos['biped2d/root_z/'] = 0.6  # sitting on its shanks, the trunk up
+            for side in ('left', 'right'):
+                qpos[f'biped2d/{side}_hip'] = 1.2
+                qpos[f'biped2d/{side}_knee'] = -2.4
+        environment.physics.data.qvel[:] = 0
+        touched = False
+        for _ in range(30):
+            step = environment.step(np.zeros(6))
+            data, model = environment.physics.data.ptr, environment.physics.model.ptr
+            links = {model.body(b).name for b in model.geom_bodyid[data.contact.geom].ravel()}
+            if 'biped2d/root' in links:
+                break
+            touched |= bool(links & {'biped2d/left_ankle', 'biped2d/left_knee'})
+            self.assertTrue(step.mid())
+        self.assertTrue(touched)
+
+    def test_terms_sum_to_the_reward(self):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        step = environment.step(np.zeros(11))
+        terms = environment.info['reward_terms']
+        self.assertCountEqual(terms, ('pose', 'velocity', 'end_effector', 'com', 'root'))
+        self.assertAlmostEqual(sum(terms.values()), step.reward, delta=1e-12)
+
+    def test_distance(self):
+        environment = held()
+        for _ in range(5):
+            environment.step(np.zeros(6))
+        x = environment.physics.named.data.qpos['biped2d/root_x/'][0]
+        self.assertEqual(environment.info['distance'], x)
+        self.assertNotEqual(x, 0)
+
+
+class DivergenceTest(parameterized.TestCase):
+    """Physics that breaks down ends the episode and nothing else."""
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_a_huge_velocity(self, id_):
+        environment = suite.make(id_, {'random': 6})
+        environment.reset()
+        actions = random_actions(environment, 4)
+        kept = environment.step(actions[0]).observation
+        environment.physics.data.qvel[:] = 1e12
+        step = environment.step(actions[1])
+        self.assertTrue(step.last())
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['diverged'])
+        self.assertFalse(environment.info['fell'])
+        for name, value in step.observation.items():  # the last that was sound
+            np.testing.assert_array_equal(value, kept[name])
+        self.recovers(environment, actions)
+
+    def test_not_a_number(self):
+        environment = suite.make(GAPS, {'random': 6})
+        environment.reset()
+        actions = random_actions(environment, 4)
+        environment.step(actions[0])
+        environment.physics.data.qpos[3] = np.nan
+        step = environment.step(actions[1])
+        self.assertTrue(step.last())
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['diverged'])
+        for value in step.observation.values():
+            self.assertTrue(np.isfinite(value).all())
+        self.recovers(environment, actions)
+
+    def test_a_joint_that_spins_too_fast(self):
+        environment = suite.make('Vel_Dog2D_LLC_Imitate_Flat-v0', {'random': 6})
+        environment.reset()
+        environment.physics.named.data.qvel['dog/tail3'] = 3000.0
+        environment.physics.forward()
+        step = environment.step(np.zeros(20))
+        self.assertGreater(np.abs(environment.physics.data.qvel).max(), 200)
+        self.assertTrue(step.last())
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['diverged'])
+
+    def recovers(self, environment, actions):
+        step = environment.step(actions[2])
+        self.assertTrue(step.first())
+        self.assertFalse(environment.info['diverged'])
+        self.assertTrue(np.isfinite(environment.physics.data.qpos).all())
+        step = environment.step(actions[3])
+        self.assertGreater(step.reward, 0.2)
+        self.assertEqual(step.discount, 1.0)
+
+
+class ObservableTest(parameterized.TestCase):
+    """A user's own observables beside the blocks."""
+
+    def build(self, **options):
+        row = suite.find('PD_Dog2D_Gaps_Terrain-v0')
+        task = suite.build_task(row)
+        observables = task.character.observables
+        for name in ('joints_pos', 'bodies_pos', 'root_pos'):
+            getattr(observables, name).enabled = True
+        return Environment(task, random=7, **options)
+
+    def test_they_are_there_and_current(self):
+        environment = self.build()
+        spec = environment.observation_spec()
+        self.assertEqual(list(spec)[:4], ['terrain', 'pose', 'velocity', 'phase'])
+        self.assertEqual(spec['dog/joints_pos'].shape, (20,))
+        self.assertEqual(spec['dog/bodies_pos'].shape, (21, 3))
+        names = [f'dog/{name}' for name in characters.CHARACTERS['dog'].joints]
+        step = environment.reset()
+        for action in random_actions(environment, 60):
+            qpos = environment.physics.named.data.qpos
+            found = np.array([qpos[name][0] for name in names])
+            np.testing.assert_array_equal(step.observation['dog/joints_pos'], found)
+            root = environment.physics.named.data.xpos['dog/root']
+            np.testing.assert_array_equal(step.observation['dog/root_pos'], root)
+            for name, each in spec.items():
+                each.validate(step.observation[name])
+            step = environment.step(action)
+
+    def test_blocks_and_rewards_stay_the_same(self):
+        mine = self.build()
+        plain = suite.make('PD_Dog2D_Gaps_Terrain-v0', {'random': 7, 'step_limit': None})
+        actions = random_actions(plain, 40)
+        ours, theirs = rollout(mine, actions), rollout(plain, actions)
+        np.testing.assert_array_equal(ours[0][:, : theirs[0].shape[1]], theirs[0])
+        np.testing.assert_array_equal(ours[1], theirs[1])
+
+    def test_flat(self):
+        environment = self.build(flat_observation=True)
+        observation = environment.reset().observation
+        self.assertEqual(list(observation), ['observations'])
+        self.assertEqual(observation['observations'].shape, (140 + 20 + 63 + 3,))
+
+    def test_observations_are_the_users_to_keep(self):
+        environment = suite.make(GAPS, {'random': 0})
+        first = environment.reset().observation
+        copies = {name: value.copy() for name, value in first.items()}
+        for action in random_actions(environment, 5):
+            environment.step(action)
+        for name, value in first.items():
+            np.testing.assert_array_equal(value, copies[name])
+            value[:] = 77.0  # must not reach into the environment
+        self.assertTrue((np.abs(environment.step(np.zeros(11)).observation['pose']) < 50).all())
+
+
+class HookTest(parameterized.TestCase):
+    """Substeps run in C: hooks between them are refused, not forgotten."""
+
+    def task(self, cls=Imitation):
+        return cls(
+            characters.make('biped2d'), PlanarTerrain(terrain.load('flat')),
+            motion.load('biped2d_walk'),
+        )  # fmt: skip
+
+    @parameterized.parameters('before_substep', 'after_substep')
+    def test_refused(self, hook):
+        hooked = type('Hooked', (Imitation,), {hook: lambda self, *_: None})
+        with self.assertRaisesRegex(ValueError, f'{hook} hook.*composer.Environment'):
+            Environment(self.task(hooked))
+        environment = Environment(self.task())
+        with self.assertRaisesRegex(ValueError, f'{hook} hook'):
+            environment.add_extra_hook(hook, lambda *_: None)
+
+    def test_other_hooks_run(self):
+        environment, calls = Environment(self.task(), random=0), []
+        environment.add_extra_hook('after_step', lambda *_: calls.append('after_step'))
+        environment.add_extra_hook('initialize_episode', lambda *_: calls.append('reset'))
+        environment.reset()
+        environment.step(np.zeros(6))
+        self.assertEqual(calls, ['reset', 'after_step'])
+
+    def test_an_entity_with_substep_hooks_is_refused(self):
+        class Prop(composer.Entity):
+            def _build(self):
+                self._root = mjcf.RootElement('prop')
+
+            @property
+            def mjcf_model(self):
+                return self._root
+
+            def after_substep(self, physics, random_state):
+                physics.step()
+
+        task = self.task()
+        task.arena.attach(Prop())
+        with self.assertRaisesRegex(ValueError, 'after_substep hook'):
+            Environment(task)
+
+
+class ConstructionTest(parameterized.TestCase):
+    """Options of an environment."""
+
+    @parameterized.parameters(
+        ({'step_limit': 0}, 'step_limit is 0'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
+        ({'time_limit': 0}, 'time_limit is 0'), ({'time_limit': np.nan}, 'time_limit is nan'),
+        ({'random': -1}, 'random is -1'), ({'random': 2**32}, 'random is 4294967296'),
+    )  # fmt: skip
+    def test_refused(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            suite.make(GAPS, options)
+
+    def test_no_compilation_after_construction(self):
+        environment = suite.make(GAPS, {'random': 0})
+        before = environment.physics.model.ptr
+        for _ in range(3):
+            environment.reset()
+            environment.step(np.zeros(11))
+        self.assertIs(environment.physics.model.ptr, before)
+
+    def test_seeds(self):
+        def heights(seed):
+            environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': seed})
+            return environment.reset().observation['terrain']
+
+        np.testing.assert_array_equal(heights(5), heights(5))
+        np.testing.assert_array_equal(heights(5), heights(np.random.RandomState(5)))
+        self.assertTrue((heights(5) != heights(6)).any())
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,349 @@
+"""Tests of muscles: the tables, the Hill formulas, and MuJoCo's muscles held against them."""
+
+import math
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+
+from trl_suite import actuation, characters, hill, suite
+from trl_suite.characters import muscles
+
+TIMESTEP = 1 / 300  # s
+ISOMETRIC_ERROR = 0.05  # peak forces; largest error of the active force-length curve
+# MuJoCo's force-velocity curve is flatter than Geyer and Herr's near rest: 1.15 against 1.34 peak
+# forces at 0.5 optimal lengths per second.
+VELOCITY_ERROR = 0.19
+
+# muscle: optimal length m, slack length m, peak force N, pennation,
+#   then per joint: arm m, angle of the largest arm (None: constant), rest angle, rad.
+BIPED_LEG = {
+    'GLU': (0.103, 0.122, 1500, 0.5, {'hip': (-0.094, None, 0.5216)}),
+    'HFL': (0.103, 0.094, 2000, 0.5, {'hip': (0.094, None, 0)}),
+    'VAS': (0.075, 0.215, 6000, 0.7, {'knee': (0.056, -0.2616, -0.9616)}),
+    'SOL': (0.037, 0.243, 4000, 0.5, {'ankle': (-0.047, -0.3492, 0.1708)}),
+    'TA': (0.056, 0.225, 800, 0.7, {'ankle': (0.037, 0.1708, -0.3492)}),
+    'HAM': (0.094, 0.29, 3000, 0.7, {'hip': (-0.075, None, 0.4316), 'knee': (-0.047, 0, 0)}),
+    'RF': (
+        0.075, 0.281, 1000, 0.7, {'hip': (0.094, None, 0), 'knee': (0.056, -0.2616, -0.9616)},
+    ),
+    'GAS': (
+        0.047, 0.374, 1500, 0.7,
+        {'knee': (-0.047, -0.7016, -0.2616), 'ankle': (-0.047, -0.3492, 0.1708)},
+    ),
+}  # fmt: skip
+BIPED = {
+    f'{side}_{name}': (*row[:4], {f'{side}_{joint}': arm for joint, arm in row[4].items()})
+    for side in ('right', 'left')
+    for name, row in BIPED_LEG.items()
+}
+SAMPLES = {
+    'biped2d': BIPED,
+    'dog': {
+        'spine0_top': (0.04, 0.03, 3000, 0.7, {'spine0': (0.03, 0.1, 0)}),
+        'neck0_bot': (0.05, 0.04, 2000, 0.7, {'neck0': (-0.03, 0.58507, 0.68507)}),
+        'tail0_top': (0.02, 0.06, 250, 0.7, {'tail0': (-0.03, -0.1, 0)}),
+        'front_SUP': (0.08, 0.02, 3000, 0.5, {'shoulder': (0.035, None, -0.7)}),
+        'front_BCP': (
+            0.1, 0.25, 3000, 0.7, {'shoulder': (0.06, None, -0.75), 'elbow': (0.04, 1.3, 0.9)},
+        ),
+        'front_TCP': (
+            0.1, 0.275, 2000, 0.7,
+            {'shoulder': (-0.074, None, 0.7), 'elbow': (-0.056, 0.2616, 0.9616)},
+        ),
+        'back_HAM': (
+            0.1, 0.04, 3000, 0.7, {'hip': (-0.05, None, 1), 'knee': (-0.06, -1.5616, -1.3616)},
+        ),
+        'back_GAS': (
+            0.04, 0.2, 1500, 0.7,
+            {'knee': (-0.047, -0.7016, -0.2616), 'ankle': (-0.047, -0.1492, 0.3708)},
+        ),
+        'back_toe1': (0.05, 0.15, 1000, 0.7, {'toe': (0.037, 0.0708, -0.4492)}),
+    },
+    'raptor': {
+        'spine0_top': (0.085, 0.1, 2500, 0.7, {'spine0': (0.05, 0.21682, 0.16682)}),
+        'head_bot': (0.03, 0.02, 1000, 0.7, {'head': (-0.05, 0.55355, 0.75355)}),
+        'tail1_bot': (0.05, 0.0941, 2000, 0.7, {'tail1': (0.04, 0, -0.1)}),
+        'right_HFL': (0.103, 0.094, 3000, 0.5, {'right_hip': (0.07, None, -0.25)}),
+        'left_HAM': (
+            0.1, 0.05, 3000, 0.7,
+            {'left_hip': (-0.08, None, 0.5), 'left_knee': (-0.095, -1.3, -0.9)},
+        ),
+        'left_toe0': (0.05, 0.1, 1000, 0.7, {'left_toe': (-0.037, -0.4492, 0.0708)}),
+    },
+}  # fmt: skip
+CASES = tuple((name, muscle) for name, table in SAMPLES.items() for muscle in table)
+COUNTS = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
+# How many muscles span each joint; the last tail units are told apart by the joint they span.
+SPANS = {
+    'dog': {'shoulder': 4, 'elbow': 4, 'hip': 4, 'knee': 4, 'ankle': 3, 'toe': 2, 'tail3': 2},
+    'raptor': {'right_hip': 4, 'left_knee': 4, 'left_ankle': 3, 'spine3': 2, 'tail4': 2},
+}
+
+
+def arm_at_rest(arm, peak, rest):
+    return arm if peak is None else arm * math.cos(rest - peak)
+
+
+class Rig:
+    """A character with muscles, its root welded; one muscle and the joints under it."""
+
+    def __init__(self, name, muscle):
+        arena = composer.Arena()
+        option = arena.mjcf_model.option
+        option.timestep, option.gravity = TIMESTEP, (0, 0, 0)
+        option.flag.contact = 'disable'
+        character = characters.make(name)
+        arena.attach(character)
+        actuation.add(character, 'muscle', TIMESTEP)
+        self._physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+        self.model, self.data = self._physics.model.ptr, self._physics.data.ptr
+        self.l_opt, _, self.f_max, self.pennation, self.arms = SAMPLES[name][muscle]
+        self.prefix = f'{name}/'
+        self.muscle = self.data.actuator(self.prefix + muscle)
+        self.rest()
+
+    def joint(self, name):
+        return self.data.joint(self.prefix + name)
+
+    def rest(self):
+        for joint, (_, _, rest) in self.arms.items():
+            self.joint(joint).qpos[0] = rest
+            self.joint(joint).qvel[0] = 0
+
+    def stretch(self, length=1.0, velocity=0.0):
+        """Turns the first joint until the fibre has a length and a velocity, optimal lengths."""
+        self.rest()
+        joint, arm = next(iter(self.arms.items()))
+        per_radian = -self.pennation * arm_at_rest(*arm) / self.l_opt
+        self.joint(joint).qpos[0] += (length - 1) / per_radian
+        self.joint(joint).qvel[0] = velocity / per_radian
+
+    def force(self, excitation):
+        """Pull of the muscle, peak forces."""
+        self.muscle.ctrl[0] = excitation
+        mujoco.mj_forward(self.model, self.data)
+        return -self.muscle.force[0] / self.f_max
+
+    def active(self):
+        """Pull at full excitation without what pulls at none, peak forces."""
+        return (self.force(1) - self.force(0.01)) / 0.99
+
+
+class TableTest(parameterized.TestCase):
+    """The hand-set muscles of the original's character files."""
+
+    @parameterized.parameters(*COUNTS.items())
+    def test_counts(self, name, count):
+        units = muscles.MUSCLES[name]
+        self.assertLen(units, count)
+        self.assertLen({unit.name for unit in units}, count)
+        spanned = {arm.joint for unit in units for arm in unit.arms}
+        self.assertLessEqual(spanned, set(characters.CHARACTERS[name].joints))
+
+    @parameterized.parameters(*CASES)
+    def test_row(self, name, muscle):
+        l_opt, l_slack, f_max, pennation, arms = SAMPLES[name][muscle]
+        unit = next(unit for unit in muscles.MUSCLES[name] if unit.name == muscle)
+        self.assertEqual(unit[1:5], (l_opt, l_slack, f_max, pennation))
+        self.assertEqual({a.joint: (a.arm, a.peak, a.rest) for a in unit.arms}, arms)
+
+    @parameterized.parameters('dog', 'raptor')
+    def test_muscles_per_joint(self, name):
+        for joint, count in SPANS[name].items():
+            arms = [arm for unit in muscles.MUSCLES[name] for arm in unit.arms]
+            self.assertLen([arm for arm in arms if arm.joint == joint], count, joint)
+
+    @parameterized.parameters(*COUNTS)
+    def test_muscles_pull_every_joint_both_ways(self, name):
+        units = muscles.MUSCLES[name]
+        for joint in {arm.joint for unit in units for arm in unit.arms}:
+            signs = {np.sign(a.arm) for unit in units for a in unit.arms if a.joint == joint}
+            self.assertEqual(signs, {-1, 1}, joint)
+
+    def test_legs_are_mirrored(self):
+        for name in ('biped2d', 'raptor'):
+            units = {unit.name: unit for unit in muscles.MUSCLES[name]}
+            for unit in units.values():
+                if unit.name.startswith('right_'):
+                    other = units[unit.name.replace('right_', 'left_')]
+                    self.assertEqual(other[1:5], unit[1:5])
+                    turned = tuple(
+                        a._replace(joint=a.joint.replace('right_', 'left_')) for a in unit.arms
+                    )
+                    self.assertEqual(other.arms, turned)
+
+
+class HillTest(parameterized.TestCase):
+    """The formulas after Geyer and Herr."""
+
+    def test_force_length(self):
+        np.testing.assert_allclose(hill.force_length([1, 1.56, 0.44]), (1, 0.05, 0.05))
+        self.assertAlmostEqual(float(hill.force_length(1.28)), 0.05**0.125)
+
+    def test_springs(self):
+        np.testing.assert_allclose(hill.parallel_force([0.5, 1, 1.56, 1.28]), (0, 0, 1, 0.25))
+        np.testing.assert_allclose(hill.buffer_force([1, 0.44, 0.16, 0.3]), (0, 0, 1, 0.25))
+        np.testing.assert_allclose(hill.tendon_force([-1, 0, 0.04, 0.02]), (0, 0, 1, 0.25))
+
+    def test_velocity(self):
+        # Ten optimal lengths per second at no force, none at the isometric force.
+        np.testing.assert_allclose(hill.velocity([0, 1, 1.5]), (-10, 0, 10), atol=1e-12)
+        self.assertAlmostEqual(float(hill.velocity(0.5)), -10 * 0.5 / 3.5)
+        self.assertAlmostEqual(float(hill.velocity(1.34)), 0.5, delta=0.02)
+        np.testing.assert_allclose(hill.velocity([-1, 9]), hill.velocity([0, 1.5]))
+        self.assertTrue((np.diff(hill.velocity(np.linspace(0, 1.5, 301))) > 0).all())
+
+    def test_moment_arms(self):
+        constant = muscles.Arm('hip', -0.094, 0.5)
+        np.testing.assert_array_equal(hill.moment_arm(constant, [-1, 0, 2]), -0.094)
+        cosine = muscles.Arm('knee', 0.056, -0.9616, -0.2616)
+        self.assertAlmostEqual(float(hill.moment_arm(cosine, -0.2616)), 0.056)
+        self.assertAlmostEqual(float(hill.moment_arm(cosine, -0.2616 - math.pi / 3)), 0.028)
+        self.assertEqual(float(hill.moment_arm(cosine, 2.0)), 0)  # never turns its sign
+        self.assertAlmostEqual(hill.constant_arm(cosine), 0.056 * math.cos(0.7))
+
+
+class MujocoTest(parameterized.TestCase):
+    """The compiled muscles, pulling on real joints."""
+
+    @parameterized.parameters(*CASES)
+    def test_peak_force_at_optimal_length(self, name, muscle):
+        rig = Rig(name, muscle)
+        self.assertAlmostEqual(rig.force(1), 1, delta=1e-9)
+        self.assertAlmostEqual(rig.force(0.01), 0.01, delta=1e-9)
+        self.assertAlmostEqual(rig.force(0.5), 0.5, delta=1e-9)  # activation without a lag
+
+    @parameterized.parameters(*CASES)
+    def test_moment_arms(self, name, muscle):
+        rig = Rig(name, muscle)
+        rig.force(1)
+        rest = rig.muscle.length[0]
+        for joint, arm in rig.arms.items():
+            rig.rest()
+            rig.joint(joint).qpos[0] += 0.1
+            rig.force(1)
+            self.assertAlmostEqual(
+                (rig.muscle.length[0] - rest) / 0.1, -arm_at_rest(*arm), delta=1e-9, msg=joint
+            )
+
+    @parameterized.parameters(
+        ('biped2d', 'right_GLU', 'right_hip', -0.094 * 1500),  # an extensor of 141 N m
+        ('biped2d', 'left_HFL', 'left_hip', 0.094 * 2000),
+        ('biped2d', 'right_VAS', 'right_knee', 0.056 * math.cos(0.7) * 6000),
+        ('biped2d', 'right_HAM', 'right_hip', -0.075 * 3000),
+        ('biped2d', 'right_HAM', 'right_knee', -0.047 * 3000),
+        ('biped2d', 'right_TA', 'right_ankle', 0.037 * math.cos(0.52) * 800),
+        ('dog', 'front_BCP', 'shoulder', 0.06 * 3000),
+        ('raptor', 'tail1_bot', 'tail1', 0.04 * math.cos(0.1) * 2000),
+    )  # fmt: skip
+    def test_torque(self, name, muscle, joint, torque):
+        rig = Rig(name, muscle)
+        for other in rig.arms:  # what the other muscles do must not reach the joint's limit
+            rig.model.jnt_actfrclimited[rig.model.joint(rig.prefix + other).id] = 0
+        torques = []
+        for excitation in (1, 0.01):
+            rig.force(excitation)
+            torques.append(float(rig.joint(joint).qfrc_actuator[0]))
+        self.assertAlmostEqual((torques[0] - torques[1]) / 0.99, torque, delta=1e-6)
+
+    @parameterized.parameters(*CASES)
+    def test_force_length(self, name, muscle):
+        rig, lengths = Rig(name, muscle), np.linspace(0.3, 1.8, 31)
+        found = []
+        for length in lengths:
+            rig.stretch(length)
+            found.append(rig.active())
+        np.testing.assert_allclose(found, hill.force_length(lengths), atol=ISOMETRIC_ERROR)
+
+    def test_passive_force(self):
+        rig, lengths = Rig('biped2d', 'right_GLU'), np.linspace(0.3, 1.8, 31)
+        found = []
+        for length in lengths:
+            rig.stretch(length)
+            found.append(rig.force(0.01) - 0.01 * rig.active())
+        found = np.array(found)
+        np.testing.assert_allclose(found[lengths <= 1], 0, atol=1e-9)  # a muscle cannot push
+        self.assertTrue((np.diff(found) > -1e-9).all())
+        # Cubic, then linear, where the original's is a parabola: softer at both ends.
+        error = np.abs(found - hill.parallel_force(lengths))
+        self.assertLess(error[lengths <= 1.6].max(), 0.15)
+        self.assertLess(error.max(), 0.51)
+
+    @parameterized.parameters(
+        ('biped2d', 'right_GLU'), ('biped2d', 'left_SOL'), ('dog', 'front_TCP'),
+        ('raptor', 'head_bot'),
+    )  # fmt: skip
+    def test_force_velocity(self, name, muscle):
+        rig, velocities = Rig(name, muscle), np.linspace(-10, 10, 41)
+        found = []
+        for velocity in velocities:
+            rig.stretch(1.0, velocity)
+            found.append(rig.active())
+        # hill.velocity is the inverse relation.
+        factor = np.linspace(0, 1.5, 100001)
+        expected = np.interp(velocities, hill.velocity(factor), factor)
+        found = np.array(found)
+        np.testing.assert_allclose(found, expected, atol=VELOCITY_ERROR)
+        self.assertTrue((np.diff(found) > -1e-9).all())
+        np.testing.assert_allclose(found[[0, 20, 40]], (0, 1, 1.5), atol=1e-9)
+
+    def test_more_exact_where_muscles_work(self):
+        """Root mean square error over the fitted range, isometric and by velocity."""
+        rig = Rig('biped2d', 'right_GLU')
+        lengths, velocities = np.linspace(0.5, 1.5, 41), np.linspace(-10, 10, 41)
+        error = []
+        for length in lengths:
+            rig.stretch(length)
+            error.append(rig.active() - float(hill.force_length(length)))
+        self.assertLess(np.sqrt(np.mean(np.square(error))), 0.035)
+        factor, error = np.linspace(0, 1.5, 100001), []
+        for velocity in velocities:
+            rig.stretch(1.0, velocity)
+            error.append(rig.active() - np.interp(velocity, hill.velocity(factor), factor))
+        self.assertLess(np.sqrt(np.mean(np.square(error))), 0.07)
+
+
+class StrainTest(parameterized.TestCase):
+    """What an environment observes of its muscles."""
+
+    @parameterized.parameters(
+        ('MTU_Biped2D_LLC_Imitate_Flat-v0', 'biped2d'), ('MTU_Dog2D_LLC_Imitate_Flat-v0', 'dog'),
+        ('MTU_Raptor2D_LLC_Imitate_Flat-v0', 'raptor'),
+    )  # fmt: skip
+    def test_strain_by_the_length_law(self, id_, name):
+        environment = suite.make(id_, {'random': 5})
+        environment.reset()
+        rng = np.random.default_rng(5)
+        for _ in range(6):
+            action = rng.uniform(-1, 1, len(environment.action_map))
+            strain = environment.step(action).observation['strain']
+            angle = environment.physics.named.data.qpos
+            for i, muscle in enumerate(environment.action_map.names):
+                if muscle not in SAMPLES[name]:
+                    continue
+                l_opt, _, _, pennation, arms = SAMPLES[name][muscle]
+                change = sum(
+                    arm_at_rest(*arm) * (angle[f'{name}/{joint}'][0] - arm[2])
+                    for joint, arm in arms.items()
+                )
+                self.assertAlmostEqual(strain[i], -pennation * change / l_opt, delta=1e-9)
+
+    def test_muscles_drive_in_the_order_of_the_action(self):
+        environment = suite.make('MTU_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
+        names = environment.action_map.names
+        self.assertEqual(names, tuple(BIPED))
+        environment.reset()
+        action = np.full(16, -1.0)
+        action[names.index('left_SOL')] = 1.0
+        environment.step(action)
+        force = environment.physics.named.data.actuator_force
+        ctrl = environment.physics.named.data.ctrl
+        self.assertEqual(ctrl['biped2d/left_SOL'], 1.0)
+        self.assertAlmostEqual(ctrl['biped2d/right_SOL'], 0.01)
+        self.assertLess(force['biped2d/left_SOL'], 10 * force['biped2d/right_SOL'])
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,385 @@
+"""Pictures show what is there, files are whole or absent, and failures say what to do."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+from unittest import mock
+
+import imageio.v3 as iio
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer
+
+from trl_suite import rendering, suite
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+SMALL = {'height': 120, 'width': 160}
+
+
+def make(id_=GAPS, seed=1, **task_kwargs):
+    environment = suite.make(id_, {'random': seed, **task_kwargs})
+    environment.reset()
+    return environment
+
+
+def drawn_ground(environment):
+    """Boxes of the ground in the scene that a picture is made of: (x, half length, top) in m."""
+    found = []
+
+    def look(physics, scene):
+        ground = physics.model.name2id('terrain', 'body')
+        for geom in scene.geoms[: scene.ngeom]:
+            is_geom = geom.objtype == mujoco.mjtObj.mjOBJ_GEOM
+            if is_geom and physics.model.geom_bodyid[geom.objid] == ground and geom.pos[2] > -30:
+                found.append((geom.pos[0], geom.size[0], geom.pos[2] + geom.size[2]))
+
+    rendering.frame(environment, **SMALL)  # makes the context
+    environment.physics.render(camera_id='biped2d_full/side', scene_callback=look, **SMALL)
+    return np.array(sorted(found))
+
+
+class FrameTest(parameterized.TestCase):
+    def test_is_what_physics_draws(self):
+        environment = make()
+        image = rendering.frame(environment, **SMALL)
+        self.assertEqual((image.shape, image.dtype), ((120, 160, 3), np.uint8))
+        direct = environment.physics.render(120, 160, 'biped2d_full/side')
+        np.testing.assert_array_equal(image, direct)
+
+    def test_cameras_by_short_and_full_name_and_number(self):
+        environment = make()
+        side, front = (rendering.frame(environment, camera=c, **SMALL) for c in ('side', 'front'))
+        self.assertGreater(np.mean(np.any(side != front, axis=2)), 0.1)
+        for name, image in (('side', side), ('front', front)):
+            full = f'biped2d_full/{name}'
+            number = environment.physics.model.name2id(full, 'camera')
+            for camera in (full, number):
+                again = rendering.frame(environment, camera=camera, **SMALL)
+                np.testing.assert_array_equal(again, image)
+
+    def test_the_character_is_in_the_picture(self):
+        # The camera follows the character: after half a second of walking it is still in the
+        # middle, so it hides the sky there.
+        environment = make('PD_Biped2D_LLC_Imitate_Flat-v0', start_phase=0.0)
+        for _ in range(15):
+            environment.step(environment.task.clip_action(0))
+        self.assertGreater(environment.info['distance'], 0.3)
+        image = rendering.frame(environment, **SMALL).astype(int)
+        sky = image[:40].reshape(-1, 3).mean(0)
+        middle = image[40:80, 30:100]
+        self.assertGreater(np.mean(np.abs(middle - sky).sum(2) > 90), 0.05)
+
+    @parameterized.parameters(
+        ({'camera': 'sid'}, "unknown camera 'sid'; did you mean 'side'"),
+        ({'camera': 2}, r'camera is 2; expected -1 to 1'),
+        ({'camera': -2}, r'camera is -2'),
+        ({'height': 0}, 'height is 0; expected 1 to 1080'),
+        ({'width': 1921}, 'width is 1921; expected 1 to 1920'),
+    )
+    def test_bad_arguments(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            rendering.frame(make(), **{**SMALL, **options})
+
+    def test_no_ghost_without_a_clip(self):
+        environment = composer.Environment(composer.NullTask(composer.Arena()))
+        self.assertEqual(rendering.frame(environment, 48, 64, camera=-1).shape, (48, 64, 3))
+        with self.assertRaisesRegex(ValueError, 'a NullTask task has no reference clip'):
+            rendering.frame(environment, 48, 64, camera=-1, ghost=True)
+
+
+class GhostTest(parameterized.TestCase):
+    @parameterized.parameters(GAPS, 'PD_Raptor2D_Steps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0')
+    def test_stands_in_the_pose_of_the_reference(self, id_):
+        # At the start the character is in the reference's pose, lifted clear of the ground.
+        environment = make(id_)
+        model = environment.physics.model
+        lift = environment.physics.data.qpos[1] - environment.task.reference_pose(0)[1]
+        self.assertBetween(lift, 0, 0.05)
+        shown = {}
+
+        def look(physics, scene):
+            before = scene.ngeom
+            rendering._ghost(environment.task)(physics, scene)
+            for geom in scene.geoms[before : scene.ngeom]:
+                shown[geom.objid] = np.array(geom.pos), np.array(geom.rgba)
+
+        rendering.frame(environment, **SMALL)  # makes the context
+        environment.physics.render(scene_callback=look, **SMALL)
+        looks = [
+            i for i in range(model.ngeom)
+            if model.geom_group[i] == 0 and model.body_weldid[model.geom_bodyid[i]] != 0
+        ]  # fmt: skip
+        self.assertCountEqual(shown, looks)
+        for i, (position, colour) in shown.items():
+            beside = np.array([0, rendering.GHOST_BEHIND, -lift])
+            character = environment.physics.data.geom_xpos[i]
+            np.testing.assert_allclose(position, character + beside, atol=1e-5)
+            self.assertLess(colour[3], 1)
+
+    def test_walks_on_while_the_character_lags(self):
+        environment = make(start_phase=0.0)
+        plain = rendering.frame(environment, **SMALL)
+        ghost = rendering.frame(environment, ghost=True, **SMALL)
+        changed = np.any(plain != ghost, axis=2)
+        self.assertBetween(np.mean(changed), 0.005, 0.5)
+        # Where the sky was, it is yellower than before.
+        sky = changed & (plain[:, :, 2] > 200)
+        self.assertGreater(sky.sum(), 20)
+        self.assertLess(
+            ghost[sky][:, 2].astype(float).mean(), plain[sky][:, 2].astype(float).mean() - 10
+        )
+
+    def test_changes_neither_model_nor_simulation(self):
+        seen, unseen = make(seed=4), make(seed=4)
+        model = seen.physics.model.ptr
+        before = {
+            name: np.array(getattr(model, name))
+            for name in ('geom_pos', 'geom_size', 'geom_rgba', 'qpos0', 'body_mass')
+        }
+        for i in range(20):
+            action = np.full(11, 0.2 * np.sin(i))
+            a, b = seen.step(action), unseen.step(action)
+            rendering.frame(seen, ghost=True, **SMALL)
+            for name, value in a.observation.items():
+                np.testing.assert_array_equal(value, b.observation[name])
+        for name, value in before.items():
+            np.testing.assert_array_equal(value, getattr(model, name))
+        np.testing.assert_array_equal(seen.get_state()['world'], unseen.get_state()['world'])
+
+
+class TerrainIsCurrentTest(parameterized.TestCase):
+    def assert_drawn_around(self, environment, x):
+        ground, strip = drawn_ground(environment), environment.task.arena.strips[0]
+        for centre, _, top in ground:
+            np.testing.assert_allclose(top, strip.height(centre), atol=1e-4)
+        left, right = ground[:, 0] - ground[:, 1], ground[:, 0] + ground[:, 1]
+        self.assertLess(left[0], x - 2)
+        self.assertGreater(right[-1], x + 10)
+        np.testing.assert_allclose(left[1:], right[:-1], atol=1e-4)  # without holes
+
+    def test_after_resets(self):
+        environment = make()
+        self.assert_drawn_around(environment, 0)
+        first = rendering.frame(environment, camera='front', **SMALL), drawn_ground(environment)
+        environment.reset()
+        self.assert_drawn_around(environment, 0)
+        second = rendering.frame(environment, camera='front', **SMALL), drawn_ground(environment)
+        self.assertFalse(np.array_equal(first[0], second[0]))
+        self.assertFalse(np.array_equal(first[1], second[1]))
+
+    def test_after_the_strip_was_extended(self):
+        environment = make()
+        rendering.frame(environment, **SMALL)  # contexts exist before the ground changes
+        world = environment.task.world
+        world.qpos[0, 0] += 40.0
+        world.qpos[0, 1] += 3.0
+        world.forward(0)
+        environment.step(np.zeros(11))
+        self.assert_drawn_around(environment, 40)
+
+    def test_after_set_state(self):
+        environment, other = make(seed=1), make(seed=2)
+        picture = rendering.frame(environment, camera='front', **SMALL)
+        self.assertFalse(np.array_equal(rendering.frame(other, camera='front', **SMALL), picture))
+        other.set_state(environment.get_state())
+        np.testing.assert_array_equal(rendering.frame(other, camera='front', **SMALL), picture)
+
+
+def numbered(count, height=32, width=48):
+    return [np.full((height, width, 3), 10 * i, np.uint8) for i in range(count)]
+
+
+class FolderTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+    def assert_only(self, *names):
+        self.assertCountEqual([path.name for path in self.folder.iterdir()], names)
+
+
+class VideoTest(FolderTest):
+    def test_mp4(self):
+        path = self.folder / 'a.mp4'
+        rendering.video(iter(numbered(12)), path, fps=15)
+        meta = iio.immeta(path, plugin='FFMPEG')
+        self.assertEqual((meta['fps'], meta['codec'], meta['size']), (15.0, 'h264', (48, 32)))
+        frames = iio.imread(path, plugin='FFMPEG')
+        self.assertEqual(frames.shape, (12, 32, 48, 3))
+        np.testing.assert_allclose(frames.mean((1, 2, 3)), 10 * np.arange(12), atol=4)
+        self.assert_only('a.mp4')
+
+    def test_gif(self):
+        path = self.folder / 'a.gif'
+        rendering.video(numbered(5), str(path), fps=20)
+        frames = iio.imread(path)
+        self.assertEqual(frames.shape, (5, 32, 48, 3))
+        np.testing.assert_allclose(frames.mean((1, 2, 3)), 10 * np.arange(5), atol=4)
+        self.assertEqual(iio.immeta(path)['duration'], 50)
+        self.assert_only('a.gif')
+
+    def test_of_a_policy(self):
+        environment = make(start_phase=0.2)
+        policy = lambda time_step: np.zeros(11)  # noqa: E731
+        images = list(rendering.frames(environment, policy, steps=60, **SMALL))
+        # One more for every reset; a biped that does nothing falls within two seconds.
+        self.assertBetween(len(images), 62, 64)
+        self.assertEqual({image.shape for image in images}, {(120, 160, 3)})
+        rendering.video(images, self.folder / 'a.mp4')
+        self.assert_only('a.mp4')
+
+    @parameterized.parameters(
+        ('a.avi', numbered(2), ValueError, "unknown suffix '.avi'; expected .mp4 or .gif"),
+        ('a.mp4', [], ValueError, 'no frames were given'),
+        ('a.mp4', numbered(2, height=33), ValueError, 'frames are 48x33 pixels; h264 needs even'),
+        ('a.gif', [*numbered(1), *numbered(1, 16)], ValueError, r'shape \(16, 48, 3\)'),
+        ('a.gif', [np.zeros((8, 8, 3))], ValueError, 'float64; expected'),
+        ('a.gif', [np.zeros((8, 8), np.uint8)], ValueError, r'shape \(8, 8\)'),
+        ('no/a.mp4', numbered(2), FileNotFoundError, 'the folder .* does not exist'),
+    )
+    def test_refusals_leave_nothing_behind(self, name, frames, error, message):
+        with self.assertRaisesRegex(error, message):
+            rendering.video(frames, self.folder / name)
+        self.assert_only()
+
+    def test_bad_rate(self):
+        with self.assertRaisesRegex(ValueError, 'fps is 0'):
+            rendering.video(numbered(2), self.folder / 'a.mp4', fps=0)
+
+    @parameterized.parameters('a.mp4', 'a.gif')
+    def test_the_old_file_stays_if_it_goes_wrong(self, name):
+        path = self.folder / name
+        path.write_text('old')
+
+        def frames():
+            yield from numbered(3)
+            raise KeyboardInterrupt
+
+        with self.assertRaises(KeyboardInterrupt):
+            rendering.video(frames(), path)
+        self.assertEqual(path.read_text(), 'old')
+        self.assert_only(name)
+
+    def test_odd_sizes_are_fine_in_a_gif(self):
+        rendering.video(numbered(2, 33, 47), self.folder / 'a.gif')
+        self.assertEqual(iio.imread(self.folder / 'a.gif').shape, (2, 33, 47, 3))
+
+
+class FilmStripTest(FolderTest):
+    @parameterized.parameters((11, 6), (10, 4), (3, 8), (5, 1), (1, 8))
+    def test_evenly_spaced_with_both_ends(self, count, columns):
+        path = self.folder / 'strip.png'
+        strip = rendering.film_strip(iter(numbered(count)), path, columns)
+        pitch = 48 + rendering.STRIP_MARGIN
+        shown = strip[0, ::pitch, 0] // 10
+        self.assertLen(shown, min(count, columns))
+        self.assertEqual(strip.shape, (32, pitch * len(shown) - rendering.STRIP_MARGIN, 3))
+        self.assertEqual(shown[0], 0)
+        if len(shown) > 1:
+            self.assertEqual(shown[-1], count - 1)
+            gaps = np.diff(shown.astype(int))
+            self.assertLessEqual(gaps.max() - gaps.min(), 1)
+        np.testing.assert_array_equal(iio.imread(path), strip)
+        self.assert_only('strip.png')
+
+    def test_refusals(self):
+        for frames, options, message in (
+            ([], {}, 'at least one frame'),
+            (numbered(2), {'columns': 0}, 'columns is 0'),
+            ([*numbered(1), *numbered(1, 16)], {}, 'the same size'),
+            (numbered(2), {'path': self.folder / 'a.jpg'}, "suffix '.jpg'; expected .png"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                rendering.film_strip(frames, **options)
+        self.assert_only()
+
+
+class PlotTerrainTest(FolderTest):
+    def test_is_a_picture_that_depends_on_the_seed(self):
+        for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 5})):
+            rendering.plot_terrain('gaps', self.folder / f'{name}.png', length=20, **options)
+        a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
+        np.testing.assert_array_equal(a, b)
+        self.assertFalse(np.array_equal(a, c))
+        self.assertGreater(d.shape[0], a.shape[0])
+        self.assert_only('a.png', 'b.png', 'c.png', 'd.png')
+
+    def test_refusals(self):
+        for terrain, options, message in (
+            ('gasp', {}, "unknown terrain 'gasp'; did you mean 'gaps'"),
+            ('gaps', {'draws': 0}, 'draws is 0'),
+            ('gaps', {'length': float('nan')}, 'length is nan'),
+            ('gaps', {'length': -3.0}, 'length is -3.0'),
+            ('gaps', {'seed': -1}, 'seed is -1'),
+            ('gaps', {'blend': float('nan')}, 'blend must be a number'),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                rendering.plot_terrain(terrain, self.folder / 'a.png', **options)
+        self.assert_only()
+
+
+def run_headless(program, variables):
+    gl = ('DISPLAY', 'WAYLAND_DISPLAY', 'MUJOCO_GL', 'PYOPENGL_PLATFORM')
+    rest = {name: value for name, value in os.environ.items() if name not in gl}
+    return subprocess.run(
+        [sys.executable, '-W', 'ignore', '-c', program], capture_output=True, text=True,
+        env={**rest, **variables}, timeout=60, check=False,
+    )  # fmt: skip
+
+
+class MissingPartsTest(FolderTest):
+    @parameterized.parameters(
+        ('imageio.v2', lambda path: rendering.video(numbered(2), path / 'a.mp4')),
+        ('imageio_ffmpeg', lambda path: rendering.video(numbered(2), path / 'a.mp4')),
+        ('imageio.v3', lambda path: rendering.film_strip(numbered(2), path / 'a.png')),
+        ('matplotlib.figure', lambda path: rendering.plot_terrain('gaps', path / 'a.png')),
+    )
+    def test_the_extra_is_named(self, module, draw):
+        with (
+            mock.patch.dict(sys.modules, {module: None}),
+            self.assertRaisesRegex(ImportError, r"pip install 'trl_suite\[video\]'"),
+        ):
+            draw(self.folder)
+        self.assert_only()
+
+    def test_without_opengl(self):
+        program = f"""
+import numpy as np
+from trl_suite import rendering, suite
+environment = suite.make({GAPS!r})
+environment.reset()
+environment.step(np.zeros(11))
+try:
+    rendering.frame(environment)
+except RuntimeError as error:
+    print(error)
+"""
+        for setting in ('disable', 'glfw'):
+            with self.subTest(setting):
+                done = run_headless(program, {'MUJOCO_GL': setting})
+                self.assertEqual((done.returncode, done.stderr), (0, ''))
+                self.assertRegex(done.stdout, f'^nothing can be drawn.*MUJOCO_GL is {setting!r}')
+                self.assertRegex(done.stdout, 'egl or osmesa .* glfw .*\n$')
+                self.assertEqual(done.stdout.count('\n'), 1)
+
+    def test_dm_control_imported_first(self):
+        # It then has chosen GLFW, which finds no screen.
+        program = f"""
+from dm_control import composer
+from trl_suite import rendering, suite
+environment = suite.make({GAPS!r})
+environment.reset()
+print(rendering.frame(environment).std() > 10)
+print(environment.physics.render().std() > 10)
+"""
+        done = run_headless(program, {})
+        self.assertEqual((done.returncode, done.stderr, done.stdout), (0, '', 'True\nTrue\n'))
+
+
+if __name__ == '__main__':
+    absltest.main()
