@@ -89,14 +89,14 @@ DOG = CharacterRow(
     description='Dog, 21 links: a segmented spine, a tail, one simulated front and hind leg.',
 )  # fmt: skip
 
+_GOAT_JOINTS = {
+    name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()
+}
+_GOAT_JOINTS['neck0'] = dataclasses.replace(_GOAT_JOINTS['neck0'], target=0.40041)
+
 GOAT = CharacterRow(
     name='goat',
-    joints={
-        name: dataclasses.replace(
-            joint, weight=1.0, **({'target': 0.40041} if name == 'neck0' else {})
-        )
-        for name, joint in _DOG_JOINTS.items()
-    },
+    joints=_GOAT_JOINTS,
     fall_links=('root', 'spine0'),
     end_effectors=('finger', 'toe'),
     stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
