@@ -49,6 +49,8 @@ def _cuts(start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: floa
     post[1:] |= face[: count - 1] & sloped[1:count]
     post[:-1] |= face[2:] & sloped[1:count]
     cut |= post
+    if not sloped[1:count].any():
+        return cut
     grid = (np.arange(start, start + count) % PIECE == 0) & ~(left & right)
     mandatory = cut.copy()
     cut |= grid

@@ -89,9 +89,7 @@ DOG = CharacterRow(
     description='Dog, 21 links: a segmented spine, a tail, one simulated front and hind leg.',
 )  # fmt: skip
 
-_GOAT_JOINTS = {
-    name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()
-}
+_GOAT_JOINTS = {name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()}
 _GOAT_JOINTS['neck0'] = dataclasses.replace(_GOAT_JOINTS['neck0'], target=0.40041)
 
 GOAT = CharacterRow(

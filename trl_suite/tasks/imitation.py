@@ -206,16 +206,17 @@ class Imitation(Task):
         phase = self._start_phase
         if phase is None:
             phase = np.random.default_rng(start_seed).uniform()
-        time = np.array([phase * self.reference.period])
-        pose, rate = self.clip.pose(time)[0], self.clip.velocity(time)[0]
-        # Where the original's segments meet; it builds them before it moves the root to x = 0.
-        upstream = {'centre': pose[0] - 0.5} if self._spawn == 'upstream' else {}
+        upstream = {}
+        if self._spawn == 'upstream':
+            # Where the original's segments meet; it builds them before it moves the root to x = 0.
+            start = self.clip.pose(np.array([phase * self.reference.period]))[0]
+            upstream['centre'] = start[0] - 0.5
         strip = Strip(
             self.arena.terrain, terrain_seed, blend=self._blend, spawn=self._spawn, **upstream
         )
         self.arena.begin_episode(row, strip)
         self.phase[row] = self._cycles[row] = self._start_cycles[row] = phase
-        self.figure.place(row, pose, rate)
+        self.figure.place(row, *self.reference.state(phase))
         self.failed[row] = self.diverged[row] = False
         self.reward[row] = 0.0
         self._observe(self._all if self.world.n == 1 else self._views(slice(row, row + 1)))

@@ -20,6 +20,7 @@ class Reference:
       com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
+      root_rate (2,) velocity of the root in x and z, m/s;
       quarter (bins,) one-hot of the part of the cycle that the phase lies in.
     """
 
@@ -64,7 +65,7 @@ class Reference:
             rows.append(
                 np.concatenate([
                     pose[2:], rate[2:], effector.T.ravel(), share @ velocity,
-                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(),
+                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(), rate[:2],
                 ])
             )  # fmt: skip
         table = np.array(rows)
@@ -75,7 +76,7 @@ class Reference:
         joints, bodies = len(links) - 1, 2 * len(links)
         sizes = {
             'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
-            'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'phase': 1,
+            'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'root_rate': 2, 'phase': 1,
             'quarter': bins,
         }  # fmt: skip
         stops = np.cumsum(list(sizes.values()))
@@ -83,6 +84,12 @@ class Reference:
             name: slice(int(stop) - size, int(stop))
             for (name, size), stop in zip(sizes.items(), stops, strict=True)
         }
+
+    def state(self, phase: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns pose and velocity at a phase, (3 + J,) each: x = 0, z above 0, pitch, joints."""
+        found, column = self.features(np.array([phase]))[0], self.columns
+        pose = np.concatenate([[0.0], found[column['height']], found[column['angles']]])
+        return pose, np.concatenate([found[column['root_rate']], found[column['rates']]])
 
     def features(self, phase: np.ndarray) -> np.ndarray:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
