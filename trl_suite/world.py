@@ -8,11 +8,13 @@ environment (n = 1, over one `dm_control` Physics) and a batch.
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 from dm_control import mjcf
+from mujoco import batch
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
 WRITABLE = ('qpos', 'qvel', 'act', 'ctrl', 'qacc_warmstart', 'mocap_pos', 'mocap_quat')
@@ -60,19 +62,19 @@ class World:
         self._model = model
         self._scratch = mujoco.MjData(model)  # mj_setConst overwrites the state of its data
 
-    # The verbs; rows are numbers of simulations.
+    # The verbs; rows are sorted numbers of simulations, without repeats.
 
     @abc.abstractmethod
-    def step(self, nstep: int) -> None:
-        """Advances all simulations by `nstep` substeps in C, positions and velocities current."""
+    def step(self, nstep: int, rows: np.ndarray | None = None) -> None:
+        """Advances some or all simulations by `nstep` substeps in C, velocities current."""
 
     @abc.abstractmethod
-    def forward(self, row: int) -> None:
+    def forward(self, rows: np.ndarray) -> None:
         """Recomputes everything that depends on a written state."""
 
     @abc.abstractmethod
-    def reset(self, row: int) -> None:
-        """Puts one simulation into the model's initial state, warnings cleared."""
+    def reset(self, rows: np.ndarray) -> None:
+        """Puts simulations into the model's initial state, warnings cleared."""
 
     @abc.abstractmethod
     def set_const(self, row: int) -> None:
@@ -136,7 +138,7 @@ class PhysicsWorld(World):
                 view.flags.writeable = False
             setattr(self, field, view)
 
-    def step(self, nstep: int) -> None:
+    def step(self, nstep: int, rows: np.ndarray | None = None) -> None:
         # The order of dm_control's default (`legacy_step`): finish the open step, run the others,
         # and begin the next, so that kinematics belong to the new state.
         mujoco.mj_step2(self._model, self._data)
@@ -144,10 +146,10 @@ class PhysicsWorld(World):
             mujoco.mj_step(self._model, self._data, nstep - 1)
         mujoco.mj_step1(self._model, self._data)
 
-    def forward(self, row: int) -> None:
+    def forward(self, rows: np.ndarray) -> None:
         mujoco.mj_forward(self._model, self._data)
 
-    def reset(self, row: int) -> None:
+    def reset(self, rows: np.ndarray) -> None:
         mujoco.mj_resetData(self._model, self._data)
 
     def set_const(self, row: int) -> None:
@@ -167,3 +169,72 @@ class PhysicsWorld(World):
 
     def diverged(self) -> np.ndarray:
         return np.array([self.any_diverged()])
+
+
+class BatchWorld(World):
+    """n simulations over a `mujoco.batch.Batch`, each with a model of its own.
+
+    Forking a process that holds one leaves the child without the batch's threads; see
+    `trl_suite.vector`.
+    """
+
+    def __init__(self, model: mujoco.MjModel, n: int, num_threads: int) -> None:
+        """Makes n simulations.
+
+        Args:
+          model: what all of them share; copied once per simulation, so it should be light.
+          n: number of simulations.
+          num_threads: threads that step them; 0 takes all cores.
+        """
+        super().__init__(model, [copy.copy(model) for _ in range(n)])
+        self.batch = batch.Batch(model, n, nthread=num_threads)
+        self._edited = True  # whether the batch must be told of edits of the models
+        for field in WRITABLE + READABLE:
+            setattr(self, field, self.batch.bind(field))
+        self._tell()
+        # A field is zero until the first call after it was bound.
+        self.batch.reset()
+
+    def _tell(self) -> None:
+        if self._edited:
+            self.batch.set_models(self.models)
+            self._edited = False
+
+    def step(self, nstep: int, rows: np.ndarray | None = None) -> None:
+        self._tell()
+        self.batch.step(rows, nstep=nstep, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def forward(self, rows: np.ndarray) -> None:
+        self._tell()
+        # What only accelerations need is computed by the next step.
+        self.batch.forward(rows, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def reset(self, rows: np.ndarray) -> None:
+        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+
+    def set_const(self, row: int) -> None:
+        mujoco.mj_setConst(self.models[row], self._scratch)
+        self._edited = True
+
+    def get_state(self, row: int) -> np.ndarray:
+        return self.batch.state[row].copy()
+
+    def set_state(self, row: int, state: np.ndarray) -> None:
+        self.batch.state[row] = state
+        self.forward(np.array([row]))
+
+    def any_diverged(self) -> bool:
+        return bool(self.batch.warning[:, _DIVERGED, 1].any())
+
+    def diverged(self) -> np.ndarray:
+        return self.batch.warning[:, _DIVERGED, 1].any(1)
+
+
+def light_model(root: mjcf.RootElement) -> mujoco.MjModel:
+    """Compiles a tree without textures and materials: the same physics, a hundredth of the size."""
+    spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
+    for geom in spec.geoms:
+        geom.material = ''  # one that is still referred to cannot be deleted
+    for item in (*spec.materials, *spec.textures):
+        spec.delete(item)
+    return spec.compile()

@@ -82,13 +82,14 @@ class PlanarTerrain(composer.Arena):
         """Keeps ground under and ahead of characters whose roots are at x, m, shape (n, 1)."""
         moved = x - self._centre
         if np.vdot(moved, moved) > _REACH**2:  # the cheap test; by rows only if it may be so
-            for row in np.flatnonzero(np.abs(moved) > _REACH).tolist():
+            rows = np.flatnonzero(np.abs(moved[:, 0]) > _REACH)
+            for row in rows.tolist():
                 # The window starts at multiples of the advance, however far a row has jumped.
                 self._lay(row, round(float(x[row, 0]) / ADVANCE) * _ADVANCE)
-                # Contacts of the open step name boxes that now lie elsewhere.
-                self._world.forward(row)
+            if len(rows):  # contacts of the open step name boxes that now lie elsewhere
+                self._world.forward(rows)
 
-    def height(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+    def height(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
         u = x * _CELLS_PER_METRE
         start = np.empty_like(u)
@@ -104,7 +105,7 @@ class PlanarTerrain(composer.Arena):
         u += self._heights.take(cell, mode='clip')
         return u
 
-    def slope(self, x: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
+    def slope(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
         cell = np.floor(x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
         return self._rises.take(cell + self._offset[rows], mode='clip') / SPACING

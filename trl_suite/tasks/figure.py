@@ -90,57 +90,50 @@ class PlanarFigure:
 
     def views(
         self,
-        rows: slice,
         observation: np.ndarray,
         blocks: dict[str, slice],
         effectors: np.ndarray,
         com_velocity: np.ndarray,
     ) -> SimpleNamespace:
-        """The parts of all arrays that a measurement of some rows reads and writes.
+        """The parts of all arrays that a measurement reads and writes.
 
         Args:
-          rows: which simulations.
-          observation: of all simulations, (n, size); terrain, pose and velocity are written there.
+          observation: (n, size); terrain, pose and velocity are written there.
           blocks: where they lie.
-          effectors: where end effectors are written, (rows, 2 * E): all x ahead of the centre of
-            mass, then all z above the ground, m.
-          com_velocity: where the velocity of the centre of mass is written, (rows, 2), m/s.
+          effectors: where end effectors are written, (n, 2 * E): all x ahead of the centre of mass,
+            then all z above the ground, m.
+          com_velocity: where the velocity of the centre of mass is written, (n, 2), m/s.
 
         Returns:
-          A namespace for `measure`. Of use to tasks: `x`, `z`, `pitch` (rows, 1), `qpos` and `qvel`
-          (rows, ...), `rates` of the joints, some of them perhaps twice, `height` (rows, 1) of the
-          root above the ground, `fall` (rows, F) contact counts, and after `measure` `facing`.
+          A namespace for `measure`. Of use to tasks: `x`, `z`, `pitch` (n, 1), `rates` of the joints
+          (n, J or more), `height` (n, 1) of the root above the ground, `fall` (n, F) contact
+          counts, and after `measure` `facing`.
         """
-        world = self._world
+        world, n = self._world, self._world.n
         x, z, pitch = self.pose_qpos[:3]
-        out = observation[rows]
-        pose = out[:, blocks['pose']]
-        count, effector_count = len(out), len(self.effectors)
-        ground_x = self._ground_x[rows]
-        samples = len(self._samples)
+        pose = observation[:, blocks['pose']]
+        effector_count, samples = len(self.effectors), len(self._samples)
         return SimpleNamespace(
-            rows=rows,
             facing=None,
-            qpos=world.qpos[rows],
-            qvel=world.qvel[rows],
-            x=world.qpos[rows, x, None],
-            z=world.qpos[rows, z, None],
-            pitch=world.qpos[rows, pitch, None],
-            rates=world.qvel[rows, self.pose_dof[2:].min() : self.pose_dof[2:].max() + 1],
-            xpos=world.xpos[rows].reshape(count, -1),
-            xipos=world.xipos[rows].reshape(count, -1),
-            cvel=world.cvel[rows].reshape(count, -1),
-            com=world.subtree_com[rows].reshape(count, -1),
-            fall=world.sensordata[rows, self._fall],
+            qpos=world.qpos,
+            qvel=world.qvel,
+            x=world.qpos[:, x, None],
+            z=world.qpos[:, z, None],
+            pitch=world.qpos[:, pitch, None],
+            rates=world.qvel[:, self.pose_dof[2:].min() : self.pose_dof[2:].max() + 1],
+            xpos=world.xpos.reshape(n, -1),
+            xipos=world.xipos.reshape(n, -1),
+            cvel=world.cvel.reshape(n, -1),
+            com=world.subtree_com.reshape(n, -1),
+            fall=world.sensordata[:, self._fall],
             height=pose[:, :1],
             position=pose[:, 1:],
-            velocity=out[:, blocks['velocity']],
-            terrain=out[:, blocks.get('terrain', slice(0, 0))],
-            ground_x=ground_x,
-            sample_x=ground_x[:, :samples],
-            effector_ground_x=ground_x[:, samples:],
-            offsets=np.tile(self._samples, (count, 1)),
-            under=np.empty((count, samples - 1)),
+            velocity=observation[:, blocks['velocity']],
+            terrain=observation[:, blocks.get('terrain', slice(0, 0))],
+            sample_x=self._ground_x[:, :samples],
+            effector_ground_x=self._ground_x[:, samples:],
+            offsets=np.tile(self._samples, (n, 1)),
+            under=np.empty((n, samples - 1)),
             effectors=effectors,
             effector_x=effectors[:, :effector_count],
             effector_z=effectors[:, effector_count:],
@@ -148,7 +141,7 @@ class PlanarFigure:
         )
 
     def measure(self, v: SimpleNamespace) -> None:
-        """Writes terrain, pose and velocity blocks, end effectors and com velocity of some rows."""
+        """Writes terrain, pose and velocity blocks, end effectors and com velocity."""
         # A trunk that points backwards looks backwards. A sum of squares is the cheapest test.
         v.facing = None
         if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2:
@@ -170,7 +163,7 @@ class PlanarFigure:
         v.sample_x[...] = v.x
         v.sample_x += v.offsets if v.facing is None else v.offsets * v.facing
         v.effector_ground_x[...] = v.effector_x
-        ground = self.arena.height(v.ground_x, v.rows)
+        ground = self.arena.height(self._ground_x)
         v.height[...] = v.z
         v.height -= ground[:, samples : samples + 1]
         if samples:
@@ -183,35 +176,41 @@ class PlanarFigure:
             v.position[:, ::2] *= v.facing
             v.velocity[:, ::2] *= v.facing
 
-    def place(self, row: int, pose: np.ndarray, rate: np.ndarray) -> None:
-        """Puts the character of one simulation at x = 0 onto the ground.
+    def place(self, rows: np.ndarray, poses: np.ndarray, rates: np.ndarray) -> None:
+        """Puts the characters of some simulations at x = 0 onto the ground.
 
         Args:
-          row: which simulation; it is reset.
-          pose: x (ignored), z above the ground, pitch and joints in link order, (3 + J,).
-          rate: their velocities, (3 + J,).
+          rows: which simulations; they are reset.
+          poses: x (ignored), z above the ground, pitch and joints in link order, (rows, 3 + J).
+          rates: their velocities, (rows, 3 + J).
         """
         world = self._world
-        world.reset(row)
-        world.qpos[row, self.pose_qpos] = pose
-        world.qpos[row, self.pose_qpos[0]] = 0.0
-        world.qpos[row, self.pose_qpos[1]] += self.ground(row, np.zeros(1))[0]
-        world.qvel[row, self.pose_dof] = rate
-        world.forward(row)
-        lift = self._penetration(row) + CLEARANCE
-        if lift > 0:
-            world.qpos[row, self.pose_qpos[1]] += lift
-            world.forward(row)
+        world.reset(rows)
+        x, z = self.pose_qpos[:2]
+        world.qpos[rows[:, None], self.pose_qpos] = poses
+        world.qpos[rows, x] = 0.0
+        world.qpos[rows, z] += self.arena.height(np.zeros((len(rows), 1)), rows)[:, 0]
+        world.qvel[rows[:, None], self.pose_dof] = rates
+        world.forward(rows)
+        lift = self._penetration(rows) + CLEARANCE
+        lifted = rows[lift > 0]
+        if len(lifted):
+            world.qpos[lifted, z] += lift[lift > 0]
+            world.forward(lifted)
 
     def ground(self, row: int, x: np.ndarray) -> np.ndarray:
         """Heights of the ground of one simulation at x (k,), m."""
         return self.arena.height(x[None], slice(row, row + 1))[0]
 
-    def _penetration(self, row: int) -> float:
-        """How deep the lowest of the links' bounding boxes reaches below the ground, m."""
-        centre = self._world.geom_xpos[row, self._geoms]
-        matrix = self._world.geom_xmat[row, self._geoms].reshape(-1, 3, 3)
-        extent = (np.abs(matrix) * self._world.models[row].geom_size[self._geoms, None]).sum(2)
-        x = centre[:, 0] + extent[:, 0] * np.array([[-1], [0], [1]])
-        ground = self.ground(row, x.ravel()).reshape(x.shape)
-        return float(np.max(ground - (centre[:, 2] - extent[:, 2])))
+    def _penetration(self, rows: np.ndarray) -> np.ndarray:
+        """How deep the lowest of the links' bounding boxes reaches below the ground, m, (rows,)."""
+        cells = rows[:, None], self._geoms
+        centre = self._world.geom_xpos[cells]
+        matrix = self._world.geom_xmat[cells].reshape(*centre.shape[:2], 3, 3)
+        half_size = self._world.models[0].geom_size[self._geoms]
+        extent = (np.abs(matrix) * half_size[:, None]).sum(3)
+        x = centre[:, :, 0] + extent[:, :, 0] * np.array([[[-1]], [[0]], [[1]]])
+        x = x.swapaxes(0, 1).reshape(len(rows), -1)
+        ground = self.arena.height(x, rows).reshape(len(rows), 3, -1)
+        lowest = (centre[:, :, 2] - extent[:, :, 2])[:, None]
+        return (ground - lowest).max((1, 2))

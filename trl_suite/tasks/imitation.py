@@ -7,6 +7,7 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -179,56 +180,51 @@ class Imitation(Task):
         self._cycles = np.zeros(n)  # time on the clip in periods: the phase, not wrapped
         self._comparison = np.zeros((n, len(self._weights)))
         self._errors = np.zeros((n, 1, len(parts)))
-        self._all = self._views(slice(None))
+        self._all = self._views()
 
-    def _views(self, rows: slice) -> SimpleNamespace:
-        """The parts of all arrays that one observation of some rows reads and writes."""
-        compared = self._comparison[rows]
-        part = {name: compared[:, columns] for name, columns in self._compared.items()}
+    def _views(self) -> SimpleNamespace:
+        """The parts of all arrays that an observation reads and writes."""
+        part = {name: self._comparison[:, columns] for name, columns in self._compared.items()}
         view = self.figure.views(
-            rows, self.observation, self.blocks, part['effectors'], part['com_velocity']
+            self.observation, self.blocks, part['effectors'], part['com_velocity']
         )
-        out = self.observation[rows]
-        block = {name: out[:, columns] for name, columns in self.blocks.items()}
-        view.compared = compared
+        block = {name: self.observation[:, columns] for name, columns in self.blocks.items()}
         view.angles_out, view.rates_out = part['angles'], part['rates']
         view.height_out = part['height']
-        view.errors = self._errors[rows]
-        view.reward_terms = self.reward_terms[rows]
-        view.tendons = self.world.ten_length[rows]
-        view.phase, view.phase_column = self.phase[rows], self.phase[rows, None]
+        view.phase_column = self.phase[:, None]
         view.strain, view.target = block.get('strain'), block.get('target')
         view.phase_out = block.get('phase')
         return view
 
-    def begin_episode(self, row: int, seed: np.random.SeedSequence) -> None:
-        terrain_seed, start_seed = seed.spawn(2)
-        phase = self._start_phase
-        if phase is None:
-            phase = np.random.default_rng(start_seed).uniform()
-        upstream = {}
-        if self._spawn == 'upstream':
-            # Where the original's segments meet; it builds them before it moves the root to x = 0.
-            start = self.clip.pose(np.array([phase * self.reference.period]))[0]
-            upstream['centre'] = start[0] - 0.5
-        strip = Strip(
-            self.arena.terrain, terrain_seed, blend=self._blend, spawn=self._spawn, **upstream
-        )
-        self.arena.begin_episode(row, strip)
-        self.phase[row] = self._cycles[row] = self._start_cycles[row] = phase
-        self.figure.place(row, *self.reference.state(phase))
-        self.failed[row] = self.diverged[row] = False
-        self.reward[row] = 0.0
-        self._observe(self._all if self.world.n == 1 else self._views(slice(row, row + 1)))
+    def begin_episodes(self, rows: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+        for row, seed in zip(rows.tolist(), seeds, strict=True):
+            terrain_seed, start_seed = seed.spawn(2)
+            phase = self._start_phase
+            if phase is None:
+                phase = np.random.default_rng(start_seed).uniform()
+            self.phase[row] = phase
+            upstream = {}
+            if self._spawn == 'upstream':
+                # Where the original's segments meet: it builds them before it moves the root to 0.
+                start = self.clip.pose(np.array([phase * self.reference.period]))[0]
+                upstream['centre'] = start[0] - 0.5
+            strip = Strip(
+                self.arena.terrain, terrain_seed, blend=self._blend, spawn=self._spawn, **upstream
+            )
+            self.arena.begin_episode(row, strip)
+        self._cycles[rows] = self._start_cycles[rows] = self.phase[rows]
+        self.figure.place(rows, *self.reference.state(self.phase[rows]))
+        self.failed[rows] = self.diverged[rows] = False
+        self.reward[rows] = 0.0
 
     def act(self, action: np.ndarray) -> None:
         self.world.ctrl[:, self._controls] = self.action_map.control(action)
         # Ground ahead is laid before the physics, so that its pictures are current after it.
         self.arena.follow(self._all.x)
 
-    def finish_step(self) -> None:
+    def finish_step(self, stepped: np.ndarray | None = None) -> None:
         v = self._all
-        self._cycles += self._phase_step
+        self._cycles += self._phase_step if stepped is None else self._phase_step * stepped
         np.remainder(self._cycles, _ONE, out=self.phase)
         # Sums of squares are the cheapest tests for what happens once in many steps.
         fast = np.vdot(v.rates, v.rates) > MAX_JOINT_SPEED**2
@@ -237,11 +233,11 @@ class Imitation(Task):
             np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
             # The last finite observation stands for what broke down.
             kept = self.observation[self.diverged]
-            self._observe(v)
+            self.observe()
             self.observation[self.diverged] = kept
         else:
             self.diverged[:] = False
-            self._observe(v)
+            self.observe()
         if np.vdot(v.fall, v.fall) > 0 or self.diverged.any():
             np.logical_or(v.fall.any(1), self.diverged, out=self.failed)
             self.reward_terms[self.failed] = 0.0
@@ -249,24 +245,24 @@ class Imitation(Task):
             self.failed[:] = False
         np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
-    def _observe(self, v: SimpleNamespace) -> None:
-        """Writes observation and reward terms of some rows from the world's state."""
+    def observe(self) -> None:
+        v = self._all
         self.figure.measure(v)
         # What the reward compares, side by side with the same features of the reference.
-        reference = self.reference.features(v.phase)
+        reference = self.reference.features(self.phase)
         v.qpos.take(self._angles, axis=1, out=v.angles_out, mode='clip')
         v.qvel.take(self._rates, axis=1, out=v.rates_out, mode='clip')
         v.height_out[...] = v.height
-        error = v.compared - reference[:, : v.compared.shape[1]]
+        error = self._comparison - reference[:, : self._comparison.shape[1]]
         if v.facing is not None:
             error[:, 0] = rewards.wrap(error[:, 0])
         error *= error
         # Row by row, so that a row's sums do not depend on how many rows there are.
-        np.matmul(error[:, None], self._weights, out=v.errors)
-        rewards.imitation(v.errors[:, 0], out=v.reward_terms)
+        np.matmul(error[:, None], self._weights, out=self._errors)
+        rewards.imitation(self._errors[:, 0], out=self.reward_terms)
 
         if v.strain is not None:
-            np.subtract(v.tendons, self._rest, out=v.strain)
+            np.subtract(self.world.ten_length, self._rest, out=v.strain)
             v.strain /= self._scale
         if v.target is not None:
             v.target[...] = reference[:, self._target_columns]

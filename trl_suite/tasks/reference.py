@@ -85,11 +85,12 @@ class Reference:
             for (name, size), stop in zip(sizes.items(), stops, strict=True)
         }
 
-    def state(self, phase: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns pose and velocity at a phase, (3 + J,) each: x = 0, z above 0, pitch, joints."""
-        found, column = self.features(np.array([phase]))[0], self.columns
-        pose = np.concatenate([[0.0], found[column['height']], found[column['angles']]])
-        return pose, np.concatenate([found[column['root_rate']], found[column['rates']]])
+    def state(self, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns poses and velocities at phases (n,): x = 0, z above 0, pitch, joints, (n, 3 + J)."""
+        found, column = self.features(phase), self.columns
+        parts = (np.zeros((len(phase), 1)), found[:, column['height']], found[:, column['angles']])
+        rates = (found[:, column['root_rate']], found[:, column['rates']])
+        return np.concatenate(parts, axis=1), np.concatenate(rates, axis=1)
 
     def features(self, phase: np.ndarray) -> np.ndarray:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import collections
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from dm_env import specs
 from trl_suite.actuation import ActionMap
 from trl_suite.world import PhysicsWorld, World
 
+_ONLY_ROW = np.zeros(1, int)
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
 
@@ -21,7 +23,7 @@ class Task(composer.Task):
     """Rules of an environment, written once over a leading axis of n simulations.
 
     A subclass owns arrays of n rows. It is driven by four methods: `bind` (a compiled world),
-    `begin_episode` (one row), `act` (all rows, before the physics) and `finish_step` (all rows,
+    `begin_episodes` (some rows), `act` (all rows, before the physics) and `finish_step` (all rows,
     after it). The composer hooks below are the case n = 1, so that a plain `composer.Environment`
     runs the task as well; a subclass whose step lasts a variable time overrides `simulate`.
 
@@ -51,16 +53,25 @@ class Task(composer.Task):
         """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
 
     @abc.abstractmethod
-    def begin_episode(self, row: int, seed: np.random.SeedSequence) -> None:
-        """Draws terrain and start of one row, and observes it."""
+    def begin_episodes(self, rows: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
+        """Draws terrain and start of some rows, each from its seed; `observe` is yet to follow."""
+
+    @abc.abstractmethod
+    def observe(self) -> None:
+        """Writes the observations of all rows from the world's state."""
 
     @abc.abstractmethod
     def act(self, action: np.ndarray) -> None:
         """Takes actions, shape (n, k), in [-1, 1]."""
 
     @abc.abstractmethod
-    def finish_step(self) -> None:
-        """Updates reward, failed and observation after the physics has advanced."""
+    def finish_step(self, stepped: np.ndarray | None = None) -> None:
+        """Updates reward, failed and observation after the physics has advanced.
+
+        Args:
+          stepped: which rows took a step, (n,) bool; the others have just begun an episode. None if
+            all did.
+        """
 
     @abc.abstractmethod
     def info(self, row: int) -> dict[str, Any]:
@@ -74,9 +85,9 @@ class Task(composer.Task):
     def set_state(self, row: int, state: dict[str, Any]) -> None:
         """Restores what `get_state` returned; the world's state is set afterwards."""
 
-    def simulate(self) -> None:
-        """Advances the physics by one control step."""
-        self.world.step(self._substeps)
+    def simulate(self, rows: np.ndarray | None = None) -> None:
+        """Advances the physics of some rows (sorted numbers), or of all, by one control step."""
+        self.world.step(self._substeps, rows)
 
     # Composer's interface: one simulation.
 
@@ -90,7 +101,8 @@ class Task(composer.Task):
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        self.begin_episode(0, episode_seed(random_state))
+        self.begin_episodes(_ONLY_ROW, [episode_seed(random_state)])
+        self.observe()
         self._begun = True
 
     def before_step(
@@ -98,7 +110,7 @@ class Task(composer.Task):
     ) -> None:
         if self._begun:
             # A plain composer.Environment leaves a reset with the actuators' velocities at zero.
-            self.world.forward(0)
+            self.world.forward(_ONLY_ROW)
             self._begun = False
         self.act(np.asarray(action, dtype=float)[None])
 

@@ -1,0 +1,293 @@
+"""Tests of determinism: seeds across processes, save and restore, pickling."""
+
+import hashlib
+import pickle
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import motion, suite
+from trl_suite.arenas import PlanarTerrain
+from trl_suite.characters import make
+from trl_suite.environment import Environment
+from trl_suite.tasks.imitation import Imitation
+from trl_suite.terrain import load
+
+EXAMPLES = (
+    'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Mixed_Terrain-v0',
+    'PD_Raptor2D_Slopes_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
+    'Torque_Dog2D_LLC_Imitate_Flat-v0', 'Vel_Biped2D_LLC_Imitate_Flat-v0',
+)  # fmt: skip
+DOG = EXAMPLES[1]
+
+
+def advance(environment, steps, seed=0, scale=1.0):
+    """Random actions; returns everything that came back as one array."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(steps):
+        step = environment.step(scale * rng.uniform(-1, 1, len(environment.action_map)))
+        reward = -1.0 if step.reward is None else step.reward
+        discount = -1.0 if step.discount is None else step.discount
+        blocks = [np.ravel(value) for value in step.observation.values()]
+        found.append(np.concatenate([[reward, discount, int(step.step_type)], *blocks]))
+    return np.array(found)
+
+
+def walked(environment, distance):
+    """Carries the character forward, so that the strip and its window have moved on."""
+    name = environment.task.character.row.name
+    while environment.info['distance'] < distance:
+        data = environment.physics.named.data
+        data.qpos[f'{name}/root_x/'] += 1.1
+        data.qpos[f'{name}/root_z/'] = 6.0
+        data.qpos[f'{name}/root_pitch/'] = 0.0
+        data.qvel[:] = 0
+        environment.physics.forward()
+        environment.step(np.zeros(len(environment.action_map)))
+    return environment
+
+
+class DeterminismTest(parameterized.TestCase):
+    """The seed decides, and nothing else does."""
+
+    SCRIPT = textwrap.dedent("""
+        import hashlib, sys
+        import numpy as np
+        from trl_suite import suite
+        for id_ in sys.argv[1:]:
+            environment = suite.make(id_, {'random': 5}, {'flat_observation': True})
+            environment.reset()
+            rng, digest = np.random.default_rng(1), hashlib.sha256()
+            for _ in range(120):
+                step = environment.step(rng.uniform(-1, 1, len(environment.action_map)))
+                digest.update(step.observation['observations'].tobytes())
+                digest.update(repr((step.reward, step.discount)).encode())
+            print(digest.hexdigest())
+    """)
+
+    def test_across_processes(self):
+        digests = [
+            subprocess.run(
+                [sys.executable, '-c', self.SCRIPT, *EXAMPLES], check=True, capture_output=True,
+                text=True, env={'PYTHONHASHSEED': seed},
+            ).stdout.split()
+            for seed in ('1', '2')
+        ]  # fmt: skip
+        self.assertLen(set(digests[0]), len(EXAMPLES))
+        self.assertEqual(digests[0], digests[1])
+        environment = suite.make(EXAMPLES[0], {'random': 5}, {'flat_observation': True})
+        environment.reset()
+        rng, digest = np.random.default_rng(1), hashlib.sha256()
+        for _ in range(120):
+            step = environment.step(rng.uniform(-1, 1, 11))
+            digest.update(step.observation['observations'].tobytes())
+            digest.update(repr((step.reward, step.discount)).encode())
+        self.assertEqual(digests[0][0], digest.hexdigest())
+
+    def test_other_environments_in_between_do_not_matter(self):
+        alone = advance(suite.make(DOG, {'random': 3}), 60)
+        mine, other = suite.make(DOG, {'random': 3}), suite.make(EXAMPLES[2], {'random': 9})
+        found = []
+        np.random.seed(123)  # noqa: NPY002
+        rng = np.random.default_rng(0)
+        for _ in range(60):
+            action = rng.uniform(-1, 1, 20)
+            step = mine.step(action)
+            found.append(step.observation['pose'])
+            other.step(rng.bit_generator.ctypes.state_address % 7 * np.zeros(18))
+        start = 3 + 50
+        np.testing.assert_array_equal(alone[:, start : start + 43], np.array(found))
+
+    def test_an_episode_does_not_depend_on_how_the_last_one_went(self):
+        episodes = []
+        for steps in (3, 40):
+            environment = suite.make(DOG, {'random': 4})
+            environment.reset()
+            advance(environment, steps, scale=0.0)
+            episodes.append([environment.reset().observation['terrain'], advance(environment, 5)])
+        np.testing.assert_array_equal(episodes[0][0], episodes[1][0])
+        np.testing.assert_array_equal(episodes[0][1], episodes[1][1])
+
+
+class SaveTest(parameterized.TestCase):
+    """Save anywhere, go on bit for bit."""
+
+    def check(self, environment, restored_into):
+        state = pickle.loads(pickle.dumps(environment.get_state()))
+        first = advance(environment, 60, seed=2, scale=0.3)
+        following = [environment.reset().observation['pose'], advance(environment, 60, seed=3)]
+        restored_into.set_state(state)
+        np.testing.assert_array_equal(advance(restored_into, 60, seed=2, scale=0.3), first)
+        np.testing.assert_array_equal(restored_into.reset().observation['pose'], following[0])
+        np.testing.assert_array_equal(advance(restored_into, 60, seed=3), following[1])
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_on_the_same_environment(self, id_):
+        environment = suite.make(id_, {'random': 6})
+        environment.reset()
+        advance(environment, 7, scale=0.3)
+        self.check(environment, environment)
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_on_a_fresh_environment(self, id_):
+        environment = suite.make(id_, {'random': 6})
+        environment.reset()
+        advance(environment, 7, scale=0.3)
+        self.check(environment, suite.make(id_, {'random': 77}))
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_on_an_environment_in_use(self, id_):
+        environment, other = suite.make(id_, {'random': 6}), suite.make(id_, {'random': 78})
+        environment.reset()
+        advance(environment, 7, scale=0.3)
+        advance(other, 33)
+        walked(other, 20)
+        self.check(environment, other)
+
+    @parameterized.parameters(*EXAMPLES[:3])
+    def test_after_the_strip_was_extended(self, id_):
+        environment = suite.make(id_, {'random': 6, 'step_limit': None})
+        environment.reset()
+        walked(environment, 47)
+        low, high = environment.task.arena.strips[0].extent
+        self.assertGreater(high, 60)
+        other = suite.make(id_, {'random': 79, 'step_limit': None})
+        self.check(environment, other)
+        self.assertLess(low, 0)
+
+    def test_at_a_reset_and_at_an_end(self):
+        environment = suite.make(DOG, {'random': 6})
+        self.check(environment, suite.make(DOG, {'random': 7}))  # before the first reset
+        environment.reset()
+        self.check(environment, suite.make(DOG, {'random': 7}))
+        for _ in range(300):
+            if environment.step(np.random.default_rng(0).uniform(-1, 1, 20)).last():
+                break
+        state = environment.get_state()
+        other = suite.make(DOG, {'random': 7})
+        other.set_state(state)
+        self.assertTrue(other.info['fell'])
+        self.assertTrue(other.step(np.zeros(20)).first())
+
+    def test_observation_info_and_steps_come_back(self):
+        environment = suite.make(DOG, {'random': 6, 'step_limit': 20})
+        environment.reset()
+        for _ in range(5):
+            step = environment.step(np.zeros(20))
+        state, info = environment.get_state(), environment.info
+        other = suite.make(DOG, {'random': 7, 'step_limit': 20})
+        other.set_state(state)
+        for name, value in other.observation().items():
+            np.testing.assert_array_equal(value, step.observation[name])
+        self.assertEqual(other.info, info)
+        lengths = []
+        for each in (environment, other):
+            count = 0
+            while not each.step(np.zeros(20)).last():
+                count += 1
+            lengths.append(count)
+        self.assertEqual(lengths[0], lengths[1])
+
+    def test_a_saved_state_is_a_copy(self):
+        environment = suite.make(DOG, {'random': 6})
+        environment.reset()
+        state = environment.get_state()
+        before = pickle.dumps(state)
+        advance(environment, 30)
+        walked(environment, 12)
+        environment.reset()
+        self.assertEqual(pickle.dumps(state), before)
+        twin = suite.make(DOG, {'random': 8})
+        twin.set_state(state)
+        advance(twin, 30)
+        twin.reset()
+        walked(twin, 12)
+        self.assertEqual(pickle.dumps(state), before)
+
+    @parameterized.parameters(
+        'PD_Raptor2D_Slopes_Mixed_Terrain-v0', 'PD_Biped2D_Gaps_Terrain-v0',
+        'MTU_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_LLC_Imitate_Flat-v0',
+    )  # fmt: skip
+    def test_a_wrong_state_is_refused(self, id_):
+        environment, other = suite.make(DOG, {'random': 0}), suite.make(id_, {'random': 0})
+        environment.reset()
+        other.reset()
+        advance(other, 3)
+        before = pickle.dumps(environment.get_state())
+        with self.assertRaises(ValueError):
+            environment.set_state(other.get_state())
+        self.assertEqual(pickle.dumps(environment.get_state()), before)  # nothing half done
+
+    def test_an_empty_state_is_refused(self):
+        with self.assertRaisesRegex(ValueError, 'world of shape'):
+            suite.make(DOG).set_state({})
+
+    def test_extra_observables_are_current_after_a_restore(self):
+        def build():
+            task = suite.build_task(suite.find(DOG))
+            task.character.observables.joints_pos.enabled = True
+            return Environment(task, random=0)
+
+        environment, other = build(), build()
+        environment.reset()
+        other.reset()
+        advance(environment, 5, scale=0.2)
+        expected = environment.observation()['dog/joints_pos']
+        other.set_state(environment.get_state())
+        np.testing.assert_array_equal(other.observation()['dog/joints_pos'], expected)
+        np.testing.assert_array_equal(advance(environment, 20), advance(other, 20))
+
+
+class PickleTest(parameterized.TestCase):
+    """An environment of the suite can be pickled in mid-episode."""
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_round_trip(self, id_):
+        environment = suite.make(id_, {'random': 6, 'time_limit': 5.0}, {'flat_observation': True})
+        environment.reset()
+        advance(environment, 5, scale=0.3)
+        data = pickle.dumps(environment)
+        self.assertLess(len(data), 300_000)
+        twin = pickle.loads(data)
+        np.testing.assert_array_equal(advance(twin, 90), advance(environment, 90))
+        np.testing.assert_array_equal(
+            twin.reset().observation['observations'],
+            environment.reset().observation['observations'],
+        )
+
+    def test_built_environments(self):
+        environment = suite.build(
+            'goat', 'position', {'Type': 'var2d_gaps', 'Params': [{'GapWMin': 0.3, 'GapWMax': 0.4}]},
+            clip=motion.load('dog_bound'), task_kwargs={'random': 1, 'terrain_samples': 20},
+        )  # fmt: skip
+        environment.reset()
+        advance(environment, 4, scale=0.2)
+        twin = pickle.loads(pickle.dumps(environment))
+        self.assertEqual(twin.blocks, environment.blocks)
+        np.testing.assert_array_equal(advance(twin, 60), advance(environment, 60))
+
+    def test_a_generator_given_as_the_seed(self):
+        environment = suite.make(DOG, {'random': np.random.RandomState(3)})
+        environment.reset()
+        advance(environment, 4)
+        twin = pickle.loads(pickle.dumps(environment))
+        np.testing.assert_array_equal(advance(twin, 90), advance(environment, 90))
+
+    def test_before_the_first_reset(self):
+        environment = suite.make(DOG, {'random': 3})
+        twin = pickle.loads(pickle.dumps(environment))
+        np.testing.assert_array_equal(advance(twin, 30), advance(environment, 30))
+
+    def test_one_that_nothing_can_build_again(self):
+        task = Imitation(
+            make('biped2d'), PlanarTerrain(load('flat')), motion.load('biped2d_walk')
+        )
+        with self.assertRaisesRegex(TypeError, r'get_state\(\)'):
+            pickle.dumps(Environment(task))
+
+
+if __name__ == '__main__':
+    absltest.main()
