@@ -1,6 +1,7 @@
 """Tests of determinism: seeds across processes, save and restore, pickling."""
 
 import hashlib
+import os
 import pickle
 import subprocess
 import sys
@@ -72,7 +73,7 @@ class DeterminismTest(parameterized.TestCase):
         digests = [
             subprocess.run(
                 [sys.executable, '-c', self.SCRIPT, *EXAMPLES], check=True, capture_output=True,
-                text=True, env={'PYTHONHASHSEED': seed},
+                text=True, env={**os.environ, 'PYTHONHASHSEED': seed},
             ).stdout.split()
             for seed in ('1', '2')
         ]  # fmt: skip
@@ -103,10 +104,10 @@ class DeterminismTest(parameterized.TestCase):
 
     def test_an_episode_does_not_depend_on_how_the_last_one_went(self):
         episodes = []
-        for steps in (3, 40):
+        for steps in (2, 6):
             environment = suite.make(DOG, {'random': 4})
             environment.reset()
-            advance(environment, steps, scale=0.0)
+            self.assertFalse(np.isin(advance(environment, steps, scale=0.0)[:, 2], (0, 2)).any())
             episodes.append([environment.reset().observation['terrain'], advance(environment, 5)])
         np.testing.assert_array_equal(episodes[0][0], episodes[1][0])
         np.testing.assert_array_equal(episodes[0][1], episodes[1][1])
@@ -209,7 +210,7 @@ class SaveTest(parameterized.TestCase):
 
     @parameterized.parameters(
         'PD_Raptor2D_Slopes_Mixed_Terrain-v0', 'PD_Biped2D_Gaps_Terrain-v0',
-        'MTU_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_LLC_Imitate_Flat-v0',
+        'MTU_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Gaps_Terrain-v0',
     )  # fmt: skip
     def test_a_wrong_state_is_refused(self, id_):
         environment, other = suite.make(DOG, {'random': 0}), suite.make(id_, {'random': 0})
@@ -217,12 +218,12 @@ class SaveTest(parameterized.TestCase):
         other.reset()
         advance(other, 3)
         before = pickle.dumps(environment.get_state())
-        with self.assertRaises(ValueError):
+        with self.assertRaisesRegex(ValueError, 'state'):
             environment.set_state(other.get_state())
         self.assertEqual(pickle.dumps(environment.get_state()), before)  # nothing half done
 
     def test_an_empty_state_is_refused(self):
-        with self.assertRaisesRegex(ValueError, 'world of shape'):
+        with self.assertRaisesRegex(ValueError, 'state'):
             suite.make(DOG).set_state({})
 
     def test_extra_observables_are_current_after_a_restore(self):

@@ -193,8 +193,14 @@ class Environment(composer.Environment):
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in the last step beyond the time step: see the task's `info`."""
-        return self._task.info(0)
+        """What happened in the last step beyond the time step: see the task's `infos`."""
+
+        def only_row(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: only_row(part) for name, part in value.items()}
+            return value[0].item()
+
+        return only_row(self._task.infos())
 
     # State.
 
@@ -205,6 +211,7 @@ class Environment(composer.Environment):
         in the same way.
         """
         return {
+            'made_for': self._task.signature,
             'world': self._task.world.get_state(0),
             'task': self._task.get_state(0),
             'random': self._random_state.get_state(),
@@ -216,14 +223,11 @@ class Environment(composer.Environment):
         """Restores what `get_state` returned; the future then repeats bit for bit.
 
         Raises:
-          ValueError: the state belongs to another environment.
+          ValueError: the state belongs to another environment; this one is left as it was.
         """
-        expected = self._task.world.get_state(0).shape
-        found = np.shape(state.get('world', ()))
+        expected, found = self._task.signature, state.get('made_for')
         if found != expected:
-            raise ValueError(
-                f'the state has a world of shape {found}; this environment needs {expected}'
-            )
+            raise ValueError(f'the state belongs to {found}; this environment is {expected}')
         self._task.set_state(0, state['task'])
         self._task.world.set_state(0, state['world'])
         self._random_state.set_state(state['random'])

@@ -143,6 +143,11 @@ class Imitation(Task):
     def root_entity(self) -> PlanarTerrain:
         return self.arena
 
+    @property
+    def signature(self) -> str:
+        parts = self.character.row.name, self.arena.terrain.name, self.clip.name
+        return f'{super().signature} of {" / ".join(parts)}'
+
     def bind(self, world: World) -> None:
         self.world = world
         figure, row = self.figure, self.character.row
@@ -270,14 +275,15 @@ class Imitation(Task):
             v.phase_out[...] = reference[:, self._phase_columns]
             v.phase_out[:, :1] = v.phase_column
 
-    def info(self, row: int) -> dict[str, Any]:
+    def infos(self) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
-        terms = zip(rewards.IMITATION_TERMS, self.reward_terms[row], strict=True)
         return {
-            'reward_terms': {name: float(value) for name, value in terms},
-            'fell': bool(self.failed[row] and not self.diverged[row]),
-            'diverged': bool(self.diverged[row]),
-            'distance': float(self._all.x[row, 0]),
+            'reward_terms': dict(
+                zip(rewards.IMITATION_TERMS, self.reward_terms.T.copy(), strict=True)
+            ),
+            'fell': self.failed & ~self.diverged,
+            'diverged': self.diverged.copy(),
+            'distance': self._all.x[:, 0].copy(),
         }
 
     def clip_action(self, row: int) -> np.ndarray:

@@ -74,8 +74,8 @@ class Task(composer.Task):
         """
 
     @abc.abstractmethod
-    def info(self, row: int) -> dict[str, Any]:
-        """What happened to one row, beyond observation and reward."""
+    def infos(self) -> dict[str, Any]:
+        """What happened beyond observation and reward: arrays of n rows, or dicts of such."""
 
     @abc.abstractmethod
     def get_state(self, row: int) -> dict[str, Any]:
@@ -84,6 +84,13 @@ class Task(composer.Task):
     @abc.abstractmethod
     def set_state(self, row: int, state: dict[str, Any]) -> None:
         """Restores what `get_state` returned; the world's state is set afterwards."""
+
+    @property
+    def signature(self) -> str:
+        """Which task this is, for people and to tell whose a saved state is."""
+        blocks = ', '.join(f'{name} {part.stop - part.start}' for name, part in self.blocks.items())
+        steps = f'{self._substeps} x {self.physics_timestep:.6g} s'
+        return f'{type(self).__name__} by {self.action_map.quantity} ({blocks}; {steps})'
 
     def simulate(self, rows: np.ndarray | None = None) -> None:
         """Advances the physics of some rows (sorted numbers), or of all, by one control step."""

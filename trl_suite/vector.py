@@ -1,0 +1,308 @@
+"""Many simulations of one environment on threads, each on a terrain of its own, as arrays.
+
+    environments = VectorEnvironment('PD_Biped2D_Gaps_Terrain-v0', num_envs=64, seed=1)
+    observation = environments.reset()
+    step = environments.step(actions)  # (64, 11) in [-1, 1]
+
+Row i behaves, bit for bit, as the single environment whose seed is `environments.seeds[i]`,
+whatever the number of rows and threads, and whenever rows are reset.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from trl_suite import errors, suite
+from trl_suite.catalogue import Row
+from trl_suite.environment import Environment
+from trl_suite.tasks.task import episode_seed
+from trl_suite.world import BatchWorld, light_model
+
+AUTORESET = ('next_step', 'same_step', 'disabled')
+
+
+class Step(NamedTuple):
+    """What one step of all rows returned.
+
+    Attributes:
+      observation: (n, size), or a dict of blocks (n, ...) in order.
+      reward: (n,).
+      terminated: rows that failed, (n,) bool.
+      truncated: rows that were cut by the step limit, (n,) bool.
+      info: arrays of n rows: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), and with
+        autoreset 'same_step' 'final_observation' where 'ended' says so.
+    """
+
+    observation: Any
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    info: dict[str, Any]
+
+
+class VectorEnvironment:
+    """n simulations of one environment.
+
+    Autoreset is what Gymnasium 1 calls so. With 'next_step' a row that has ended ignores its action
+    in the next step and returns the first observation of a new episode with reward 0. With
+    'same_step' it begins anew in the step in which it ended; the observation is then the new
+    episode's, and the last one is in `info['final_observation']`. With 'disabled' the caller resets
+    rows; stepping an ended row raises.
+
+    Attributes:
+      num_envs: number of rows n.
+      seeds: seed of each row, (n,) uint32.
+      blocks: where each observation block lies in the flat vector.
+      action_map: what actions mean.
+    """
+
+    def __init__(
+        self,
+        environment: str | Row,
+        num_envs: int,
+        num_threads: int = 0,
+        seed: int | Sequence[int] | None = None,
+        *,
+        autoreset: str = 'next_step',
+        dtype: DTypeLike = np.float64,
+        flat_observation: bool = True,
+        step_limit: int | None = -1,
+        task_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Compiles one light model and makes n simulations of it.
+
+        Args:
+          environment: id, alias, or row of the catalogue.
+          num_envs: number of rows.
+          num_threads: threads that step the physics; 0 takes all cores.
+          seed: of the whole: row i gets the i-th number that
+            `numpy.random.SeedSequence(seed).generate_state(n)` gives. Or a sequence of n seeds, one
+            per row. Drawn from the system if None.
+          autoreset: one of `AUTORESET`.
+          dtype: of observations and rewards, float64 or float32.
+          flat_observation: give one array of all blocks side by side, else a dict of blocks.
+          step_limit: control steps after which an episode is cut; by default the row's own.
+          task_kwargs: options of the task, as for `suite.load`.
+
+        Raises:
+          ValueError: unknown names or options, or numbers out of range.
+        """
+        if int(num_envs) != num_envs or num_envs < 1:
+            raise ValueError(f'num_envs is {num_envs}; expected a positive integer')
+        if int(num_threads) != num_threads or num_threads < 0:
+            raise ValueError(f'num_threads is {num_threads}; expected 0 or a positive integer')
+        if autoreset not in AUTORESET:
+            raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
+        if np.dtype(dtype) not in (np.dtype(np.float64), np.dtype(np.float32)):
+            raise ValueError(f'dtype is {np.dtype(dtype)}; expected float64 or float32')
+        self.row = suite.find(environment) if isinstance(environment, str) else environment
+        self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
+        self.flat_observation = flat_observation
+        self.step_limit = self.row.step_limit if step_limit == -1 else step_limit
+        self._task_kwargs = dict(task_kwargs or {})
+        self._num_threads = int(num_threads)
+        self._task = suite.build_task(self.row, self._task_kwargs)
+        model = light_model(self._task.root_entity.mjcf_model)
+        self._world: BatchWorld | None = BatchWorld(model, self.num_envs, self._num_threads)
+        self._task.bind(self._world)
+        self._pid = os.getpid()
+        self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
+        self._steps = np.zeros(self.num_envs, int)
+        self._ended = np.ones(self.num_envs, bool)  # rows that need a reset
+        self._fresh = True  # whether no row was ever reset
+        self._picture: Environment | None = None
+        self.seed(seed)
+
+    def seed(self, seed: int | Sequence[int] | None) -> None:
+        """Gives every row a new stream of random numbers, from which its next reset draws."""
+        if seed is None or np.ndim(seed) == 0:
+            sequence = np.random.SeedSequence(seed)  # type: ignore[arg-type]
+            self.seeds = sequence.generate_state(self.num_envs, np.uint32)
+        else:
+            seeds = np.asarray(seed)
+            if seeds.shape != (self.num_envs,):
+                raise ValueError(f'{seeds.size} seeds for {self.num_envs} rows')
+            if (seeds < 0).any() or (seeds >= 2**32).any():
+                raise ValueError('seeds must lie in [0, 2**32)')
+            self.seeds = seeds.astype(np.uint32)
+        self._random = [np.random.RandomState(int(value)) for value in self.seeds]
+
+    def reset(
+        self,
+        rows: np.ndarray | Sequence[int] | None = None,
+        seed: int | Sequence[int] | None = None,
+    ) -> Any:
+        """Begins an episode in some rows, or in all, without touching the others.
+
+        Args:
+          rows: numbers of rows, or a mask (n,) bool; None for all.
+          seed: also seed all rows anew, as the constructor does.
+
+        Returns:
+          The observations of all rows.
+        """
+        self._check_usable()
+        if seed is not None:
+            self.seed(seed)
+        numbers = self._numbers(rows)
+        if self._fresh and len(numbers) < self.num_envs:
+            raise ValueError('the first reset must be of all rows')
+        self._fresh = False
+        self._begin(numbers)
+        self._task.observe()
+        return self._observation()
+
+    def step(self, action: np.ndarray) -> Step:
+        """Takes one step in every row.
+
+        Args:
+          action: (n, k) in [-1, 1], clipped there.
+
+        Raises:
+          ValueError: an action of another shape, or with NaN or infinity; the row is named.
+          RuntimeError: before the first reset, after `close`, in a forked process, or with autoreset
+            'disabled' for a row that has ended.
+        """
+        self._check_usable()
+        if self._fresh:
+            raise RuntimeError('step before the first reset')
+        action = self._checked(action)
+        task, ended = self._task, self._ended
+        resetting = np.flatnonzero(ended)
+        stepped = None
+        if len(resetting):
+            if self.autoreset == 'disabled':
+                raise RuntimeError(
+                    f'row {resetting[0]} has ended; reset it, or choose another autoreset'
+                )
+            stepped = ~ended
+            self._begin(resetting)
+        task.act(action)
+        task.simulate(None if stepped is None else np.flatnonzero(stepped))
+        self._steps += 1 if stepped is None else stepped
+        task.finish_step(stepped)
+        if stepped is not None:
+            task.reward[resetting] = 0.0
+            task.failed[resetting] = task.diverged[resetting] = False
+        terminated = task.failed.copy()
+        truncated = np.zeros(self.num_envs, bool)
+        if self.step_limit is not None:
+            truncated = (self._steps >= self.step_limit) & ~terminated
+        self._ended = terminated | truncated
+        reward, info = task.reward.astype(self.dtype), task.infos()
+        if self.autoreset == 'same_step':
+            info['ended'] = self._ended
+            if self._ended.any():
+                info['final_observation'] = self._observation()
+                self._begin(np.flatnonzero(self._ended))
+                task.observe()
+        return Step(self._observation(), reward, terminated, truncated, info)
+
+    def render(self, row: int = 0, **options: Any) -> np.ndarray:
+        """Draws one row; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
+        from trl_suite import rendering
+
+        self._check_usable()
+        assert self._world is not None
+        if self._picture is None:  # the batch's models have no pictures in them
+            self._picture = suite.build_row(self.row, self._task_kwargs, {})
+            self._picture.reset()
+        self._picture.task.set_state(0, self._task.get_state(row))
+        self._picture.task.world.set_state(0, self._world.get_state(row))
+        return rendering.frame(self._picture, **options)
+
+    def close(self) -> None:
+        """Frees the simulations; may be called twice."""
+        self._world = None
+        self._task = None  # type: ignore[assignment]
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns everything that the future of all rows depends on."""
+        self._check_usable()
+        assert self._world is not None
+        rows = range(self.num_envs)
+        return {
+            'world': [self._world.get_state(row) for row in rows],
+            'task': [self._task.get_state(row) for row in rows],
+            'random': [random.get_state() for random in self._random],
+            'seeds': self.seeds.copy(),
+            'steps': self._steps.copy(),
+            'ended': self._ended.copy(),
+            'fresh': self._fresh,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_state` of an environment of the same row and size returned."""
+        self._check_usable()
+        assert self._world is not None
+        if len(state['world']) != self.num_envs:
+            raise ValueError(f'the state has {len(state["world"])} rows; expected {self.num_envs}')
+        for row in range(self.num_envs):
+            self._task.set_state(row, state['task'][row])
+            self._world.set_state(row, state['world'][row])
+            self._random[row].set_state(state['random'][row])
+        self.seeds, self._fresh = state['seeds'].copy(), state['fresh']
+        self._steps, self._ended = state['steps'].copy(), state['ended'].copy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError(
+            'a live batch cannot be pickled; pickle what made it (id, num_envs, seed) and '
+            'get_state(), and build it again where it is needed'
+        )
+
+    def _begin(self, rows: np.ndarray) -> None:
+        self._task.begin_episodes(rows, [episode_seed(self._random[row]) for row in rows.tolist()])
+        self._steps[rows] = 0
+        self._ended[rows] = False
+
+    def _observation(self) -> Any:
+        flat = self._task.observation.astype(self.dtype)
+        if self.flat_observation:
+            return flat
+        return {name: flat[:, part] for name, part in self.blocks.items()}
+
+    def _numbers(self, rows: np.ndarray | Sequence[int] | None) -> np.ndarray:
+        if rows is None:
+            return np.arange(self.num_envs)
+        rows = np.asarray(rows)
+        if rows.dtype == bool:
+            if rows.shape != (self.num_envs,):
+                raise ValueError(f'a mask of shape {rows.shape}; expected ({self.num_envs},)')
+            return np.flatnonzero(rows)
+        numbers = np.unique(rows.astype(int))
+        if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < self.num_envs):
+            raise ValueError(f'rows {rows.tolist()} of an environment of {self.num_envs} rows')
+        return numbers
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        shape = (self.num_envs, len(self.action_map))
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'actions are not an array of numbers: {error}') from None
+        if action.shape != shape:
+            raise ValueError(f'actions have shape {action.shape}; expected {shape}')
+        if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
+            row, i = np.argwhere(~np.isfinite(action))[0]
+            raise ValueError(
+                f'action of row {row}, number {i} ({self.action_map.names[i]}) is {action[row, i]}; '
+                'expected finite numbers'
+            )
+        return action
+
+    def _check_usable(self) -> None:
+        if self._world is None:
+            raise RuntimeError('the environment is closed')
+        if os.getpid() != self._pid:
+            raise RuntimeError(
+                'a vector environment does not survive a fork: its threads stay in the parent. Make '
+                "it in the child, or start processes with multiprocessing's 'spawn'"
+            )
