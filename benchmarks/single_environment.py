@@ -2,11 +2,13 @@
 
     python benchmarks/single_environment.py [--steps N] [--json FILE]
 
-An environment is driven by random actions; every `step` call is timed, resets are not. Then the
+An environment is driven by an action sequence; every `step` call is timed, resets are not. Then the
 same model is put into the same start states and driven with the same controls by raw `mj_step`,
 with as many substeps. The ratio raw time / environment time is 1 if the environment costs nothing
-but physics. dm_control's own suite walker is measured in the same way. Blocks of both alternate, so
-that a drifting machine does not tilt the ratio; the median over blocks is printed.
+but physics. Two workloads: random actions (a character that flails in the air half of the time: the
+cheapest physics there is) and the action 0 (a character held in its mean pose until it has fallen,
+in contact throughout). dm_control's own suite walker is measured in the same way. Blocks of all
+cases alternate, so that a drifting machine does not tilt the ratios; medians over blocks.
 """
 
 import argparse
@@ -16,16 +18,17 @@ import time
 
 import mujoco
 import numpy as np
-from dm_control import suite as dm_suite
 
-from trl_suite import suite
+from trl_suite import suite  # isort: skip  (before dm_control: it chooses how to render)
+from dm_control import suite as dm_suite
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 BLOCK = 200  # control steps
+WORKLOADS = {'random actions': 1.0, 'action 0': 0.0}
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-def block(environment, substeps, random, steps):
+def block(environment, substeps, scale, random, steps):
     """Times one block; returns (environment seconds, raw seconds, reset seconds per reset)."""
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     size = mujoco.mj_stateSize(model, STATE)
@@ -41,7 +44,7 @@ def block(environment, substeps, random, steps):
             mujoco.mj_getState(model, data, state, STATE)
             # A fresh model copy per episode: its terrain is part of what raw MuJoCo simulates.
             episodes.append((taken, state, mujoco.MjModel.__copy__(model)))
-        action = random.uniform(spec.minimum, spec.maximum, spec.shape)
+        action = scale * random.uniform(spec.minimum, spec.maximum, spec.shape)
         begin = time.perf_counter()
         time_step = environment.step(action)
         spent += time.perf_counter() - begin
@@ -66,8 +69,9 @@ def measure(cases, blocks):
     """Runs alternating blocks; returns per case (ratio, control steps per second, reset ms)."""
     found = {name: ([], [], []) for name in cases}
     for i in range(blocks + 1):
-        for name, (environment, substeps) in cases.items():
-            spent, raw, resets = block(environment, substeps, np.random.default_rng(i), BLOCK)
+        for name, (environment, substeps, scale) in cases.items():
+            random = np.random.default_rng(i)
+            spent, raw, resets = block(environment, substeps, scale, random, BLOCK)
             if i:  # the first block warms up
                 found[name][0].append(raw / spent)
                 found[name][1].append(BLOCK / spent)
@@ -90,9 +94,11 @@ def main():
     cases = {}
     for substeps in (10, 20):
         environment = suite.make(ID, task_kwargs={'random': 0, 'substeps': substeps})
-        cases[f'{ID}, {substeps} substeps'] = (environment, substeps)
+        for workload, scale in WORKLOADS.items():
+            cases[f'{ID}, {substeps} substeps, {workload}'] = (environment, substeps, scale)
     walker = dm_suite.load('walker', 'walk', task_kwargs={'random': 0})
-    cases['dm_control suite walker-walk, 10 substeps'] = (walker, 10)
+    for workload, scale in WORKLOADS.items():
+        cases[f'dm_control suite walker-walk, 10 substeps, {workload}'] = (walker, 10, scale)
     figures = measure(cases, max(1, arguments.steps // BLOCK))
     for name, row in figures.items():
         print(name, *(f'{key}: {value}' for key, value in row.items()), sep='\n    ')

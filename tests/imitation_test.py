@@ -199,7 +199,9 @@ class ObservationTest(parameterized.TestCase):
     def test_target_belongs_to_the_reset_as_well(self):
         environment, step = started('PD_Biped2D_LLC_Imitate_Flat-v0')
         probe = Reference(environment).at(float(environment.task.phase[0]))
-        np.testing.assert_allclose(step.observation['target'][:15], probe.blocks()['pose'], atol=1e-4)
+        np.testing.assert_allclose(
+            step.observation['target'][:15], probe.blocks()['pose'], atol=1e-4
+        )
 
     def test_breakdown_of_the_documented_rows(self):
         blocks = suite.make('PD_Biped2D_Gaps_Terrain-v0').blocks

@@ -283,9 +283,7 @@ class PickleTest(parameterized.TestCase):
         np.testing.assert_array_equal(advance(twin, 30), advance(environment, 30))
 
     def test_one_that_nothing_can_build_again(self):
-        task = Imitation(
-            make('biped2d'), PlanarTerrain(load('flat')), motion.load('biped2d_walk')
-        )
+        task = Imitation(make('biped2d'), PlanarTerrain(load('flat')), motion.load('biped2d_walk'))
         with self.assertRaisesRegex(TypeError, r'get_state\(\)'):
             pickle.dumps(Environment(task))
 

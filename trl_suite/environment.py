@@ -72,6 +72,10 @@ class Environment(composer.Environment):
         )
         # The constructor has compiled already; composer would do it again at the first reset.
         self._mjcf_never_compiled = False
+        # Whether anything but the task has hooks around a step; asking them each time takes longer.
+        self._hooked = bool(
+            self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
+        )
         for name in _SUBSTEP_HOOKS:
             hook = getattr(self._hooks, f'_{name}')
             overridden = getattr(type(task), name) is not getattr(composer.Task, name)
@@ -82,6 +86,7 @@ class Environment(composer.Environment):
         if hook_name in _SUBSTEP_HOOKS:
             raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
         super().add_extra_hook(hook_name, hook_callable)
+        self._hooked = True
 
     def _make_observation_updater(self) -> composer_observation.Updater:
         # One substep: the updater must see a control step as a single update.
@@ -115,9 +120,15 @@ class Environment(composer.Environment):
         task, physics = self._task, self._physics_proxy
         if self._extra_observables:
             self._observation_updater.prepare_for_next_control_step()
-        self._hooks.before_step(physics, action, self._random_state)
+        if self._hooked:
+            self._hooks.before_step(physics, action, self._random_state)
+        else:
+            task.before_step(physics, action, self._random_state)
         task.simulate()
-        self._hooks.after_step(physics, self._random_state)
+        if self._hooked:
+            self._hooks.after_step(physics, self._random_state)
+        else:
+            task.after_step(physics, self._random_state)
         self._steps += 1
         if self._extra_observables:
             self._observation_updater.update()

@@ -105,7 +105,8 @@ class World:
     def joint_addresses(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """Returns the addresses of one-dimensional joints in qpos and in qvel."""
         ids = self._ids(mujoco.mjtObj.mjOBJ_JOINT, names)
-        return self._model.jnt_qposadr[ids], self._model.jnt_dofadr[ids]
+        # As numpy's own index type: it need not be cast in every step.
+        return self._model.jnt_qposadr[ids].astype(int), self._model.jnt_dofadr[ids].astype(int)
 
     def sensor_addresses(self, names: Sequence[str]) -> np.ndarray:
         """Returns the addresses of one-dimensional sensors in sensordata."""

@@ -146,30 +146,30 @@ class PlanarFigure:
         v.facing = None
         if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2:
             v.facing = np.where(np.cos(v.pitch) < 0, -1.0, 1.0)
-        v.xipos.take(self._xz, axis=1, out=v.position, mode='clip')
-        v.position -= v.qpos.take(self._root_xz, axis=1)
+        v.xipos.take(self._xz, 1, v.position, 'clip')
+        v.position -= v.qpos.take(self._root_xz, 1)
         # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
-        v.cvel.take(self._linear, axis=1, out=v.velocity, mode='clip')
-        turning = v.xipos.take(self._zx, axis=1)
-        turning -= v.com.take(self._com_zx, axis=1)
-        turning *= v.cvel.take(self._spin, axis=1)
+        v.cvel.take(self._linear, 1, v.velocity, 'clip')
+        turning = v.xipos.take(self._zx, 1)
+        turning -= v.com.take(self._com_zx, 1)
+        turning *= v.cvel.take(self._spin, 1)
         turning *= self._cross
         v.velocity += turning
         # Row by row, so that a row's sum does not depend on how many rows there are.
         np.matmul(v.velocity[:, None], self._share, out=v.com_velocity)
 
         samples = len(self._samples) - 1
-        v.xpos.take(self._effector_xz, axis=1, out=v.effectors, mode='clip')
+        v.xpos.take(self._effector_xz, 1, v.effectors, 'clip')
         v.sample_x[...] = v.x
         v.sample_x += v.offsets if v.facing is None else v.offsets * v.facing
         v.effector_ground_x[...] = v.effector_x
         ground = self.arena.height(self._ground_x)
-        v.height[...] = v.z
-        v.height -= ground[:, samples : samples + 1]
+        under_root = ground[:, samples : samples + 1]
+        np.subtract(v.z, under_root, v.height)
         if samples:
-            v.under[...] = ground[:, samples : samples + 1]
+            v.under[...] = under_root
             np.subtract(ground[:, :samples], v.under, out=v.terrain)
-        v.effector_x -= v.com.take(self._com_x, axis=1)
+        v.effector_x -= v.com.take(self._com_x, 1)
         v.effector_z -= ground[:, samples + 1 :]
 
         if v.facing is not None:

@@ -21,7 +21,7 @@ class Reference:
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
       root_rate (2,) velocity of the root in x and z, m/s;
-      quarter (bins,) one-hot of the part of the cycle that the phase lies in.
+      phase itself; quarter (bins,) one-hot of the part of the cycle that the phase lies in.
     """
 
     def __init__(
@@ -70,9 +70,12 @@ class Reference:
             )  # fmt: skip
         table = np.array(rows)
         quarter = np.repeat(np.eye(bins), SAMPLES // bins, axis=0)
-        constant = np.zeros((SAMPLES, 1 + bins))
-        self._table = np.concatenate([table[:-1], np.zeros((SAMPLES, 1)), quarter], axis=1)
-        self._steps = np.concatenate([np.diff(table, axis=0), constant], axis=1)
+        phase = np.arange(SAMPLES)[:, None] / SAMPLES
+        self._table = np.concatenate([table[:-1], phase, quarter], axis=1)
+        self._steps = np.concatenate(
+            [np.diff(table, axis=0), np.full_like(phase, 1 / SAMPLES), np.zeros_like(quarter)],
+            axis=1,
+        )
         joints, bodies = len(links) - 1, 2 * len(links)
         sizes = {
             'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
@@ -96,13 +99,13 @@ class Reference:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
         u = phase * _SAMPLES
         sample = np.floor(u)
-        u -= sample
+        u = u - sample  # not in place: slower for a single number
         index = sample.astype(np.int64)
-        found = self._steps.take(index, axis=0)
+        found = self._steps.take(index, 0)
         blend = np.empty_like(found)
         blend[...] = u[:, None]  # packed: quicker than broadcasting
         found *= blend
-        found += self._table.take(index, axis=0)
+        found += self._table.take(index, 0)
         return found
 
 

@@ -1,0 +1,194 @@
+"""Tests of the package: pins, what importing costs, and a wheel far from the checkout."""
+
+import os
+import pathlib
+import re
+import shutil
+import site
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import textwrap
+
+from absl.testing import absltest
+
+CHECKOUT = pathlib.Path(__file__).resolve().parents[1]
+
+
+def python(code, executable=sys.executable, cwd=None, **variables):
+    """Runs code in a fresh interpreter; returns what it printed."""
+    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONPATH'}
+    done = subprocess.run(
+        [str(executable), '-c', textwrap.dedent(code)], capture_output=True, text=True, cwd=cwd,
+        env={**environment, **variables}, timeout=300,
+    )  # fmt: skip
+    if done.returncode:
+        raise AssertionError(done.stderr)
+    return done.stdout, done.stderr
+
+
+class PinTest(absltest.TestCase):
+    """Requirements of an installation."""
+
+    def test_engine_pair(self):
+        setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
+        required = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
+        # dm_control 1.0.50 asks for mujoco>=3.17 but cannot make a Physics on MuJoCo 4.0.0
+        # ('MjModel' object has no attribute 'flex_vertedge'), so an unpinned install is broken.
+        self.assertIn("'mujoco>=3.17,<4'", required)
+        self.assertIn("'dm-control>=1.0.50'", required)
+
+
+class ImportTest(absltest.TestCase):
+    """Importing is quick, quiet and needs no display."""
+
+    def test_import_is_fast_and_silent(self):
+        code = """
+            import time
+            start = time.perf_counter()
+            import trl_suite
+            seconds = time.perf_counter() - start
+            import sys
+            assert 'mujoco' not in sys.modules, 'the engine is imported on first use'
+            sys.stdout.write(str(seconds))
+        """
+        seconds = []
+        for _ in range(3):  # the best of three: the machine may be busy
+            out, err = python(code)
+            self.assertEqual(err, '')
+            seconds.append(float(out))
+        self.assertLess(min(seconds), 1.5)
+
+    def test_suite_prints_nothing_and_makes_no_context(self):
+        code = """
+            import trl_suite.suite
+            from dm_control import _render
+            import sys
+            assert 'glfw' not in sys.modules
+            environment = trl_suite.suite.make('PD_Dog2D_Gaps_Terrain-v0', {'random': 0})
+            environment.reset()
+            assert environment.physics._contexts is None, 'an OpenGL context was made'
+        """
+        variables = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}
+        out, err = python(code, MUJOCO_GL='egl', **variables)
+        self.assertEqual((out, err), ('', ''))
+
+    def test_terrain_and_motion_need_no_engine(self):
+        code = """
+            import sys
+            from trl_suite import motion, terrain
+            terrain.Strip(terrain.load('slopes_mixed'), 0).height([0.0, 7.0])
+            motion.load('dog_bound').pose(0.1)
+            assert 'mujoco' not in sys.modules and 'dm_control' not in sys.modules
+        """
+        self.assertEqual(python(code), ('', ''))
+
+    def test_without_a_display_egl_is_chosen(self):
+        code = """
+            import os
+            os.environ.pop('MUJOCO_GL', None)
+            os.environ.pop('DISPLAY', None)
+            os.environ.pop('WAYLAND_DISPLAY', None)
+            import trl_suite
+            print(os.environ['MUJOCO_GL'])
+        """
+        if sys.platform != 'linux':
+            self.skipTest('only on Linux')
+        self.assertEqual(python(code)[0].strip(), 'egl')
+
+    def test_a_choice_of_the_user_is_kept(self):
+        code = """
+            import os
+            import trl_suite
+            print(os.environ['MUJOCO_GL'])
+        """
+        self.assertEqual(python(code, MUJOCO_GL='osmesa', DISPLAY='')[0].strip(), 'osmesa')
+
+
+class WheelTest(absltest.TestCase):
+    """A wheel installed elsewhere works without the checkout."""
+
+    def test_wheel(self):
+        temporary = tempfile.TemporaryDirectory()
+        self.addCleanup(temporary.cleanup)
+        folder = pathlib.Path(temporary.name).resolve()
+        source, wheels, venv, work = (
+            folder / name for name in ('source', 'wheels', 'venv', 'work')
+        )
+        work.mkdir()
+        # Built from a copy: building writes beside setup.py.
+        source.mkdir()
+        for name in ('trl_suite', 'xml', 'mocap'):
+            shutil.copytree(
+                CHECKOUT / name, source / name, ignore=shutil.ignore_patterns('__pycache__')
+            )
+        for name in ('setup.py', 'pyproject.toml', 'README.md'):
+            if (CHECKOUT / name).exists():
+                shutil.copy(CHECKOUT / name, source / name)
+        self.run_quietly(
+            sys.executable, '-m', 'build', '--wheel', '--outdir', wheels, source, cwd=work
+        )
+        (wheel,) = wheels.glob('*.whl')
+        shutil.rmtree(source)
+
+        self.run_quietly(sys.executable, '-m', 'venv', '--without-pip', venv)
+        inner = venv / 'bin' / 'python'
+        target = pathlib.Path(
+            python("import sysconfig; print(sysconfig.get_path('purelib'))", inner)[0].strip()
+        )
+        self.run_quietly(
+            sys.executable, '-m', 'pip', '--disable-pip-version-check', '-q', 'install',
+            '--no-deps', '--no-index', '--target', target, wheel,
+        )  # fmt: skip
+        # Third-party packages come from this interpreter; ours must not.
+        others = [sysconfig.get_path('purelib'), sysconfig.get_path('platlib'),
+                  *site.getsitepackages()]  # fmt: skip
+        lines = [f'import sys; sys.path.append({path!r})' for path in dict.fromkeys(others)]
+        (target / 'others.pth').write_text('\n'.join(lines) + '\n')
+
+        out, _ = python(
+            """
+            import pathlib
+            import numpy as np
+            import trl_suite
+            from trl_suite import motion, resources, suite
+            print(pathlib.Path(trl_suite.__file__).resolve())
+            print(resources.directory('xml').resolve())
+            print(resources.directory('mocap').resolve())
+            print(len(motion.names()))
+            for id_ in ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0'):
+                environment = suite.make(id_, {'random': 0})
+                environment.reset()
+                for _ in range(20):
+                    step = environment.step(np.zeros(environment.action_spec().shape))
+                assert all(np.isfinite(v).all() for v in step.observation.values())
+            suite.build('goat', terrain='cliffs_rugged').reset()
+            """,
+            inner, cwd=work,
+        )  # fmt: skip
+        module, xml, mocap, clips = out.split()
+        installed = target.resolve() / 'trl_suite'
+        self.assertEqual(pathlib.Path(module), installed / '__init__.py')
+        self.assertEqual(pathlib.Path(xml), installed / 'xml')
+        self.assertEqual(pathlib.Path(mocap), installed / 'mocap')
+        self.assertEqual(int(clips), len(list((CHECKOUT / 'mocap').glob('*.npz'))))
+        self.assertTrue((installed / 'py.typed').exists())
+        self.assertTrue((installed / 'terrain' / 'presets.json').exists())
+        self.assertEqual(
+            {path.name for path in (installed / 'xml').glob('*.xml')},
+            {path.name for path in (CHECKOUT / 'xml').glob('*.xml')},
+        )
+        top = {path.name for path in target.iterdir()}
+        self.assertNotIn('tests', top)
+        self.assertFalse((installed / 'mocap' / 'recipes').exists())
+
+    def run_quietly(self, *command, cwd=None):
+        done = subprocess.run(
+            [str(each) for each in command], capture_output=True, text=True, cwd=cwd, timeout=300
+        )
+        self.assertEqual(done.returncode, 0, done.stdout + done.stderr)
+
+
+if __name__ == '__main__':
+    absltest.main()
