@@ -265,8 +265,7 @@ class RewardTest(parameterized.TestCase):
     @parameterized.parameters(*((id_, steps) for id_ in EXAMPLES for steps in (1, 6)))
     def test_terms_in_a_rollout(self, id_, steps):
         environment, step = started(id_, steps)
-        if step.first() or step.last():
-            self.skipTest('fell')
+        self.assertTrue(step.mid())
         terms, expected = environment.info['reward_terms'], self.by_hand(environment)
         for name, value in expected.items():
             # The task interpolates a table of the clip.
