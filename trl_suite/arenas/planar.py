@@ -166,7 +166,7 @@ def _pool_size(terrain: Terrain) -> int:
 
 
 def _decorate(root: mjcf.RootElement) -> None:
-    """Light, sky and ground, cheap enough that one model serves pictures and physics."""
+    """Sky and ground (the sun follows each character), cheap enough that one model serves pictures and physics."""
     root.visual.quality.shadowsize = 1024
     root.visual.quality.offsamples = 0
     getattr(root.visual, 'global').offwidth = 1920
@@ -189,8 +189,4 @@ def _decorate(root: mjcf.RootElement) -> None:
     root.asset.add(
         'material', name='ground', texture='ground', texuniform=True, reflectance=0, specular=0,
         texrepeat=(2, 2),
-    )  # fmt: skip
-    root.worldbody.add(
-        'light', name='sun', mode='trackcom', pos=(-2, 2, 6), dir=(0.3, -0.3, -1), directional=True,
-        diffuse=(0.5, 0.5, 0.48), specular=(0.1, 0.1, 0.1), castshadow=True,
     )  # fmt: skip
