@@ -196,7 +196,7 @@ class VectorEnvironment:
         self._ended = terminated | truncated
         reward, info = task.reward.astype(self.dtype), task.infos()
         if self.autoreset == 'same_step':
-            info['ended'] = self._ended
+            info['ended'] = self._ended.copy()
             if self._ended.any():
                 info['final_observation'] = self._observation()
                 self._begin(np.flatnonzero(self._ended))

@@ -1,0 +1,289 @@
+"""Many rows behave as single environments do, bit for bit, and never disturb each other."""
+
+import multiprocessing
+import pickle
+
+import numpy as np
+from absl.testing import parameterized
+
+from trl_suite import suite
+from trl_suite.vector import AUTORESET, VectorEnvironment
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
+LIMIT = 12  # control steps: short episodes, so that rows are reset in the middle
+
+
+def singles(seeds, id_, **task_kwargs):
+    return [
+        suite.make(
+            id_,
+            {'random': int(seed), 'step_limit': LIMIT, **task_kwargs},
+            {'flat_observation': True},
+        )
+        for seed in seeds
+    ]
+
+
+def flat(time_step):
+    return time_step.observation['observations']
+
+
+class IdentityTest(parameterized.TestCase):
+    """A row is the single environment with its seed."""
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_every_row_is_a_single_environment(self, id_):
+        rows = VectorEnvironment(id_, 3, num_threads=2, seed=5, step_limit=LIMIT)
+        alone = singles(rows.seeds, id_)
+        first = rows.reset()
+        np.testing.assert_array_equal(first, [flat(one.reset()) for one in alone])
+        random, ends = np.random.default_rng(0), 0
+        for _ in range(2 * LIMIT + 6):
+            action = random.uniform(-1, 1, (3, len(rows.action_map)))
+            step = rows.step(action)
+            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
+            np.testing.assert_array_equal(step.observation, [flat(one) for one in steps])
+            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
+            np.testing.assert_array_equal(
+                step.terminated, [one.last() and one.discount == 0 for one in steps]
+            )
+            np.testing.assert_array_equal(
+                step.truncated, [one.last() and one.discount == 1 for one in steps]
+            )
+            ends += sum(one.last() for one in steps)
+        self.assertGreaterEqual(ends, 6)
+
+    @parameterized.parameters(1, 2, 3)
+    def test_threads_do_not_matter(self, threads):
+        found = []
+        for number in (1, threads):
+            rows = VectorEnvironment(GAPS, 5, num_threads=number, seed=1)
+            rows.reset()
+            random = np.random.default_rng(3)
+            for _ in range(30):
+                step = rows.step(random.uniform(-1, 1, (5, 11)))
+            found.append(step.observation)
+        np.testing.assert_array_equal(*found)
+
+    def test_the_number_of_rows_does_not_matter(self):
+        few = VectorEnvironment(GAPS, 2, 1, seed=[7, 8])
+        many = VectorEnvironment(GAPS, 9, 2, seed=[7, 8, *range(20, 27)])
+        np.testing.assert_array_equal(few.reset(), many.reset()[:2])
+        random = np.random.default_rng(0)
+        for _ in range(60):
+            action = random.uniform(-1, 1, (9, 11))
+            a, b = few.step(action[:2]), many.step(action)
+            np.testing.assert_array_equal(a.observation, b.observation[:2])
+            np.testing.assert_array_equal(a.reward, b.reward[:2])
+
+    def test_long_runs_go_over_new_ground(self):
+        # 14 m at 4 m/s: the window of boxes is laid anew, at another time in every row.
+        rows = VectorEnvironment('PD_Dog2D_Slopes_Terrain-v0', 3, 2, seed=2, autoreset='disabled')
+        alone = [
+            suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': int(seed)}) for seed in rows.seeds
+        ]
+        rows.reset()
+        world, v = rows._task.world, rows._task._all
+        for one in alone:
+            one.reset()
+        for push in range(1, 6):
+            for row, one in enumerate(alone):
+                x = push * (2.0 + row)
+                height = rows._task.arena.strips[row].height(np.array([x]))[0] + 1.0
+                world.qpos[row, :2] = x, height
+                one.physics.data.qpos[:2] = x, height
+                one.task.world.forward(np.zeros(1, int))
+            world.forward(np.arange(3))
+            action = np.zeros((3, 20))
+            for _ in range(3):
+                rows._task.act(action)
+                rows._task.simulate()
+                rows._task.finish_step()
+                steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
+                for one, row in zip(steps, rows._task.observation, strict=True):
+                    np.testing.assert_array_equal(
+                        np.concatenate(list(one.observation.values())), row
+                    )
+                if any(one.last() for one in steps):
+                    for one in alone:
+                        one._reset_next_step = False
+        self.assertGreater(float(v.x.min()), 9.0)
+
+
+class AutoresetTest(parameterized.TestCase):
+    """Gymnasium's three manners of beginning anew."""
+
+    def run_to_the_end(self, autoreset):
+        rows = VectorEnvironment(FLAT, 4, 1, seed=0, autoreset=autoreset, step_limit=3)
+        rows.reset()
+        for _ in range(3):
+            step = rows.step(np.zeros((4, 6)))
+        self.assertTrue(step.truncated.all())
+        return rows, step
+
+    def test_next_step_ignores_the_action(self):
+        rows, _ = self.run_to_the_end('next_step')
+        step = rows.step(np.ones((4, 6)))
+        np.testing.assert_array_equal(step.reward, 0)
+        self.assertFalse((step.terminated | step.truncated).any())
+        again, _ = self.run_to_the_end('next_step')
+        np.testing.assert_array_equal(again.step(-np.ones((4, 6))).observation, step.observation)
+
+    def test_same_step_keeps_the_last_observation(self):
+        rows, step = self.run_to_the_end('same_step')
+        other, last = self.run_to_the_end('next_step')
+        np.testing.assert_array_equal(step.info['final_observation'], last.observation)
+        np.testing.assert_array_equal(step.info['ended'], True)
+        np.testing.assert_array_equal(step.observation, other.step(np.zeros((4, 6))).observation)
+        np.testing.assert_array_equal(step.reward, last.reward)
+        self.assertFalse(rows.step(np.zeros((4, 6))).truncated.any())
+
+    def test_disabled_asks_for_a_reset(self):
+        rows, step = self.run_to_the_end('disabled')
+        with self.assertRaisesRegex(RuntimeError, 'row 0 has ended'):
+            rows.step(np.zeros((4, 6)))
+        rows.reset(np.array([True] * 4))
+        self.assertFalse(rows.step(np.zeros((4, 6))).truncated.any())
+        self.assertEqual(step.reward.shape, (4,))
+
+    @parameterized.parameters({'rows': [1, 3]}, {'rows': [False, True, False, True]})
+    def test_a_reset_of_some_rows_leaves_the_others(self, rows):
+        environments, untouched = (
+            VectorEnvironment(FLAT, 4, 1, seed=4, autoreset='disabled') for _ in range(2)
+        )
+        before = environments.reset()
+        np.testing.assert_array_equal(untouched.reset(), before)
+        after = environments.reset(rows)
+        np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+        self.assertTrue((after[[1, 3]] != before[[1, 3]]).any(1).all())
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (4, 6))
+        for _ in range(5):
+            a, b = environments.step(action), untouched.step(action)
+            np.testing.assert_array_equal(a.observation[[0, 2]], b.observation[[0, 2]])
+
+    def test_autoreset_names(self):
+        self.assertEqual(AUTORESET, ('next_step', 'same_step', 'disabled'))
+
+
+class RobustnessTest(parameterized.TestCase):
+    """What goes wrong says so, and stays in its row."""
+
+    def setUp(self):
+        super().setUp()
+        self.rows = VectorEnvironment(FLAT, 3, 1, seed=0)
+        self.rows.reset()
+
+    def test_divergence_stays_in_its_row(self):
+        other = VectorEnvironment(FLAT, 3, 1, seed=0)
+        other.reset()
+        self.rows._task.world.qvel[1, 5] = 1e12
+        action = np.zeros((3, 6))
+        step, calm = self.rows.step(action), other.step(action)
+        np.testing.assert_array_equal(step.info['diverged'], [False, True, False])
+        np.testing.assert_array_equal(step.terminated, [False, True, False])
+        self.assertEqual(step.reward[1], 0.0)
+        self.assertTrue(np.isfinite(step.observation).all())
+        np.testing.assert_array_equal(step.observation[[0, 2]], calm.observation[[0, 2]])
+        for _ in range(5):
+            step, calm = self.rows.step(action), other.step(action)
+            np.testing.assert_array_equal(step.observation[[0, 2]], calm.observation[[0, 2]])
+            self.assertTrue(np.isfinite(step.observation).all())
+
+    @parameterized.parameters(
+        (np.zeros((3, 5)), 'shape'),
+        (np.zeros(6), 'shape'),
+        (np.full((3, 6), 'a'), 'array of numbers'),
+    )
+    def test_wrong_actions(self, action, message):
+        with self.assertRaisesRegex(ValueError, message):
+            self.rows.step(action)
+
+    @parameterized.parameters(np.nan, np.inf, -np.inf)
+    def test_non_finite_actions_name_the_row(self, value):
+        action = np.zeros((3, 6))
+        action[2, 4] = value
+        with self.assertRaisesRegex(ValueError, r'row 2, number 4 \(left_knee\)'):
+            self.rows.step(action)
+
+    def test_huge_finite_actions_are_clipped(self):
+        self.assertTrue(np.isfinite(self.rows.step(np.full((3, 6), 1e200)).observation).all())
+
+    @parameterized.parameters(
+        ({'num_envs': 0}, 'num_envs'),
+        ({'num_threads': -1}, 'num_threads'),
+        ({'autoreset': 'next'}, "did you mean 'next_step'"),
+        ({'dtype': np.int32}, 'float64 or float32'),
+        ({'seed': [1, 2]}, '2 seeds for 3 rows'),
+        ({'environment': 'PD_Biped2D_Gap_Terrain-v0'}, 'PD_Biped2D_Gaps_Terrain-v0'),
+        ({'task_kwargs': {'sub_steps': 3}}, "did you mean 'substeps'"),
+    )
+    def test_wrong_arguments(self, arguments, message):
+        with self.assertRaisesRegex(ValueError, message):
+            VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
+
+    def test_closed(self):
+        self.rows.close()
+        self.rows.close()
+        with self.assertRaisesRegex(RuntimeError, 'closed'):
+            self.rows.step(np.zeros((3, 6)))
+
+    def test_step_before_reset(self):
+        with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
+            VectorEnvironment(FLAT, 2, 1).step(np.zeros((2, 6)))
+
+    def test_a_live_batch_is_not_pickled(self):
+        with self.assertRaisesRegex(TypeError, 'get_state'):
+            pickle.dumps(self.rows)
+
+    def test_saved_and_restored_elsewhere(self):
+        random = np.random.default_rng(0)
+        actions = random.uniform(-1, 1, (40, 3, 6))
+        for action in actions[:15]:
+            self.rows.step(action)
+        state = pickle.loads(pickle.dumps(self.rows.get_state()))
+        expected = [self.rows.step(action).observation for action in actions[15:]]
+        other = VectorEnvironment(FLAT, 3, 2, seed=99)
+        other.set_state(state)
+        found = [other.step(action).observation for action in actions[15:]]
+        np.testing.assert_array_equal(found, expected)
+
+    def test_float32_and_blocks(self):
+        rows = VectorEnvironment(GAPS, 2, 1, seed=0, dtype=np.float32, flat_observation=False)
+        observation = rows.reset()
+        self.assertEqual(list(observation), ['terrain', 'pose', 'velocity', 'phase'])
+        self.assertEqual({value.dtype for value in observation.values()}, {np.dtype(np.float32)})
+        self.assertEqual(observation['terrain'].shape, (2, 50))
+        self.assertEqual(rows.step(np.zeros((2, 11))).reward.dtype, np.float32)
+
+    def test_a_forked_child_is_refused_not_hung(self):
+        rows = VectorEnvironment(FLAT, 2, 2, seed=0)
+        rows.reset()
+        context = multiprocessing.get_context('fork')
+        answers = context.Queue()
+        child = context.Process(target=_step_in_child, args=(rows, answers))
+        child.start()
+        self.assertIn('fork', answers.get(timeout=30))
+        child.join(timeout=30)
+        self.assertEqual(child.exitcode, 0)
+        rows.step(np.zeros((2, 6)))
+
+    def test_made_in_a_spawned_child(self):
+        context = multiprocessing.get_context('spawn')
+        answers = context.Queue()
+        child = context.Process(target=_make_in_child, args=(answers,))
+        child.start()
+        found = answers.get(timeout=60)
+        child.join(timeout=60)
+        np.testing.assert_array_equal(found, VectorEnvironment(FLAT, 2, 2, seed=0).reset())
+
+
+def _step_in_child(rows, answers):
+    try:
+        rows.step(np.zeros((2, 6)))
+    except RuntimeError as error:
+        answers.put(str(error))
+
+
+def _make_in_child(answers):
+    answers.put(VectorEnvironment(FLAT, 2, 2, seed=0).reset())
