@@ -60,7 +60,7 @@ class ActionMap:
         np.minimum(control, high, out=control)
         control *= half_range
         control += centre
-        return control.reshape(np.shape(action))
+        return control if np.ndim(action) > 1 else control[0]
 
     @functools.cached_property
     def _rows(self) -> tuple[np.ndarray, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -72,6 +71,8 @@ class Environment(composer.Environment):
         )
         # The constructor has compiled already; composer would do it again at the first reset.
         self._mjcf_never_compiled = False
+        self._parts = tuple(task.blocks.items())
+        self._size = len(task.action_map)
         # Whether anything but the task has hooks around a step; asking them each time takes longer.
         self._hooked = bool(
             self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
@@ -143,13 +144,12 @@ class Environment(composer.Environment):
         return dm_env.TimeStep(step_type, reward, task.get_discount(physics), observation)
 
     def _checked(self, action: np.ndarray) -> np.ndarray:
-        size = len(self._task.action_map)
         try:
             action = np.asarray(action, dtype=float)
         except (TypeError, ValueError) as error:
             raise ValueError(f'action is not an array of numbers: {error}') from None
-        if action.shape != (size,):
-            raise ValueError(f'action has shape {action.shape}; expected ({size},)')
+        if action.shape != (self._size,):
+            raise ValueError(f'action has shape {action.shape}; expected ({self._size},)')
         if not np.vdot(action, action) < np.inf:  # the quick test; huge numbers pass the next
             if np.isfinite(action).all():
                 return action
@@ -158,29 +158,27 @@ class Environment(composer.Environment):
             raise ValueError(f'action[{i}] ({name}) is {action[i]}; expected finite numbers')
         return action
 
-    def _observe(self) -> collections.OrderedDict[str, np.ndarray]:
+    def _observe(self) -> dict[str, np.ndarray]:
         row = self._task.observation[0].copy()
-        observation: collections.OrderedDict[str, np.ndarray] = collections.OrderedDict()
         if self._flat_observation:
-            observation[FLAT_OBSERVATION_KEY] = row
+            observation = {FLAT_OBSERVATION_KEY: row}
         else:
-            for name, part in self._task.blocks.items():
-                observation[name] = row[part]
+            observation = {name: row[part] for name, part in self._parts}
         if self._extra_observables:
             updated = self._observation_updater.get_observation()
             extra = {name: np.asarray(updated[name], float) for name in self._extra_observables}
             if self._flat_observation:
-                parts = [observation[FLAT_OBSERVATION_KEY], *(v.ravel() for v in extra.values())]
+                parts = [row, *(value.ravel() for value in extra.values())]
                 observation[FLAT_OBSERVATION_KEY] = np.concatenate(parts)
             else:
                 observation.update(extra)
         return observation
 
-    def observation_spec(self) -> collections.OrderedDict[str, specs.Array]:
-        return collections.OrderedDict(
-            (name, specs.Array(value.shape, value.dtype, name))
+    def observation_spec(self) -> dict[str, specs.Array]:
+        return {
+            name: specs.Array(value.shape, value.dtype, name)
             for name, value in self._observe().items()
-        )
+        }
 
     def reward_spec(self) -> specs.Array:
         return specs.Array((), float, 'reward')
@@ -247,7 +245,7 @@ class Environment(composer.Environment):
         if self._extra_observables:
             self._observation_updater.reset(self._physics_proxy, self._random_state)
 
-    def observation(self) -> collections.OrderedDict[str, np.ndarray]:
+    def observation(self) -> dict[str, np.ndarray]:
         """Returns the observation of the current state, e.g. after `set_state`."""
         return self._observe()
 

@@ -116,21 +116,33 @@ class VectorEnvironment:
         self._ended = np.ones(self.num_envs, bool)  # rows that need a reset
         self._fresh = True  # whether no row was ever reset
         self._picture: Environment | None = None
+        self.seeds = np.zeros(self.num_envs, np.uint32)
+        self._random = [np.random.RandomState(0)] * self.num_envs
         self.seed(seed)
 
-    def seed(self, seed: int | Sequence[int] | None) -> None:
-        """Gives every row a new stream of random numbers, from which its next reset draws."""
+    def seed(
+        self,
+        seed: int | Sequence[int] | None,
+        rows: np.ndarray | Sequence[int] | None = None,
+    ) -> None:
+        """Gives some rows, or all, new streams of random numbers, from which resets draw.
+
+        Args:
+          seed: of all n rows, as the constructor takes it.
+          rows: rows that get theirs; numbers, or a mask (n,) bool; None for all.
+        """
         if seed is None or np.ndim(seed) == 0:
             sequence = np.random.SeedSequence(seed)  # type: ignore[arg-type]
-            self.seeds = sequence.generate_state(self.num_envs, np.uint32)
+            seeds = sequence.generate_state(self.num_envs, np.uint32)
         else:
             seeds = np.asarray(seed)
             if seeds.shape != (self.num_envs,):
                 raise ValueError(f'{seeds.size} seeds for {self.num_envs} rows')
-            if (seeds < 0).any() or (seeds >= 2**32).any():
-                raise ValueError('seeds must lie in [0, 2**32)')
-            self.seeds = seeds.astype(np.uint32)
-        self._random = [np.random.RandomState(int(value)) for value in self.seeds]
+            if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
+                raise ValueError('seeds must be integers in [0, 2**32)')
+        for row in self._numbers(rows).tolist():
+            self.seeds[row] = seeds[row]
+            self._random[row] = np.random.RandomState(int(seeds[row]))
 
     def reset(
         self,
@@ -141,17 +153,17 @@ class VectorEnvironment:
 
         Args:
           rows: numbers of rows, or a mask (n,) bool; None for all.
-          seed: also seed all rows anew, as the constructor does.
+          seed: also seed these rows anew, as the constructor does: as part of a seed of all n.
 
         Returns:
           The observations of all rows.
         """
         self._check_usable()
-        if seed is not None:
-            self.seed(seed)
         numbers = self._numbers(rows)
         if self._fresh and len(numbers) < self.num_envs:
             raise ValueError('the first reset must be of all rows')
+        if seed is not None:
+            self.seed(seed, numbers)
         self._fresh = False
         self._begin(numbers)
         self._task.observe()
@@ -202,6 +214,12 @@ class VectorEnvironment:
                 self._begin(np.flatnonzero(self._ended))
                 task.observe()
         return Step(self._observation(), reward, terminated, truncated, info)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What happened in each row's last step, or its reset: see the task's `infos`."""
+        self._check_usable()
+        return self._task.infos()
 
     def render(self, row: int = 0, **options: Any) -> np.ndarray:
         """Draws one row; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
