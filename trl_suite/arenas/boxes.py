@@ -107,6 +107,8 @@ def from_profile(
     # Posts are level; the height is that of the vertex at the face.
     post = (b - a <= 1) & (at_left | at_right)
     z0, z1 = np.where(post & at_right & ~at_left, z1, z0), np.where(post & at_left, z0, z1)
+    if np.abs(z1 - z0).max(initial=0) < EPSILON:
+        return _level(x0, x1, z0)
     slope = (z1 - z0) / (x1 - x0)
     tilted = np.abs(slope) > EPSILON
 
@@ -143,4 +145,16 @@ def from_profile(
     quaternion = np.zeros((len(a), 4))
     quaternion[:, 0] = np.cos(0.5 * angle)
     quaternion[:, 2] = -np.sin(0.5 * angle)
+    return Boxes(position, half_size, quaternion)
+
+
+def _level(x0: np.ndarray, x1: np.ndarray, z: np.ndarray) -> Boxes:
+    """Boxes whose upper faces lie at z between x0 and x1, m, shape (k,)."""
+    position, half_size = np.zeros((2, len(z), 3))
+    position[:, 0] = 0.5 * (x0 + x1)
+    position[:, 2] = z - 0.5 * LEVEL_THICKNESS
+    half_size[:, 0] = 0.5 * (x1 - x0)
+    half_size[:, 1:] = HALF_WIDTH, 0.5 * LEVEL_THICKNESS
+    quaternion = np.zeros((len(z), 4))
+    quaternion[:, 0] = 1
     return Boxes(position, half_size, quaternion)

@@ -65,12 +65,14 @@ class PlanarTerrain(composer.Arena):
     def bind(self, world: World) -> None:
         """Resolves the arena's geoms in a world and makes room for its n strips."""
         self._world = world
-        self._geoms = world.geom_ids([geom.full_identifier for geom in self.boxes])
+        # The boxes of one body are neighbours in the model.
+        self._first_geom = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         self.strips: list[Strip | None] = [None] * world.n
-        self._start = np.zeros((world.n, 1))  # vertex number of a window's first vertex
+        self._start = np.full((world.n, 1), np.nan)  # vertex number of a window's first vertex
         self._offset = np.arange(world.n)[:, None] * _WINDOW
         # Of every cell its first height and the rise to the next, m.
         self._heights, self._rises = np.zeros((2, world.n, _WINDOW))
+        self._vertical = np.zeros((world.n, _WINDOW), bool)
         self._centre = np.zeros((world.n, 1))  # m; of the travel that a window is good for
 
     def begin_episode(self, row: int, strip: Strip) -> None:
@@ -113,10 +115,9 @@ class PlanarTerrain(composer.Arena):
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
         strip = self.strips[row]
-        return {
-            'strip': None if strip is None else strip.state(),
-            'centre': int(self._start[row, 0]) + _BEHIND,
-        }
+        if strip is None:
+            return {'strip': None}
+        return {'strip': strip.state(), 'centre': int(self._start[row, 0]) + _BEHIND}
 
     def restore(self, row: int, state: dict[str, Any]) -> None:
         """Restores the ground of one simulation; the caller forwards the world afterwards."""
@@ -130,22 +131,29 @@ class PlanarTerrain(composer.Arena):
         assert strip is not None
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
-        self._start[row] = start
-        self._heights[row] = heights
-        self._rises[row, :-1] = np.diff(heights)
         self._centre[row] = centre * SPACING
+        if (
+            self._start[row, 0] == start
+            and (self._heights[row] == heights).all()
+            and (self._vertical[row] == vertical).all()
+        ):
+            return  # as on flat ground: the boxes lie already
         tolerance = boxes.TOLERANCE
         pieces = boxes.from_profile(start, heights, vertical, tolerance)
-        while len(pieces.position) > len(self._geoms):  # coarser, rather than with holes
+        while len(pieces.position) > len(self.boxes):  # coarser, rather than with holes
             tolerance *= 2
             if tolerance > COARSEST:
                 raise ValueError(
                     f'terrain {self.terrain.name!r} needs {len(pieces.position)} boxes for '
                     f'{BEHIND + AHEAD:g} m, where {PROBES} draws led to expect no more than '
-                    f'{len(self._geoms)}: its features must be spread more evenly'
+                    f'{len(self.boxes)}: its features must be spread more evenly'
                 )
             pieces = boxes.from_profile(start, heights, vertical, tolerance)
-        used, unused = np.split(self._geoms, [len(pieces.position)])
+        self._start[row], self._vertical[row] = start, vertical
+        self._heights[row] = heights
+        self._rises[row, :-1] = np.diff(heights)
+        first, count = self._first_geom, len(pieces.position)
+        used, unused = slice(first, first + count), slice(first + count, first + len(self.boxes))
         model = self._world.models[row]
         model.geom_pos[used] = pieces.position
         model.geom_size[used] = pieces.half_size

@@ -24,6 +24,7 @@ class PlanarFigure:
     Attributes:
       pose_qpos, pose_dof: addresses of x, z, pitch and the joints in link order.
       links, effectors: body ids, in link order.
+      geoms: ids of the collision geoms.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class PlanarFigure:
         )
         self.links = world.body_ids([body.full_identifier for body in character.bodies])
         self.effectors = world.body_ids([b.full_identifier for b in character.end_effectors])
-        self._geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
+        self.geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         links, root_body = self.links, self.links[0]
         count = len(links)
         # Addresses in flat arrays, x and z by turns.
@@ -176,41 +177,35 @@ class PlanarFigure:
             v.position[:, ::2] *= v.facing
             v.velocity[:, ::2] *= v.facing
 
-    def place(self, rows: np.ndarray, poses: np.ndarray, rates: np.ndarray) -> None:
+    def place(
+        self, rows: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray
+    ) -> None:
         """Puts the characters of some simulations at x = 0 onto the ground.
+
+        Each is lifted until every link's bounding box is clear of the ground under its middle and
+        its ends; never lowered.
 
         Args:
           rows: which simulations; they are reset.
           poses: x (ignored), z above the ground, pitch and joints in link order, (rows, 3 + J).
           rates: their velocities, (rows, 3 + J).
+          extents: of the collision geoms in these poses, relative to the root, (rows, 3, G); see
+            `trl_suite.tasks.reference.link_extents`.
         """
         world = self._world
+        centre, half, lowest = extents.swapaxes(0, 1)
+        x = np.concatenate([np.zeros((len(rows), 1)), centre - half, centre, centre + half], axis=1)
+        ground = self.arena.height(x, rows)
+        height = poses[:, 1] + ground[:, 0]
+        depth = ground[:, 1:].reshape(len(rows), 3, -1).max(1) - (height[:, None] + lowest)
+        height += np.maximum(depth.max(1) + CLEARANCE, 0)
         world.reset(rows)
-        x, z = self.pose_qpos[:2]
         world.qpos[rows[:, None], self.pose_qpos] = poses
-        world.qpos[rows, x] = 0.0
-        world.qpos[rows, z] += self.arena.height(np.zeros((len(rows), 1)), rows)[:, 0]
+        world.qpos[rows, self.pose_qpos[0]] = 0.0
+        world.qpos[rows, self.pose_qpos[1]] = height
         world.qvel[rows[:, None], self.pose_dof] = rates
         world.forward(rows)
-        lift = self._penetration(rows) + CLEARANCE
-        lifted = rows[lift > 0]
-        if len(lifted):
-            world.qpos[lifted, z] += lift[lift > 0]
-            world.forward(lifted)
 
     def ground(self, row: int, x: np.ndarray) -> np.ndarray:
         """Heights of the ground of one simulation at x (k,), m."""
         return self.arena.height(x[None], slice(row, row + 1))[0]
-
-    def _penetration(self, rows: np.ndarray) -> np.ndarray:
-        """How deep the lowest of the links' bounding boxes reaches below the ground, m, (rows,)."""
-        cells = rows[:, None], self._geoms
-        centre = self._world.geom_xpos[cells]
-        matrix = self._world.geom_xmat[cells].reshape(*centre.shape[:2], 3, 3)
-        half_size = self._world.models[0].geom_size[self._geoms]
-        extent = (np.abs(matrix) * half_size[:, None]).sum(3)
-        x = centre[:, :, 0] + extent[:, :, 0] * np.array([[[-1]], [[0]], [[1]]])
-        x = x.swapaxes(0, 1).reshape(len(rows), -1)
-        ground = self.arena.height(x, rows).reshape(len(rows), 3, -1)
-        lowest = (centre[:, :, 2] - extent[:, :, 2])[:, None]
-        return (ground - lowest).max((1, 2))

@@ -156,7 +156,7 @@ class Imitation(Task):
         self._ctrl = world.ctrl[:, controls[0] : controls[-1] + 1]  # added one after the other
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
-            figure.effectors, PHASE_BINS,
+            figure.effectors, figure.geoms, PHASE_BINS,
         )  # fmt: skip
         columns = self.reference.columns
         # Pitch and joints.

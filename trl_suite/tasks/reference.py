@@ -21,6 +21,8 @@ class Reference:
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
       root_rate (2,) velocity of the root in x and z, m/s;
+      extents (3 * G,) of the collision geoms: centres ahead of the root, half lengths, lowest
+        points above the root, m;
       phase itself; quarter (bins,) one-hot of the part of the cycle that the phase lies in.
     """
 
@@ -32,6 +34,7 @@ class Reference:
         pose_dof: np.ndarray,
         links: np.ndarray,
         effectors: np.ndarray,
+        geoms: np.ndarray,
         bins: int,
     ) -> None:
         """Tabulates a clip.
@@ -43,6 +46,7 @@ class Reference:
           pose_dof: the same in qvel.
           links: body ids in link order, the root body first.
           effectors: body ids of the end effectors.
+          geoms: ids of the collision geoms.
           bins: parts of the cycle, a divisor of SAMPLES.
         """
         self.clip = clip
@@ -66,6 +70,7 @@ class Reference:
                 np.concatenate([
                     pose[2:], rate[2:], effector.T.ravel(), share @ velocity,
                     pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(), rate[:2],
+                    link_extents(model, data, geoms, pose[:2]).ravel(),
                 ])
             )  # fmt: skip
         table = np.array(rows)
@@ -79,7 +84,7 @@ class Reference:
         joints, bodies = len(links) - 1, 2 * len(links)
         sizes = {
             'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
-            'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'root_rate': 2, 'phase': 1,
+            'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'root_rate': 2, 'extents': 3 * len(geoms), 'phase': 1,
             'quarter': bins,
         }  # fmt: skip
         stops = np.cumsum(list(sizes.values()))
@@ -88,12 +93,18 @@ class Reference:
             for (name, size), stop in zip(sizes.items(), stops, strict=True)
         }
 
-    def state(self, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns poses and velocities at phases (n,): x = 0, z above 0, pitch, joints, (n, 3 + J)."""
+    def state(self, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns where a character is at phases (n,).
+
+        Returns:
+          Poses: x = 0, z above 0, pitch, joints, (n, 3 + J); their velocities, (n, 3 + J); and the
+          extents of the collision geoms as `link_extents` gives them, (n, 3, G).
+        """
         found, column = self.features(phase), self.columns
         parts = (np.zeros((len(phase), 1)), found[:, column['height']], found[:, column['angles']])
         rates = (found[:, column['root_rate']], found[:, column['rates']])
-        return np.concatenate(parts, axis=1), np.concatenate(rates, axis=1)
+        extents = found[:, column['extents']].reshape(len(phase), 3, -1)
+        return np.concatenate(parts, axis=1), np.concatenate(rates, axis=1), extents
 
     def features(self, phase: np.ndarray) -> np.ndarray:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
@@ -122,3 +133,16 @@ def link_velocities(centres: np.ndarray, cvel: np.ndarray, about: np.ndarray) ->
     """
     offset = (centres - about)[:, ::-1] * (1, -1)
     return cvel[:, 3:6:2] + cvel[:, 1:2] * offset
+
+
+def link_extents(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray, root: np.ndarray
+) -> np.ndarray:
+    """Bounding boxes of geoms in the x-z plane, relative to the root at `root` (x, z), m.
+
+    Returns:
+      Centres in x, half lengths in x, and lowest points, shape (3, geoms).
+    """
+    centre = data.geom_xpos[geoms][:, ::2] - root
+    half = (np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3)) * model.geom_size[geoms, None]).sum(2)
+    return np.stack([centre[:, 0], half[:, 0], centre[:, 1] - half[:, 2]])

@@ -73,8 +73,9 @@ class Strip:
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
-        right, left = _sequence(seed).spawn(2)
-        self._right, self._left = np.random.default_rng(right), np.random.default_rng(left)
+        # Two far parts of one stream: quicker to make than two streams.
+        right = np.random.PCG64(_sequence(seed))
+        self._right, self._left = np.random.Generator(right), np.random.Generator(right.jumped())
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -205,11 +206,11 @@ class Strip:
 
 
 def _sequence(seed: int | np.random.SeedSequence | np.random.Generator) -> np.random.SeedSequence:
-    """Returns a SeedSequence of our own, which may spawn children without touching the user's."""
+    """Returns the SeedSequence that a seed stands for."""
     if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0:
-        seed = np.random.SeedSequence(int(seed))
+        return np.random.SeedSequence(int(seed))
     if isinstance(seed, np.random.SeedSequence):
-        return np.random.SeedSequence(seed.generate_state(4).tolist())
+        return seed
     if isinstance(seed, np.random.Generator):
         return np.random.SeedSequence(seed.integers(2**32, size=4).tolist())
     raise TypeError(f'seed must be an int >= 0, a SeedSequence or a Generator, not {seed!r}')
