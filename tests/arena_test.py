@@ -17,7 +17,6 @@ LEVEL = (
     'flat', 'gaps_humanoid', 'walls_humanoid', 'steps_humanoid', 'mixed_humanoid', 'gaps', 'walls',
     'steps', 'mixed', 'cliffs_rugged', 'narrow_gaps_raptor', 'tight_gaps', 'stairs',
 )  # fmt: skip
-# Largest and root mean square deviation of 0.1 m pieces from the profile, m.
 # Largest and typical deviation, m. Pieces longer than 0.1 m stay within 4 mm of the profile. Where
 # there are faces, the level post of 1.5 cells beside a face adds 0.0375 m times the slope, which in
 # these presets stays below 0.27 (three standard deviations). slopes_humanoid: pieces of 0.1 m.
