@@ -1,0 +1,266 @@
+"""How fast the vector environment is against raw MuJoCo and its peers; ratios within one run.
+
+    python benchmarks/vector_environment.py [--seconds S] [--json FILE] [--plot FILE]
+
+Prints, under random actions, resets included:
+
+- our vector environment by rows and threads: control steps per second; the share of the time that
+  `Batch.step` takes in the same run (1 would mean that nothing but physics costs); cost of a reset;
+  memory per row;
+- raw `Batch.step` and raw `mj_step` of the same model, and our single environment;
+- the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
+  async) and EnvPool, each as a fraction of the raw `mj_step` rate of its own model with as many
+  physics steps, so that models of different cost compare.
+"""
+
+import argparse
+import gc
+import importlib.util
+import json
+import os
+import resource
+import time
+
+import mujoco
+import numpy as np
+
+from trl_suite import suite
+from trl_suite.vector import VectorEnvironment
+
+IDS = ('PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0')
+ROWS = (1, 16, 64, 256, 1024)
+THREADS = (1, 2)
+SUBSTEPS = 10
+
+
+class Stopwatch:
+    """Adds up the time that calls of a function take."""
+
+    def __init__(self, function):
+        self.function, self.seconds, self.items = function, 0.0, 0
+
+    def __call__(self, *arguments, **keywords):
+        begin = time.perf_counter()
+        found = self.function(*arguments, **keywords)
+        self.seconds += time.perf_counter() - begin
+        self.items += len(arguments[0]) if np.ndim(arguments[0] if arguments else 0) else 0
+        return found
+
+
+def resident():
+    """Resident memory of this process, bytes."""
+    with open('/proc/self/statm') as file:
+        return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def rate(step, seconds, per_call=1):
+    """Calls `step` for about `seconds`; returns items per second."""
+    step()
+    calls, begin = 0, time.perf_counter()
+    while time.perf_counter() - begin < seconds:
+        step()
+        calls += 1
+    return calls * per_call / (time.perf_counter() - begin)
+
+
+def actions(random, low, high, shape):
+    """A hundred random actions, drawn beforehand and repeated."""
+    return iter(_Cycle(random.uniform(low, high, (100, *shape))))
+
+
+class _Cycle:
+    def __init__(self, items):
+        self.items = items
+
+    def __iter__(self):
+        while True:
+            yield from self.items
+
+
+def ours(id_, rows, threads, seconds):
+    """Our vector environment: rate, share of physics, reset cost, memory per row."""
+    gc.collect()
+    before = resident()
+    environments = VectorEnvironment(id_, rows, threads, seed=0)
+    environments.reset()
+    memory = (resident() - before) / rows
+    drawn = actions(np.random.default_rng(0), -1, 1, (rows, len(environments.action_map)))
+    for _ in range(5):
+        environments.step(next(drawn))
+    physics = environments._world.step = Stopwatch(environments._world.step)
+    begin = environments._begin = Stopwatch(environments._begin)
+    start = time.perf_counter()
+    found = rate(lambda: environments.step(next(drawn)), seconds, rows)
+    total = time.perf_counter() - start
+    result = {
+        'control steps per second': round(found),
+        'share of Batch.step': round(physics.seconds / total, 3),
+        'reset, ms per row': round(1e3 * begin.seconds / max(1, begin.items), 3),
+        'share of resets': round(begin.seconds / total, 3),
+        'memory per row, kB': round(memory / 1e3),
+    }
+    environments.close()
+    return result
+
+
+def raw_batch(id_, rows, threads, seconds):
+    """Raw Batch.step of the same model, terrains included, nothing reset."""
+    environments = VectorEnvironment(id_, rows, threads, seed=0)
+    environments.reset()
+    batch = environments._world.batch
+    control, width = batch.bind('ctrl'), len(environments.action_map)
+    drawn = actions(np.random.default_rng(0), -1, 1, (rows, width))
+
+    def step():
+        control[:] = environments.action_map.control(next(drawn))
+        batch.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    return rate(step, seconds, rows)
+
+
+def raw(model, substeps, seconds, state=None):
+    """Raw mj_step of a model under random controls; reset each second of simulated time."""
+    data = mujoco.MjData(model)
+    low, high = model.actuator_ctrlrange.T.copy()
+    limited = model.actuator_ctrllimited.astype(bool)
+    low[~limited], high[~limited] = -1, 1
+    drawn = actions(np.random.default_rng(0), low, high, (model.nu,))
+    calls = 0
+
+    def step():
+        nonlocal calls
+        if calls % 30 == 0:
+            mujoco.mj_resetData(model, data)
+            if state is not None:
+                mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        calls += 1
+        data.ctrl[:] = next(drawn)
+        mujoco.mj_step(model, data, substeps)
+
+    return rate(step, seconds)
+
+
+def single(id_, seconds):
+    """Our single environment, resets included; and raw mj_step of its model from its start."""
+    environment = suite.make(id_, {'random': 0})
+    environment.reset()
+    physics = environment.physics
+    state = physics.get_state(sig=mujoco.mjtState.mjSTATE_INTEGRATION)
+    found = {'raw mj_step': raw(physics.model.ptr, SUBSTEPS, seconds, state)}
+    drawn = actions(np.random.default_rng(0), -1, 1, environment.action_spec().shape)
+    found['single environment'] = rate(lambda: environment.step(next(drawn)), seconds)
+    return found
+
+
+def peers(seconds):
+    """The installed peers, each as a fraction of raw mj_step of its own model."""
+    found = {}
+    from dm_control import suite as dm_suite
+
+    for domain, task in (('walker', 'walk'), ('humanoid', 'walk')):
+        environment = dm_suite.load(domain, task, task_kwargs={'random': 0})
+        spec = environment.action_spec()
+        drawn = actions(np.random.default_rng(0), spec.minimum, spec.maximum, spec.shape)
+        environment.reset()
+        substeps = round(environment.control_timestep() / environment.physics.timestep())
+        reference = raw(environment.physics.model.ptr, substeps, seconds)
+        speed = rate(lambda e=environment, d=drawn: e.step(next(d)), seconds)
+        found[f'dm_control {domain}'] = speed / reference
+    if importlib.util.find_spec('gymnasium'):
+        import gymnasium
+
+        for id_ in ('Walker2d-v5', 'Humanoid-v5'):
+            environment = gymnasium.make(id_)
+            base = environment.unwrapped
+            reference = raw(base.model, base.frame_skip, seconds)
+            environment.reset(seed=0)
+            space = environment.action_space
+            drawn = actions(np.random.default_rng(0), space.low, space.high, space.shape)
+
+            def step(environment=environment, drawn=drawn):
+                _, _, terminated, truncated, _ = environment.step(next(drawn))
+                if terminated or truncated:
+                    environment.reset()
+
+            found[f'Gymnasium {id_}'] = rate(step, seconds) / reference
+            for mode in ('sync', 'async'):
+                rows = 16
+                vector = gymnasium.make_vec(id_, num_envs=rows, vectorization_mode=mode)
+                vector.reset(seed=0)
+                drawn_rows = actions(
+                    np.random.default_rng(0), space.low, space.high, (rows, *space.shape)
+                )
+                speed = rate(lambda v=vector, d=drawn_rows: v.step(next(d)), seconds, rows)
+                found[f'Gymnasium {id_} {mode}, {rows} rows'] = speed / reference
+                vector.close()
+            if id_ == 'Humanoid-v5' and importlib.util.find_spec('envpool'):
+                import envpool
+
+                for rows in (16, 64):
+                    pool = envpool.make_gymnasium('Humanoid-v4', num_envs=rows, num_threads=2)
+                    pool.reset()
+                    drawn_rows = actions(
+                        np.random.default_rng(0), space.low, space.high, (rows, *space.shape)
+                    )
+                    speed = rate(lambda p=pool, d=drawn_rows: p.step(next(d)), seconds, rows)
+                    found[f'EnvPool Humanoid-v4, {rows} rows, 2 threads'] = speed / reference
+    return {name: round(value, 3) for name, value in found.items()}
+
+
+def plot(figures, path):
+    """Draws rate against rows."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4))
+    for id_, found in figures['ours'].items():
+        reference = figures['single'][id_]['raw mj_step']
+        for threads in THREADS:
+            rows = [n for n in ROWS if f'{n} rows, {threads} threads' in found]
+            rates = [
+                found[f'{n} rows, {threads} threads']['control steps per second'] / reference
+                for n in rows
+            ]
+            axes.plot(rows, rates, 'o-' if threads == 1 else 's--', label=f'{id_}, {threads}')
+    axes.set(xscale='log', xlabel='rows', ylabel='rate / raw mj_step on one thread')
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
+    parser.add_argument('--json', help='also write the figures to this file')
+    parser.add_argument('--plot', help='also draw rate against rows')
+    parser.add_argument('--rows', type=int, nargs='*', default=ROWS)
+    parser.add_argument('--no-peers', action='store_true')
+    arguments = parser.parse_args()
+    figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'raw Batch.step': {}}
+    for id_ in IDS:
+        figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
+        print(id_, figures['single'][id_])
+        figures['ours'][id_], figures['raw Batch.step'][id_] = {}, {}
+        for threads in THREADS:
+            for rows in arguments.rows:
+                name = f'{rows} rows, {threads} threads'
+                figures['ours'][id_][name] = ours(id_, rows, threads, arguments.seconds)
+                speed = raw_batch(id_, rows, threads, arguments.seconds)
+                figures['raw Batch.step'][id_][name] = round(speed)
+                print(f'  {name}: {figures["ours"][id_][name]}, raw Batch.step {speed:.0f}/s')
+    if not arguments.no_peers:
+        figures['peers'] = peers(arguments.seconds)
+        for name, value in figures['peers'].items():
+            print(f'{name}: {value} of raw mj_step of its model')
+    if arguments.json:
+        with open(arguments.json, 'w') as file:
+            json.dump(figures, file, indent=2)
+    if arguments.plot:
+        plot(figures, arguments.plot)
+
+
+if __name__ == '__main__':
+    main()
