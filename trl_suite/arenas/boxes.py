@@ -22,6 +22,7 @@ OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
 LEAN = 0.9  # of the way to the next face; how far the lower end of a tilted box may lean out
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
 EPSILON = 1e-9
+_FRACTIONS = {PIECE << i: np.arange(PIECE << i) / (PIECE << i) for i in range(1, DOUBLINGS + 1)}
 
 
 class Boxes(NamedTuple):
@@ -56,19 +57,21 @@ def _cuts(start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: floa
     cut |= grid
     for doubling in range(1, DOUBLINGS + 1):
         span = PIECE << doubling
-        first = np.arange(-start % span, count - span, span)
-        if not len(first):
+        offset = -start % span
+        spans = (count - 1 - offset) // span
+        if spans < 1:
             break
-        inner = first[:, None] + np.arange(1, span)
+        inside = slice(offset, offset + spans * span)
+        height = heights[inside].reshape(spans, span)
         # A span may be one piece if its halves are, nothing must be cut inside, and the profile
         # stays close to the chord.
-        halves = cut[inner]
-        halves[:, span // 2 - 1] = False
-        free = ~halves.any(1) & ~mandatory[inner].any(1)
-        a, b = heights[first], heights[first + span]
-        chord = a[:, None] + (b - a)[:, None] * (np.arange(1, span) / span)
-        free &= np.abs(heights[inner] - chord).max(1) < tolerance
-        cut[first[free] + span // 2] = False
+        cuts = cut[inside].reshape(spans, span)[:, 1:]
+        free = cuts.sum(1) == cuts[:, span // 2 - 1]
+        free &= ~mandatory[inside].reshape(spans, span)[:, 1:].any(1)
+        first = height[:, :1]
+        rise = heights[offset + span :: span][:spans, None] - first
+        free &= np.abs(height - (first + rise * _FRACTIONS[span])).max(1) < tolerance
+        cut[offset + span // 2 : inside.stop : span][free] = False
     return cut
 
 
