@@ -31,11 +31,14 @@ setup(
     ],
     extras_require={
         'video': ['imageio[ffmpeg]', 'matplotlib'],
+        'gymnasium': ['gymnasium>=1.1'],
+        'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4'],
         'test': [
             'absl-py',
             'pytest',
             'pytest-xdist',
             'build',
+            'gymnasium>=1.1',
             'imageio[ffmpeg]',
             'matplotlib',
             'scipy',

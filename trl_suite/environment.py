@@ -143,6 +143,11 @@ class Environment(composer.Environment):
         step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, reward, task.get_discount(physics), observation)
 
+    def close(self) -> None:
+        """Frees the simulation; may be called twice."""
+        if self._physics is not None:
+            super().close()
+
     def _checked(self, action: np.ndarray) -> np.ndarray:
         try:
             action = np.asarray(action, dtype=float)

@@ -104,6 +104,10 @@ class VectorEnvironment:
         self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
         self.flat_observation = flat_observation
         self.step_limit = self.row.step_limit if step_limit == -1 else step_limit
+        if self.step_limit is not None and not (
+            int(self.step_limit) == self.step_limit and self.step_limit >= 1
+        ):
+            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
         self._task_kwargs = dict(task_kwargs or {})
         self._num_threads = int(num_threads)
         self._task = suite.build_task(self.row, self._task_kwargs)

@@ -1,0 +1,531 @@
+"""Gymnasium's interface: its checks over every id, and its own vector environments as reference."""
+
+import importlib.util
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import warnings
+
+import gymnasium
+import numpy as np
+from absl.testing import parameterized
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space
+
+from trl_suite import catalogue, rendering, suite
+from trl_suite.gym import SuiteEnv, SuiteVectorEnv
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
+SHORT = {'step_limit': 20}  # so that random actions meet both ends: falls and the limit
+SMALL = {'height': 48, 'width': 64}
+# Two for each Box: what has no bounds is declared without.
+UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
+
+
+def python(code, **variables):
+    """Runs code in a fresh interpreter; returns what it printed."""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=100,
+        env={**os.environ, **variables},
+    )  # fmt: skip
+    if done.returncode:
+        raise AssertionError(done.stderr)
+    return done.stdout.strip()
+
+
+class Same:
+    """Comparison of nested dicts of arrays, shapes and types included."""
+
+    def assert_same(self, ours, theirs, where=''):
+        if isinstance(theirs, dict):
+            self.assertEqual(set(ours), set(theirs), where)
+            for key in theirs:
+                self.assert_same(ours[key], theirs[key], f'{where}/{key}')
+        elif isinstance(theirs, np.ndarray) and theirs.dtype == object:
+            self.assertEqual(ours.dtype, object, where)
+            for i, (our, their) in enumerate(zip(ours, theirs, strict=True)):
+                self.assert_same(our, their, f'{where}/{i}')
+        elif theirs is None:
+            self.assertIsNone(ours, where)
+        else:
+            self.assertEqual(np.asarray(ours).dtype, np.asarray(theirs).dtype, where)
+            np.testing.assert_array_equal(ours, theirs, where)
+
+
+class EveryIdTest(Same, parameterized.TestCase):
+    """What holds for all environments."""
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_check_env(self, id_):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter('always')
+            env = gymnasium.make(f'trl_suite/{id_}', render_kwargs=SMALL)
+            check_env(env.unwrapped)  # renders as well
+            env.close()
+        others = [
+            str(each.message)
+            for each in caught
+            if not any(known in str(each.message) for known in UNAVOIDABLE)
+        ]
+        self.assertEqual(others, [])
+        self.assertIsNone(env.spec.max_episode_steps)  # else there would be two time limits
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_episode_of_a_seed_is_that_of_the_suite(self, id_):
+        env = gymnasium.make(f'trl_suite/{id_}')
+        env.reset(seed=1)  # what came before does not matter
+        observation, _ = env.reset(seed=7)
+        theirs = suite.make(id_, {'random': 7}, {'flat_observation': True})
+        flat = [theirs.reset().observation['observations']]
+        ours = [observation]
+        env.action_space.seed(0)
+        for _ in range(4):
+            action = env.action_space.sample()
+            observation, reward, terminated, truncated, info = env.step(action)
+            time_step = theirs.step(action)
+            flat.append(time_step.observation['observations'])
+            ours.append(observation)
+            self.assertEqual(reward, time_step.reward)
+            self.assertEqual(terminated or truncated, time_step.last())
+            self.assertEqual(info, theirs.info)
+            self.assertAlmostEqual(sum(info['reward_terms'].values()), reward)
+        self.assertEqual(ours[0].dtype, np.float32)
+        np.testing.assert_array_equal(ours, np.array(flat, np.float32))
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_vector_entry_point_is_the_sync_vector(self, id_):
+        options = {'num_envs': 2, 'task_kwargs': {'step_limit': 3}}
+        ours = gymnasium.make_vec(
+            f'trl_suite/{id_}', vectorization_mode='vector_entry_point', num_threads=1, **options
+        )
+        theirs = gymnasium.make_vec(f'trl_suite/{id_}', vectorization_mode='sync', **options)
+        self.assertIsInstance(ours, SuiteVectorEnv)
+        for name in ('single_observation_space', 'single_action_space', 'action_space'):
+            self.assertEqual(getattr(ours, name), getattr(theirs, name))
+        self.assertEqual(ours.observation_space, theirs.observation_space)
+        self.assert_same(ours.reset(seed=[3, 4])[0], theirs.reset(seed=[3, 4])[0])
+        ours.action_space.seed(0)
+        for _ in range(5):
+            action = ours.action_space.sample()
+            self.assert_same(ours.step(action)[0], theirs.step(action)[0])
+        ours.close()
+        theirs.close()
+
+    def test_spaces(self):
+        phases = 0
+        for id_, row in catalogue.BY_ID.items():
+            env = gymnasium.make(f'trl_suite/{id_}', flat_observation=False).unwrapped
+            blocks = env.environment.blocks
+            self.assertEqual(list(env.observation_space.spaces), list(blocks))  # terrain first
+            if row.options.get('terrain_samples'):
+                self.assertEqual(next(iter(env.observation_space)), 'terrain')
+            for name, box in env.observation_space.items():
+                low, high = (0, 1) if name == 'phase' else (-np.inf, np.inf)
+                self.assertEqual((box.low == low).all() and (box.high == high).all(), True)
+                phases += name == 'phase'
+            action = env.action_space
+            self.assertEqual(action.shape, (len(env.environment.action_map),))
+            self.assertTrue((action.low == -1).all() and (action.high == 1).all())
+            self.assertEqual(action.dtype, np.float32)
+        self.assertEqual(phases, sum('_LLC_' not in id_ for id_ in suite.ALL_IDS))
+
+
+class SingleTest(Same, parameterized.TestCase):
+    """One environment."""
+
+    def rollout(self, env, seed=5, steps=30):
+        outputs = [env.reset(seed=seed)]
+        random = np.random.default_rng(0)
+        for _ in range(steps):
+            outputs.append(env.step(random.uniform(-1, 1, env.action_space.shape)))
+            if outputs[-1][2] or outputs[-1][3]:
+                outputs.append(env.reset())
+        return outputs
+
+    def test_dict_flattens_to_flat(self):
+        flat = SuiteEnv(GAPS)
+        blocks = SuiteEnv(GAPS, flat_observation=False)
+        flattened = gymnasium.wrappers.FlattenObservation(blocks)
+        self.assertEqual(flattened.observation_space, flat.observation_space)
+        for ours, theirs in zip(self.rollout(flat), self.rollout(flattened), strict=True):
+            np.testing.assert_array_equal(ours[0], theirs[0])
+
+    def test_dtype(self):
+        half, full = self.rollout(SuiteEnv(GAPS)), self.rollout(SuiteEnv(GAPS, dtype=np.float64))
+        for single, double in zip(half, full, strict=True):
+            self.assertEqual((single[0].dtype, double[0].dtype), (np.float32, np.float64))
+            self.assertTrue((double[0].astype(np.float32) == single[0]).all())
+        self.assertEqual(SuiteEnv(GAPS, dtype=np.float64).action_space.dtype, np.float64)
+
+    def test_ends(self):
+        """A fall terminates; the own limit truncates, once."""
+        env = gymnasium.make(f'trl_suite/{FLAT}', task_kwargs={'step_limit': 3})
+        env.reset(seed=0)
+        idle = np.zeros(env.action_space.shape, np.float32)
+        ends = [env.step(idle)[2:4] for _ in range(3)]
+        self.assertEqual(ends, [(False, False), (False, False), (False, True)])
+        env = gymnasium.make(f'trl_suite/{FLAT}')
+        ended, steps = False, 0
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        while not ended:
+            action = env.action_space.sample()
+            _, reward, terminated, truncated, info = env.step(action)
+            ended, steps = terminated or truncated, steps + 1
+        self.assertEqual((terminated, truncated, info['fell'], reward), (True, False, True, 0.0))
+        self.assertLess(steps, 256)
+
+    def test_free_combination(self):
+        env = SuiteEnv(suite.build('raptor', actuation='muscle', terrain='gaps_humanoid'))
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # as above
+            check_env(env, skip_render_check=True)
+        with self.assertRaisesRegex(ValueError, 'already made'):
+            SuiteEnv(suite.make(GAPS), task_kwargs=SHORT)
+
+    def test_pickle_in_the_middle_of_an_episode(self):
+        env = gymnasium.make(f'trl_suite/{GAPS}').unwrapped
+        env.reset(seed=2)
+        idle = np.zeros(env.action_space.shape)
+        env.step(idle)
+        twin = pickle.loads(pickle.dumps(env))
+        for _ in range(5):
+            self.assertEqual(repr(env.step(idle)), repr(twin.step(idle)))
+        np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
+
+    def test_render(self):
+        env = gymnasium.make(
+            f'trl_suite/{GAPS}', render_mode='rgb_array', render_kwargs={**SMALL, 'ghost': True}
+        )
+        env.reset(seed=3)
+        theirs = suite.make(GAPS, {'random': 3})
+        theirs.reset()
+        expected = rendering.frame(theirs, ghost=True, **SMALL)
+        np.testing.assert_array_equal(env.render(), expected)
+        self.assertGreater(np.std(expected), 5)
+        self.assertEqual(env.metadata['render_fps'], 30)
+        silent = SuiteEnv(GAPS)
+        silent.reset()
+        self.assertIsNone(silent.render())
+
+    @parameterized.parameters(
+        ({'render_mode': 'rgb_aray'}, 'rgb_array'),
+        ({'render_mode': 'human'}, 'render_mode'),
+        ({'dtype': np.int32}, 'int32'),
+        ({'task_kwargs': {'step_limt': 3}}, 'step_limt'),
+    )
+    def test_refused_options(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            SuiteEnv(GAPS, **options)
+        with self.assertRaisesRegex(ValueError, message):
+            SuiteVectorEnv(GAPS, 2, **options)
+
+    def test_misuse(self):
+        env = SuiteEnv(FLAT)
+        idle = np.zeros(6)
+        with self.assertRaises(gymnasium.error.ResetNeeded):
+            env.step(idle)
+        for seed in (-1, 2**32):
+            with self.assertRaisesRegex(ValueError, 'seed'):
+                env.reset(seed=seed)
+        env.reset(seed=np.int64(3))
+        for action in (np.zeros(5), np.zeros((1, 6)), np.full(6, np.nan), [np.inf] * 6, 'abcdef'):
+            with self.assertRaises(ValueError):
+                env.step(action)
+        env.step(idle)  # unharmed
+        short = SuiteEnv(FLAT, task_kwargs={'step_limit': 1})
+        short.reset()
+        short.step(idle)
+        with self.assertRaises(gymnasium.error.ResetNeeded):
+            short.step(idle)
+        env.close()
+        env.close()
+        for call in (env.reset, env.render, lambda: env.step(idle)):
+            with self.assertRaisesRegex(RuntimeError, 'closed'):
+                call()
+
+
+class VectorTest(Same, parameterized.TestCase):
+    """Rows against Gymnasium's own vector environment of single ones."""
+
+    def pair(self, mode, n=3, seed_list=(5, 9, 11), **options):
+        single = {'task_kwargs': SHORT, **options}
+        theirs = SyncVectorEnv(
+            [lambda: SuiteEnv(GAPS, **single) for _ in range(n)], autoreset_mode=mode
+        )
+        ours = SuiteVectorEnv(GAPS, n, num_threads=2, autoreset_mode=mode, **single)
+        self.assertIs(ours.metadata['autoreset_mode'], theirs.metadata['autoreset_mode'])
+        seeds = list(seed_list)
+        self.assert_same(ours.reset(seed=seeds), theirs.reset(seed=seeds))
+        ours.action_space.seed(1)
+        return ours, theirs
+
+    def assert_same(self, ours, theirs, where=''):
+        if isinstance(theirs, tuple):
+            for i, (our, their) in enumerate(zip(ours, theirs, strict=True)):
+                # Rewards: rounded to the environment's dtype, where Gymnasium's are float64.
+                rounded = their.astype(our.dtype) if (len(ours), i) == (5, 1) else their
+                super().assert_same(our, rounded, f'{where}[{i}]')
+        else:
+            super().assert_same(ours, theirs, where)
+
+    @parameterized.product(
+        mode=(AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP),
+        flat_observation=(True, False),
+        dtype=(np.float32, np.float64),
+    )
+    def test_autoreset(self, mode, **options):
+        ours, theirs = self.pair(mode, **options)
+        falls = limits = 0
+        for step in range(60):
+            action = ours.action_space.sample()
+            our, their = ours.step(action), theirs.step(action)
+            self.assert_same(our, their, f'step {step}')
+            self.assertIn(our[0], ours.observation_space)
+            falls, limits = falls + our[2].sum(), limits + our[3].sum()
+        self.assertGreaterEqual(falls, 1)
+        self.assertGreaterEqual(limits, 1)
+
+    def test_disabled(self):
+        ours, theirs = self.pair(AutoresetMode.DISABLED)
+        for step in range(30):
+            action = ours.action_space.sample()
+            our, their = ours.step(action), theirs.step(action)
+            self.assert_same(our, their, f'step {step}')
+            ended = our[2] | our[3]
+            if ended.any():
+                # Gymnasium's takes the mask out of the dict.
+                options = [{'reset_mask': ended.copy()} for _ in range(2)]
+                seed = [100 + step] * 3 if step % 2 else None  # of the rows that are reset
+                self.assert_same(
+                    ours.reset(seed=seed, options=options[0]),
+                    theirs.reset(seed=seed, options=options[1]),
+                    f'reset {step}',
+                )
+                self.assertIn('reset_mask', options[0])
+        idle = np.zeros(ours.action_space.shape)
+        with self.assertRaisesRegex(RuntimeError, 'has ended'):
+            for _ in range(21):
+                ours.step(idle)
+
+    def test_seed_of_the_whole(self):
+        ours = SuiteVectorEnv(GAPS, 3)
+        first, _ = ours.reset(seed=5)
+        children = np.random.SeedSequence(5).generate_state(3)
+        np.testing.assert_array_equal(first, ours.reset(seed=children.tolist())[0])
+        np.testing.assert_array_equal(first, ours.reset(seed=5)[0])
+        self.assertTrue((first != ours.reset()[0]).any())
+        self.assertTrue((ours.reset(seed=6)[0] != first).any(1).all())
+
+    @parameterized.parameters(None, 'NextStep', 'SameStep', 'Disabled')
+    def test_make_vec(self, mode):
+        options = {} if mode is None else {'autoreset_mode': mode}
+        envs = gymnasium.make_vec(f'trl_suite/{FLAT}', num_envs=4, num_threads=1, **options)
+        self.assertIsInstance(envs, SuiteVectorEnv)
+        self.assertIs(envs.metadata['autoreset_mode'], AutoresetMode(mode or 'NextStep'))
+        self.assertEqual(envs.observation_space, batch_space(envs.single_observation_space, 4))
+        self.assertEqual(gymnasium.make_vec(envs.spec).num_envs, 4)
+
+    def test_async(self):
+        """Single environments live in processes as well."""
+        seeds = [5, 9]
+        theirs = gymnasium.make_vec(f'trl_suite/{FLAT}', 2, 'async')
+        self.addCleanup(theirs.close)
+        ours = gymnasium.make_vec(f'trl_suite/{FLAT}', 2, num_threads=1)
+        ours.action_space.seed(0)
+        self.assert_same(ours.reset(seed=seeds), theirs.reset(seed=seeds))
+        action = ours.action_space.sample()
+        self.assert_same(ours.step(action)[0], theirs.step(action)[0])
+
+    def test_render(self):
+        ours = SuiteVectorEnv(GAPS, 3, render_mode='rgb_array', render_kwargs=SMALL)
+        single = SuiteEnv(GAPS, render_mode='rgb_array', render_kwargs=SMALL)
+        ours.reset(seed=[1, 2, 3])
+        single.reset(seed=2)
+        idle = np.zeros(ours.action_space.shape)
+        ours.step(idle)
+        single.step(idle[0])
+        frames = ours.render()
+        self.assertIsInstance(frames, tuple)
+        self.assertLen(frames, 3)
+        np.testing.assert_array_equal(frames[1], single.render())
+        self.assertTrue((frames[0] != frames[1]).any())
+        self.assertIsNone(SuiteVectorEnv(GAPS, 1).render())
+
+    def test_misuse(self):
+        with self.assertRaisesRegex(ValueError, 'NextStep'):
+            SuiteVectorEnv(FLAT, 2, autoreset_mode='NexStep')
+        with self.assertRaisesRegex(ValueError, 'step_limit'):
+            SuiteVectorEnv(FLAT, 2, task_kwargs={'step_limit': 0})
+        envs = SuiteVectorEnv(FLAT, 2, num_threads=1)
+        with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
+            envs.step(np.zeros((2, 6)))
+        for seed in ([1], [1, None], [-1, 2], [0.5, 1.5], -1):
+            with self.assertRaises(ValueError):
+                envs.reset(seed=seed)
+        envs.reset(seed=1)
+        for mask in ([True], np.array([1, 0]), np.zeros(2, bool), 'no'):
+            with self.assertRaisesRegex(ValueError, 'reset_mask'):
+                envs.reset(options={'reset_mask': mask})
+        for action in (np.zeros((2, 5)), np.zeros(6), np.full((2, 6), np.nan)):
+            with self.assertRaises(ValueError):
+                envs.step(action)
+        envs.step(np.zeros((2, 6)))  # unharmed
+        envs.close()
+        envs.close()
+        for call in (envs.reset, lambda: envs.step(np.zeros((2, 6)))):
+            with self.assertRaisesRegex(RuntimeError, 'closed'):
+                call()
+
+
+class WrapperTest(parameterized.TestCase):
+    """Gymnasium's wrappers work, and tell what is true."""
+
+    def single(self, **options):
+        env = gymnasium.make(f'trl_suite/{FLAT}', task_kwargs=SHORT, **options)
+        self.addCleanup(env.close)
+        env.action_space.seed(0)
+        return env
+
+    def vector(self, **options):
+        env = gymnasium.make_vec(
+            f'trl_suite/{FLAT}', num_envs=3, num_threads=1, task_kwargs=SHORT, **options
+        )
+        self.addCleanup(env.close)
+        env.action_space.seed(0)
+        return env
+
+    def test_statistics(self):
+        env = gymnasium.wrappers.RecordEpisodeStatistics(self.single())
+        env.reset(seed=0)
+        rewards, info = [], {}
+        while 'episode' not in info:
+            _, reward, _, _, info = env.step(env.action_space.sample())
+            rewards.append(reward)
+        self.assertAlmostEqual(info['episode']['r'], sum(rewards), places=5)
+        self.assertEqual(info['episode']['l'], len(rewards))
+
+    @parameterized.parameters('NextStep', 'SameStep')
+    def test_vector_statistics(self, mode):
+        env = gymnasium.wrappers.vector.RecordEpisodeStatistics(self.vector(autoreset_mode=mode))
+        env.reset(seed=0)
+        sums, lengths, episodes, fresh = np.zeros(3), np.zeros(3), 0, np.zeros(3, bool)
+        for _ in range(80):
+            _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            sums, lengths = sums + reward, lengths + ~fresh
+            ended = terminated | truncated
+            for row in np.flatnonzero(ended):
+                self.assertAlmostEqual(info['episode']['r'][row], sums[row], places=5)
+                self.assertEqual(info['episode']['l'][row], lengths[row])
+                self.assertTrue(info['_episode'][row])
+                episodes += 1
+            sums[ended] = lengths[ended] = 0
+            fresh = ended if mode == 'NextStep' else fresh
+        self.assertGreater(episodes, 6)
+        self.assertEqual(env.episode_count, episodes)
+
+    def test_normalize_observation(self):
+        env = gymnasium.wrappers.NormalizeObservation(self.single())
+        raw = self.single()
+        env.reset(seed=0)
+        seen = [raw.reset(seed=0)[0]]
+        env.action_space.seed(0)
+        for _ in range(60):
+            action = env.action_space.sample()
+            _, _, terminated, truncated, _ = env.step(action)
+            seen.append(raw.step(action)[0])
+            if terminated or truncated:
+                env.reset()
+                seen.append(raw.reset()[0])
+        np.testing.assert_allclose(env.obs_rms.mean, np.mean(seen, 0), atol=1e-3)
+
+    def test_vector_normalize_observation(self):
+        env = gymnasium.wrappers.vector.NormalizeObservation(self.vector())
+        raw = self.vector()
+        env.reset(seed=0)
+        seen = [raw.reset(seed=0)[0]]
+        env.action_space.seed(0)
+        for _ in range(40):
+            action = env.action_space.sample()
+            observation = env.step(action)[0]
+            seen.append(raw.step(action)[0])
+        self.assertTrue(np.isfinite(observation).all())
+        np.testing.assert_allclose(env.obs_rms.mean, np.concatenate(seen).mean(0), atol=1e-3)
+
+    def test_frame_stack(self):
+        env = gymnasium.wrappers.FrameStackObservation(self.single(), 3)
+        first = env.reset(seed=0)[0]
+        second = env.step(env.action_space.sample())[0]
+        self.assertEqual(first.shape, (3, *self.single().observation_space.shape))
+        self.assertIn(first, env.observation_space)
+        np.testing.assert_array_equal(second[1], first[2])
+        self.assertTrue((second[2] != second[1]).any())
+
+    def test_vector_flatten(self):
+        blocks = gymnasium.wrappers.vector.FlattenObservation(self.vector(flat_observation=False))
+        flat = self.vector()
+        self.assertEqual(blocks.single_observation_space, flat.single_observation_space)
+        np.testing.assert_array_equal(blocks.reset(seed=0)[0], flat.reset(seed=0)[0])
+        action = flat.action_space.sample()
+        np.testing.assert_array_equal(blocks.step(action)[0], flat.step(action)[0])
+
+    def test_render_collection(self):
+        env = self.single(render_mode='rgb_array_list', render_kwargs=SMALL)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        frames = env.render()
+        self.assertEqual([frame.shape for frame in frames], [(48, 64, 3)] * 2)
+
+    def test_record_video(self):
+        if importlib.util.find_spec('moviepy') is None:
+            self.skipTest('needs moviepy')
+        wrappers = gymnasium.wrappers
+        with tempfile.TemporaryDirectory() as folder:
+            for name, env in (
+                ('one', wrappers.RecordVideo(
+                    self.single(render_mode='rgb_array', render_kwargs=SMALL), f'{folder}/one')),
+                ('many', wrappers.vector.RecordVideo(
+                    self.vector(render_mode='rgb_array', render_kwargs=SMALL), f'{folder}/many')),
+            ):  # fmt: skip
+                env.reset(seed=0)
+                for _ in range(22):
+                    _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+                    if name == 'one' and (terminated or truncated):
+                        break
+                env.close()
+                files = os.listdir(f'{folder}/{name}')
+                self.assertNotEmpty(files)
+                for file in files:
+                    self.assertGreater(os.path.getsize(f'{folder}/{name}/{file}'), 500)
+
+
+class ImportTest(parameterized.TestCase):
+    """What is registered, and by what."""
+
+    def test_every_id_is_registered(self):
+        ours = {id_ for id_ in gymnasium.registry if id_.startswith('trl_suite/')}
+        self.assertEqual(ours, {f'trl_suite/{id_}' for id_ in suite.ALL_IDS})
+
+    def test_id_that_names_the_module(self):
+        id_ = f'trl_suite.gym:trl_suite/{FLAT}'
+        out = python(
+            f'import gymnasium; env = gymnasium.make({id_!r}); envs = gymnasium.make_vec({id_!r}, 2);'
+            'print(env.reset(seed=1)[0].shape, envs.reset(seed=1)[0].shape)'
+        )
+        self.assertEqual(out, '(58,) (2, 58)')
+
+    def test_the_suite_does_not_need_gymnasium(self):
+        code = (
+            'import sys; sys.modules["gymnasium"] = None\n'
+            'from trl_suite import suite, vector, cli, rendering\n'
+            f'suite.make({FLAT!r}).reset()\n'
+            'try:\n    import trl_suite.gym\n'
+            'except ImportError as error:\n    print(error)'
+        )
+        message = python(code)
+        self.assertIn("pip install 'trl_suite[gymnasium]'", message)
+        self.assertLen(message.splitlines(), 1)

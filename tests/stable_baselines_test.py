@@ -1,0 +1,144 @@
+"""Stable-Baselines3's interface, against its own vector environment of single ones."""
+
+import tempfile
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from absl.testing import parameterized
+
+pytest.importorskip('stable_baselines3', reason='needs stable-baselines3', exc_type=ImportError)
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from trl_suite import suite
+from trl_suite.gym import SuiteEnv
+from trl_suite.stable_baselines import SuiteVecEnv
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
+LIMIT = 20  # so that random actions meet both ends: falls and the limit
+SMALL = {'height': 48, 'width': 64}
+
+
+class StableBaselinesTest(parameterized.TestCase):
+    """Rows against single environments, wrappers, and a learner."""
+
+    @parameterized.parameters(*suite.ALL_IDS)
+    def test_single_environments_pass_the_checker(self, id_):
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            check_env(gymnasium.make(f'trl_suite/{id_}').unwrapped, skip_render_check=True)
+
+    @parameterized.parameters(True, False)
+    def test_rows_are_those_of_dummy_vec_env(self, flat):
+        theirs = DummyVecEnv([
+            lambda: SuiteEnv(GAPS, flat_observation=flat, task_kwargs={'step_limit': LIMIT})
+        ] * 3)  # fmt: skip
+        ours = SuiteVecEnv(GAPS, 3, 2, flat_observation=flat, step_limit=LIMIT)
+        self.assertEqual(ours.observation_space, theirs.observation_space)
+        self.assertEqual(ours.action_space, theirs.action_space)
+        self.assertEqual(ours.seed(7), theirs.seed(7))
+        self.compare(ours.reset(), theirs.reset())
+        self.assertEqual(ours.reset_infos, theirs.reset_infos)
+        random, falls, limits = np.random.default_rng(0), 0, 0
+        for _ in range(60):
+            action = random.uniform(-1, 1, (3, *ours.action_space.shape)).astype(np.float32)
+            our, their = ours.step(action), theirs.step(action)
+            self.compare(our[0], their[0])
+            np.testing.assert_array_equal(our[1], their[1])
+            self.assertEqual((our[1].dtype, our[2].dtype), (np.float32, bool))
+            np.testing.assert_array_equal(our[2], their[2])
+            self.assertEqual(ours.reset_infos, theirs.reset_infos)
+            for row, (one, other) in enumerate(zip(our[3], their[3], strict=True)):
+                self.assertEqual('terminal_observation' in one, our[2][row])
+                if our[2][row]:
+                    limits += one['TimeLimit.truncated']
+                    falls += one['fell']
+                    self.compare(one.pop('terminal_observation'), other.pop('terminal_observation'))
+                self.assertEqual(one, other)
+        self.assertGreaterEqual(falls, 1)
+        self.assertGreaterEqual(limits, 1)
+
+    def compare(self, ours, theirs):
+        if not isinstance(ours, dict):
+            ours, theirs = {'': ours}, {'': theirs}
+        self.assertEqual(set(ours), set(theirs))
+        for key in ours:
+            self.assertEqual(ours[key].dtype, np.float32)
+            np.testing.assert_array_equal(ours[key], theirs[key])
+
+    def test_monitor(self):
+        envs = VecMonitor(SuiteVecEnv(FLAT, 3, 1, seed=0, step_limit=LIMIT))
+        envs.reset()
+        random, sums, lengths, episodes = np.random.default_rng(0), np.zeros(3), np.zeros(3), 0
+        for _ in range(60):
+            _, reward, done, infos = envs.step(random.uniform(-1, 1, (3, 6)))
+            sums, lengths = sums + reward, lengths + 1
+            for row in np.flatnonzero(done):
+                self.assertAlmostEqual(infos[row]['episode']['r'], sums[row], places=4)
+                self.assertEqual(infos[row]['episode']['l'], lengths[row])
+                sums[row] = lengths[row] = 0
+                episodes += 1
+        self.assertGreater(episodes, 6)
+
+    def test_seeds(self):
+        envs = SuiteVecEnv(FLAT, 2, 1, seed=[4, 5])
+        first = envs.reset()
+        self.assertTrue((envs.reset() != first).any(1).all())  # the streams go on
+        envs.seed(4)
+        np.testing.assert_array_equal(envs.reset(), first)
+        envs.seed(2**32 - 1)  # as SB3 may draw it
+        envs.reset()
+        np.testing.assert_array_equal(envs.environment.seeds, [2**32 - 1, 0])
+
+    def test_render(self):
+        envs = SuiteVecEnv(FLAT, 3, 1, seed=0, render_mode='rgb_array', render_kwargs=SMALL)
+        envs.reset()
+        picture = envs.render()
+        self.assertEqual(picture.shape, (96, 128, 3))  # two by two, the last one empty
+        np.testing.assert_array_equal(picture[:48, :64], envs.environment.render(0, **SMALL))
+        self.assertEqual(SuiteVecEnv(FLAT, 2, 1).get_images(), [None, None])
+        with self.assertRaisesRegex(ValueError, 'rgb_array'):
+            SuiteVecEnv(FLAT, 2, 1, render_mode='rgb')
+
+    def test_attributes(self):
+        envs = SuiteVecEnv(FLAT, 3, 1)
+        self.assertEqual(envs.get_attr('step_limit'), [256] * 3)
+        self.assertEqual(envs.get_attr('step_limit', [0, 2]), [256] * 2)
+        self.assertFalse(envs.has_attr('spec'))
+        self.assertEqual(envs.env_is_wrapped(gymnasium.Wrapper), [False] * 3)
+        with self.assertRaisesRegex(NotImplementedError, 'environment'):
+            envs.set_attr('step_limit', 3)
+        with self.assertRaisesRegex(NotImplementedError, 'environment'):
+            envs.env_method('reset')
+
+    def test_misuse(self):
+        envs = SuiteVecEnv(FLAT, 2, 1)
+        with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
+            envs.step(np.zeros((2, 6)))
+        envs.reset()
+        for action in (np.zeros((2, 5)), np.full((2, 6), np.nan)):
+            with self.assertRaises(ValueError):
+                envs.step(action)
+        envs.close()
+        envs.close()
+        with self.assertRaisesRegex(RuntimeError, 'closed'):
+            envs.step(np.zeros((2, 6)))
+
+    @parameterized.parameters((True, 'MlpPolicy'), (False, 'MultiInputPolicy'))
+    def test_ppo(self, flat, policy):
+        envs = VecNormalize(VecMonitor(SuiteVecEnv(GAPS, 4, 1, flat_observation=flat)))
+        model = PPO(policy, envs, n_steps=32, batch_size=64, n_epochs=1, seed=3, device='cpu')
+        model.learn(512)
+        self.assertEqual(model.num_timesteps, 512)
+        self.assertNotEmpty(model.ep_info_buffer)
+        mean, _ = evaluate_policy(model, envs, n_eval_episodes=2)
+        self.assertBetween(mean, 0, 256)
+        with tempfile.TemporaryDirectory() as folder:
+            model.save(f'{folder}/model.zip')
+            PPO.load(f'{folder}/model.zip', envs, device='cpu').learn(128)
