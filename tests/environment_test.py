@@ -509,6 +509,16 @@ class ConstructionTest(parameterized.TestCase):
         np.testing.assert_array_equal(heights(5), heights(np.random.RandomState(5)))
         self.assertTrue((heights(5) != heights(6)).any())
 
+    def test_closed(self):
+        environment = suite.make('PD_Biped2D_Flat-v0', {'random': 0})
+        environment.reset()
+        environment.close()
+        environment.close()
+        with self.assertRaisesRegex(RuntimeError, 'closed'):
+            environment.step(np.zeros(11))
+        with self.assertRaisesRegex(RuntimeError, 'closed'):
+            environment.reset()
+
 
 if __name__ == '__main__':
     absltest.main()

@@ -99,6 +99,12 @@ class Environment(composer.Environment):
         return composer_observation.Updater(self._task.observables, 1, True, False)
 
     def reset(self) -> dm_env.TimeStep:
+        """Begins an episode.
+
+        Raises:
+          RuntimeError: after `close`.
+        """
+        self._check_open()
         self._steps = 0
         self._reset_next_step = False
         self._hooks.initialize_episode(self._physics_proxy, self._random_state)
@@ -114,7 +120,9 @@ class Environment(composer.Environment):
 
         Raises:
           ValueError: an action of another shape, or with NaN or infinity.
+          RuntimeError: after `close`.
         """
+        self._check_open()
         action = self._checked(action)
         if self._reset_next_step:
             return self.reset()
@@ -147,6 +155,10 @@ class Environment(composer.Environment):
         """Frees the simulation; may be called twice."""
         if self._physics is not None:
             super().close()
+
+    def _check_open(self) -> None:
+        if self._physics is None:
+            raise RuntimeError('the environment is closed')
 
     def _checked(self, action: np.ndarray) -> np.ndarray:
         try:

@@ -10,6 +10,7 @@ Gymnasium 1 has no plugins: without that import the id must name the module, as 
 'trl_suite.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. What has no id is wrapped by hand, as
 `SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the environment's
 own step limit truncates it; `info` has 'reward_terms' (a dict), 'fell', 'diverged', 'distance' (m).
+The terms of a reset are those of the start, for which there is no reward.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class VectorEnvironment:
           dtype: of observations and rewards, float64 or float32.
           flat_observation: give one array of all blocks side by side, else a dict of blocks.
           step_limit: control steps after which an episode is cut; by default the row's own.
-          task_kwargs: options of the task, as for `suite.load`.
+          task_kwargs: options of the task, as for `suite.load` (without seed and limits).
 
         Raises:
           ValueError: unknown names or options, or numbers out of range.
