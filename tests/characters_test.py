@@ -101,7 +101,8 @@ class Figures:
 
 DOG = Figures(
     33.67, 2, 0.6486, (0.29154, -0.12482, 0.0283), (1.42438, 2.73639, 3.99552),
-    'root spine0 spine1 spine2 spine3 torso neck0 neck1 head', 'finger toe', 34,
+    'root spine0 spine1 spine2 spine3 torso neck0 neck1 head', 'finger toe',
+    33,  # 34 in the original; shoulder and wrist would lock in the plane and are excluded
 )  # fmt: skip
 FIGURES = {
     'dog': DOG,

@@ -116,6 +116,9 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> R
 
 def _imitation(character: str, model: str, clip: str, original: bool) -> Row:
     run = '_Run' if clip == 'biped2d_run' else ''
+    # Where servos or torques drive joints hard into their limits, limits hold at 600 Hz; see
+    # benchmarks/physics_rate.md.
+    fine = model == 'velocity' or (model == 'torque' and character != 'biped2d')
     id_ = f'{_PREFIX[model]}_{_IN_ID[character]}_LLC_Imitate{run}_Flat-v0'
     figure = _IN_ID[character][:-2].lower()
     return Row(
@@ -126,7 +129,7 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> Row:
         actuation=model,
         terrain='flat',
         clip=clip,
-        options=MappingProxyType({'target': True}),
+        options=MappingProxyType({'target': True, **({'substeps': 20} if fine else {})}),
         description=f'The {figure} tracks a {_GAIT[clip]} on flat ground by {_BY[model]}.',
         tags=frozenset({'planar', 'flat', _status(id_, original)}),
     )

@@ -33,7 +33,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         lambda row: 'completion' in row.tags,
         'not in the registry of the original: a combination that its papers name or imply',
     ),
-    (lambda row: True, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
+    (lambda row: True, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
     (lambda row: True, 'actions are in [-1, 1] and clipped; the original takes physical units'),
     (
         lambda row: row.actuation == 'position',
