@@ -18,10 +18,8 @@ from mujoco import batch
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
 WRITABLE = ('qpos', 'qvel', 'act', 'ctrl', 'qacc_warmstart', 'mocap_pos', 'mocap_quat')
-READABLE = (
-    'xpos', 'xquat', 'xmat', 'xipos', 'cvel', 'subtree_com', 'geom_xpos', 'geom_xmat', 'sensordata',
-    'ten_length', 'actuator_force',
-)  # fmt: skip
+# Only what some task reads: a batch copies out every field for every row at every call.
+READABLE = ('xpos', 'xipos', 'cvel', 'subtree_com', 'sensordata', 'ten_length')
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that continues a trajectory bit for bit
 # Bad position, velocity and acceleration are neighbours among the warnings.
 _DIVERGED = slice(mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC + 1)
@@ -45,16 +43,11 @@ class World:
     mocap_pos: np.ndarray
     mocap_quat: np.ndarray
     xpos: np.ndarray
-    xquat: np.ndarray
-    xmat: np.ndarray
     xipos: np.ndarray
     cvel: np.ndarray
     subtree_com: np.ndarray
-    geom_xpos: np.ndarray
-    geom_xmat: np.ndarray
     sensordata: np.ndarray
     ten_length: np.ndarray
-    actuator_force: np.ndarray
 
     def __init__(self, model: mujoco.MjModel, models: list[mujoco.MjModel]) -> None:
         self.n = len(models)
