@@ -1,6 +1,8 @@
-"""Packages of trl_suite, with the data folders xml/ and mocap/ shipped inside the wheel."""
+"""Packages of trl_suite, with the data folders xml/, mocap/ and trained/ inside the wheel."""
 
 from setuptools import find_packages, setup
+
+TORCH = 'torch>=2.4,<2.14'
 
 setup(
     name='trl_suite',
@@ -11,13 +13,19 @@ setup(
         *find_packages(include=['trl_suite', 'trl_suite.*']),
         'trl_suite.xml',
         'trl_suite.mocap',
+        'trl_suite.trained',
     ],
-    package_dir={'trl_suite.xml': 'xml', 'trl_suite.mocap': 'mocap'},
+    package_dir={
+        'trl_suite.xml': 'xml',
+        'trl_suite.mocap': 'mocap',
+        'trl_suite.trained': 'trained',
+    },
     package_data={
         'trl_suite': ['py.typed'],
         'trl_suite.terrain': ['*.json'],
         'trl_suite.xml': ['*.xml'],
         'trl_suite.mocap': ['*.npz', '*.md'],
+        'trl_suite.trained': ['*.npz', '*.json', '*.md'],
     },
     install_requires=[
         # MuJoCo 4.0.0 breaks dm_control 1.0.50 when a Physics is made.
@@ -32,7 +40,8 @@ setup(
     extras_require={
         'video': ['imageio[ffmpeg]', 'matplotlib'],
         'gymnasium': ['gymnasium>=1.1'],
-        'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4'],
+        'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
+        'train': [TORCH],
         'test': [
             'absl-py',
             'pytest',
@@ -42,6 +51,7 @@ setup(
             'imageio[ffmpeg]',
             'matplotlib',
             'scipy',
+            TORCH,
         ],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1'],
     },

@@ -6,17 +6,19 @@ Prints, under random actions, resets included:
 
 - our vector environment by rows and threads: control steps per second; the share of the time that
   `Batch.step` takes in the same run (1 would mean that nothing but physics costs); cost of a reset;
-  memory per row;
+- memory per row: what fresh processes with 16 and with 1024 rows differ by;
 - raw `Batch.step` and raw `mj_step` of the same model, and our single environment;
 - the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
   async) and EnvPool, each as a fraction of the raw `mj_step` rate of its own model with as many
-  physics steps, so that models of different cost compare.
+  physics steps, so that models of different cost compare. EnvPool 1.2.0 has MuJoCo 3.6.0 inside;
+  the wheels of 1.2.2 to 1.2.5 lack files without which they cannot be imported.
 """
 
 import argparse
-import gc
+import concurrent.futures
 import importlib.util
 import json
+import multiprocessing
 import os
 import resource
 import time
@@ -31,6 +33,8 @@ IDS = ('PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terr
 ROWS = (1, 16, 64, 256, 1024)
 THREADS = (1, 2)
 SUBSTEPS = 10
+MEMORY_ROWS = (16, 1024)
+WARM = 40  # steps; most rows have fallen once by then
 
 
 class Stopwatch:
@@ -77,16 +81,19 @@ class _Cycle:
             yield from self.items
 
 
-def ours(id_, rows, threads, seconds):
-    """Our vector environment: rate, share of physics, reset cost, memory per row."""
-    gc.collect()
-    before = resident()
+def warmed(id_, rows, threads):
+    """Our vector environment once its rows are all over their episodes, and random actions."""
     environments = VectorEnvironment(id_, rows, threads, seed=0)
     environments.reset()
-    memory = (resident() - before) / rows
     drawn = actions(np.random.default_rng(0), -1, 1, (rows, len(environments.action_map)))
-    for _ in range(5):
+    for _ in range(WARM):
         environments.step(next(drawn))
+    return environments, drawn
+
+
+def ours(id_, rows, threads, seconds):
+    """Our vector environment: rate, share of physics, reset cost; and the rate of raw Batch.step."""
+    environments, drawn = warmed(id_, rows, threads)
     physics = environments._world.step = Stopwatch(environments._world.step)
     begin = environments._begin = Stopwatch(environments._begin)
     start = time.perf_counter()
@@ -97,25 +104,35 @@ def ours(id_, rows, threads, seconds):
         'share of Batch.step': round(physics.seconds / total, 3),
         'reset, ms per row': round(1e3 * begin.seconds / max(1, begin.items), 3),
         'share of resets': round(begin.seconds / total, 3),
-        'memory per row, kB': round(memory / 1e3),
     }
-    environments.close()
-    return result
-
-
-def raw_batch(id_, rows, threads, seconds):
-    """Raw Batch.step of the same model, terrains included, nothing reset."""
-    environments = VectorEnvironment(id_, rows, threads, seed=0)
-    environments.reset()
-    batch = environments._world.batch
-    control, width = batch.bind('ctrl'), len(environments.action_map)
-    drawn = actions(np.random.default_rng(0), -1, 1, (rows, width))
+    batch = environments._world.batch  # as it is now, terrains included; nothing is reset any more
+    control = batch.bind('ctrl')
 
     def step():
         control[:] = environments.action_map.control(next(drawn))
         batch.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
-    return rate(step, seconds, rows)
+    found = rate(step, seconds, rows)
+    environments.close()
+    return result, found
+
+
+def footprint(id_, rows):
+    """Resident memory of this process once it has built, reset and stepped as many rows, bytes."""
+    environments, _ = warmed(id_, rows, max(THREADS))
+    found = resident()
+    environments.close()
+    return found
+
+
+def memory(id_):
+    """Memory per row, bytes; processes of their own, where nothing was allocated and freed before."""
+    sizes = []
+    for rows in MEMORY_ROWS:
+        spawn = multiprocessing.get_context('spawn')
+        with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
+            sizes.append(pool.submit(footprint, id_, rows).result())
+    return (sizes[1] - sizes[0]) / (MEMORY_ROWS[1] - MEMORY_ROWS[0])
 
 
 def raw(model, substeps, seconds, state=None):
@@ -202,8 +219,9 @@ def envpool_humanoid(space, reference, seconds):
     """EnvPool's humanoid, if it can be imported, as a fraction of a raw rate."""
     try:
         import envpool
-    except (ImportError, OSError) as error:  # some of its wheels lack files that it looks for
-        return {f'EnvPool (not measured: {error})': float('nan')}
+    except (ImportError, OSError) as error:
+        print(f'EnvPool is not measured: {error}')
+        return {}
     found = {}
     for rows in (16, 64):
         pool = envpool.make_gymnasium('Humanoid-v4', num_envs=rows, num_threads=2)
@@ -248,17 +266,20 @@ def main():
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
     figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'raw Batch.step': {}}
+    figures['memory per row, kB'] = {}
     for id_ in IDS:
         figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
         print(id_, figures['single'][id_])
+        figures['memory per row, kB'][id_] = round(memory(id_) / 1e3)
+        print(f'  memory per row: {figures["memory per row, kB"][id_]} kB')
         figures['ours'][id_], figures['raw Batch.step'][id_] = {}, {}
         for threads in THREADS:
             for rows in arguments.rows:
                 name = f'{rows} rows, {threads} threads'
-                figures['ours'][id_][name] = ours(id_, rows, threads, arguments.seconds)
-                speed = raw_batch(id_, rows, threads, arguments.seconds)
+                found, speed = ours(id_, rows, threads, arguments.seconds)
+                figures['ours'][id_][name] = found
                 figures['raw Batch.step'][id_][name] = round(speed)
-                print(f'  {name}: {figures["ours"][id_][name]}, raw Batch.step {speed:.0f}/s')
+                print(f'  {name}: {found}, raw Batch.step {speed:.0f}/s', flush=True)
     if not arguments.no_peers:
         figures['peers'] = peers(arguments.seconds)
         for name, value in figures['peers'].items():

@@ -11,12 +11,18 @@ from trl_suite import actuation, characters
 
 GRAVITY = 9.81  # m/s^2; of MuJoCo's default, which a user's own arena has
 
-# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, limits rad as they act.
+# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, limits rad as they act;
+# of the hopper's leg, which slides, N and m instead of N m and rad.
 FREE = (-np.inf, np.inf)
 BIPED_LEG = {
     'hip': (2, 300, 300, 30, 0.3, (-2.57, 2.57)),
     'knee': (1.5, 300, 300, 30, 0.3, (-3.14, 0)),
     'ankle': (0.5, 100, 100, 10, 0.2, (-1.57, 1.57)),
+}
+SIMBICON_LEG = {
+    'hip': (5, 200, 200, 20, 0.3, (-0.37, 2.87)),
+    'knee': (2.5, 200, 200, 20, 0.3, (-3, 0)),
+    'ankle': (0.5, 200, 150, 15, 0.2, (-0.57, 1)),
 }
 FULL_LEG = {
     'hip': (5, 150, 200, 20, 0.3, (-0.5, 2.57)),
@@ -76,10 +82,15 @@ JOINTS = {
         **sided(RAPTOR_LEG),
     },
     'biped2d': sided(BIPED_LEG),
+    'biped2d_simbicon': sided(SIMBICON_LEG),
     'biped2d_full': {
         **sided(FULL_LEG),
         **sided(FULL_ARM),
         'neck': (3.5, 50, 100, 10, 0.3, (-0.57, 0.57)),
+    },
+    'hopper': {
+        'hip': (0.2, 2500, 200, 20, 0.5, (-1.57, 1.57)),
+        'leg': (0.2, 180, 1000, 20, 0.5, (-0.2, 0.2)),
     },
 }
 NAMES = tuple(JOINTS)
@@ -115,10 +126,17 @@ FIGURES = {
         33, 25, 0.7904, (0.00157, 0.05096, 0), (3.14638, 0.27844, 2.93567), 'root',
         'right_ankle left_ankle', 11,
     ),
+    'biped2d_simbicon': Figures(
+        41, 25, 0.7904, (0.001263, -0.01062, 0), (4.175239, 0.366537, 3.885026), 'root',
+        'right_ankle left_ankle', 11,
+    ),
     'biped2d_full': Figures(
         49, 25, 0.7904, (0.00106, 0.04252, 0), (5.43552, 0.52145, 4.99070),
         'root right_hip left_hip right_shoulder right_forearm left_shoulder left_forearm neck',
         'right_ankle left_ankle', 19,
+    ),
+    'hopper': Figures(
+        8.4, 8, 0.83, (0, -0.016667, 0), (0.120215, 0.354388, 0.419587), 'root', 'leg', 0
     ),
 }  # fmt: skip
 
@@ -150,6 +168,18 @@ LINKS = {
         'left_knee': ('left_hip', (0, -0.352, 0), (0.065, 0.416, 0.06), (0, -0.183, 0)),
         'left_ankle': ('left_knee', (0, -0.391, 0), (0.177, 0.05, 0.08), (0.0518, -0.0224, 0)),
     },
+    'biped2d_simbicon': {
+        'root': (None, (0, 0, 0), (0.11, 0.45, 0.278), (0, 0.19, 0)),
+        'left_hip': ('root', (0, 0, -0.1), (0.0846, 0.4, 0.08), (0, -0.1745, 0)),
+        'right_knee': ('right_hip', (0, -0.352, 0), (0.065, 0.416, 0.06), (0, -0.183, 0)),
+        'right_ankle': ('right_knee', (0, -0.391, 0), (0.177, 0.05, 0.08), (0.0518, -0.0224, 0)),
+    },
+    'hopper': {
+        'root': (None, (0, 0, 0), (0.7, 0.2, 0.2), (0, 0, 0)),
+        'hip': ('root', (0, 0, 0), (0.08, 0.4, 0.21), (0, -0.2, 0)),
+        # The capsule's bounding box: radius 0.03, cylinder 0.6 long.
+        'leg': ('hip', (0, -0.2, 0), (0.06, 0.66, 0.06), (0, -0.3, 0)),
+    },
     'biped2d_full': {
         'root': (None, (0, 0, 0), (0.1, 0.45, 0.278), (0, 0.19, 0)),
         'right_shoulder': ('root', (0, 0.41, 0.18), (0.07, 0.325, 0.08), (0, -0.1545, 0)),
@@ -170,6 +200,22 @@ def alone(name):
     """The character compiled by itself, its root at the origin."""
     physics = mjcf.Physics.from_mjcf_model(characters.make(name).mjcf_model)
     return physics.model.ptr, physics.data.ptr
+
+
+def half_size(model, link):
+    """Half the size of a link's collision geom along its axes."""
+    return model.geom_aabb[model.geom(link).id, 3:]
+
+
+def lowest(model, data):
+    """Heights of the lowest points of the geoms that can touch the ground, m."""
+    for geom in np.flatnonzero((model.geom_group == 3) & (model.geom_conaffinity > 0)):
+        up = np.abs(data.geom_xmat[geom].reshape(3, 3)[2])
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            radius, half_length, _ = model.geom_size[geom]
+            yield data.geom_xpos[geom, 2] - radius - up[2] * half_length
+        else:
+            yield data.geom_xpos[geom, 2] - up @ model.geom_size[geom]
 
 
 def users_arena(timestep=0.002):
@@ -195,13 +241,7 @@ class FiguresTest(parameterized.TestCase):
         # The composite inertia of the root body: xx yy zz xy xz yz about the whole body's com.
         xx, yy, zz = figures.inertia
         np.testing.assert_allclose(data.crb[1][:3], (xx, zz, yy), atol=1e-5)
-        boxes = model.geom_group == 3
-        corners = data.geom_xpos[boxes, 2] - np.einsum(
-            'ij,ij->i',
-            np.abs(data.geom_xmat[boxes].reshape(-1, 3, 3)[:, 2]),
-            model.geom_size[boxes],
-        )
-        self.assertAlmostEqual(-corners.min(), figures.height, delta=5e-5)
+        self.assertAlmostEqual(-min(lowest(model, data)), figures.height, delta=5e-5)
 
     @parameterized.parameters(*NAMES)
     def test_body_figures_reports_the_same(self, name):
@@ -214,13 +254,15 @@ class FiguresTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_link_masses_and_solid_box_inertias(self, name):
+        """The capsule of the hopper's leg counts as its bounding box, 0.01 m larger all round."""
         model, _ = alone(name)
         masses = {'root': FIGURES[name].root_mass} | {j: r[0] for j, r in JOINTS[name].items()}
         self.assertEqual(model.nbody - 1, len(masses))
         for link, mass in masses.items():
             body = model.body(link)
             self.assertAlmostEqual(body.mass[0], mass, delta=1e-9, msg=link)
-            a, b, c = (2 * model.geom(link).size) ** 2
+            margin = 0.01 if (name, link) == ('hopper', 'leg') else 0
+            a, b, c = (2 * (half_size(model, link) + margin)) ** 2
             solid = mass / 12 * np.array([b + c, a + c, a + b])
             np.testing.assert_allclose(np.sort(body.inertia), np.sort(solid), rtol=1e-6)
 
@@ -229,8 +271,9 @@ class FiguresTest(parameterized.TestCase):
         parent, joint, size, centre = LINKS[name][link]
         model, _ = alone(name)
         x, y, z = size
-        np.testing.assert_allclose(model.geom(link).size, (x / 2, z / 2, y / 2), atol=1e-9)
+        np.testing.assert_allclose(half_size(model, link), (x / 2, z / 2, y / 2), atol=1e-9)
         np.testing.assert_allclose(model.geom(link).pos, to_mujoco(centre), atol=1e-9)
+        np.testing.assert_allclose(model.body(link).ipos, to_mujoco(centre), atol=1e-9)
         np.testing.assert_allclose(model.body(link).pos, to_mujoco(joint), atol=1e-9)
         if parent is not None:
             self.assertEqual(model.body(model.body(link).parentid[0]).name, parent)
@@ -253,7 +296,11 @@ class FiguresTest(parameterized.TestCase):
         for (joint, row), figures in zip(table.items(), character.row.joints.values(), strict=True):
             _, limit, kp, kd, weight, limits = row
             compiled = model.joint(joint)
-            np.testing.assert_array_equal(compiled.axis, (0, -1, 0))  # positive lifts the front
+            slides = (name, joint) == ('hopper', 'leg')
+            kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+            self.assertEqual(compiled.type[0], kind, joint)
+            # Positive lifts the front, or makes the leg longer.
+            np.testing.assert_array_equal(compiled.axis, (0, 0, -1) if slides else (0, -1, 0))
             np.testing.assert_allclose(model.jnt_actfrcrange[compiled.id], (-limit, limit))
             self.assertEqual(model.jnt_actfrclimited[compiled.id], 1)
             self.assertEqual((figures.kp, figures.kd, figures.weight), (kp, kd, weight), joint)
@@ -263,9 +310,49 @@ class FiguresTest(parameterized.TestCase):
         np.testing.assert_allclose(character.torque_limits, [row[1] for row in table.values()])
         np.testing.assert_allclose(character.joint_ranges, [row[5] for row in table.values()])
 
+    def test_only_the_leg_of_the_hopper_slides(self):
+        slides = {
+            (name, joint)
+            for name in NAMES
+            for joint, prismatic in zip(
+                JOINTS[name], characters.make(name).prismatic, strict=True
+            )
+            if prismatic
+        }  # fmt: skip
+        self.assertEqual(slides, {('hopper', 'leg')})
+
+    def test_leg_of_the_hopper_slides_along_its_thigh(self):
+        model, data = alone('hopper')
+        data.joint('hip').qpos[0] = 0.5  # forward
+        mujoco.mj_forward(model, data)
+        short = data.body('leg').xipos.copy()
+        data.joint('leg').qpos[0] = 0.15
+        mujoco.mj_forward(model, data)
+        slide = data.body('leg').xipos - short
+        np.testing.assert_allclose(slide, 0.15 * np.array([np.sin(0.5), 0, -np.cos(0.5)]))
+
+    @parameterized.parameters(
+        # The original's state files: x, z, pitch, joints; lowest point and height above it, m.
+        ('hopper', (0, 1.214392, -0.00686, 0.012764, 0), 0.384406, 0.932385),
+        ('biped2d_simbicon', (0, 0.791, 0, 0, 0, 0, 0, 0, 0), 0.0006, 1.2054),
+    )
+    def test_initial_state_of_the_original(self, name, pose, bottom, height):
+        arena = users_arena()
+        character = characters.make(name)
+        character.create_root_joints(arena.attach(character))
+        physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+        physics.data.qpos[:] = pose
+        physics.forward()
+        model, data = physics.model.ptr, physics.data.ptr
+        self.assertAlmostEqual(min(lowest(model, data)), bottom, delta=1e-6)
+        root = data.geom(f'{name}/root')
+        top = root.xpos[2] + np.abs(root.xmat.reshape(3, 3)[2]) @ model.geom(f'{name}/root').size
+        self.assertAlmostEqual(top - bottom, height, delta=2e-6)
+
     @parameterized.parameters(
         ('dog', 12.604, 'root', 1), ('raptor', 9.75, 'right_hip', 1), ('biped2d', 2.6, 'root', 1),
         ('biped2d_full', 4.1, 'neck', 0.3), ('goat', 21, 'tail0', 1),
+        ('biped2d_simbicon', 2.6, 'left_ankle', 0.2), ('hopper', 2, 'leg', 0.5),
     )  # fmt: skip
     def test_reward_weights(self, name, total, link, weight):
         row = characters.CHARACTERS[name]
@@ -281,7 +368,16 @@ class FiguresTest(parameterized.TestCase):
         self.assertEqual(tuple(body.name for body in effectors), row.end_effectors)
         self.assertNotEmpty(row.description)
 
-    @parameterized.parameters(('raptor', 4), ('biped2d', 3), ('biped2d_full', 5), ('dog', 0))
+    @parameterized.parameters(
+        ('biped2d_simbicon', 'right_ankle left_ankle right_knee left_knee'), ('hopper', 'leg')
+    )
+    def test_what_touches_the_ground_without_a_stumble(self, name, links):
+        self.assertCountEqual(characters.CHARACTERS[name].stumble_exempt, links.split())
+
+    @parameterized.parameters(
+        ('raptor', 4), ('biped2d', 3), ('biped2d_full', 5), ('dog', 0), ('biped2d_simbicon', 3),
+        ('hopper', 0),
+    )  # fmt: skip
     def test_mirror_pairs(self, name, count):
         row = characters.CHARACTERS[name]
         self.assertLen(row.mirror, count)
@@ -331,6 +427,7 @@ class CollisionTest(parameterized.TestCase):
         ('raptor', 'tail0', 'tail2', True), ('raptor', 'head', 'tail4', True),
         ('raptor', 'right_toe', 'left_toe', True), ('raptor', 'root', 'right_knee', False),
         ('biped2d', 'right_knee', 'left_knee', True), ('biped2d', 'root', 'right_ankle', False),
+        ('biped2d_simbicon', 'right_hip', 'left_ankle', True), ('hopper', 'root', 'leg', False),
         ('biped2d_full', 'right_forearm', 'neck', True),
         ('biped2d_full', 'right_forearm', 'right_hip', False),
         ('biped2d_full', 'right_shoulder', 'right_forearm', False),
@@ -387,7 +484,9 @@ class OwnArenaTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_falls_and_rests_on_the_floor_with_its_weight(self, name):
-        character, physics = self.place(name, 'torque')
+        _, physics = self.place(name, 'torque')
+        if name == 'hopper':
+            physics.named.data.qvel[f'{name}/root_pitch/'] = 0.5  # it would balance on its point
         physics.step(6 * 600)
         model, data = physics.model.ptr, physics.data.ptr
         self.assertLess(data.body(f'{name}/root').xpos[2], 0.5 * FIGURES[name].height)
@@ -402,11 +501,7 @@ class OwnArenaTest(parameterized.TestCase):
             forces.append(vertical)
         weight = FIGURES[name].mass * GRAVITY
         self.assertAlmostEqual(np.mean(forces), weight, delta=0.02 * weight)
-        for geom in character.collision_geoms:
-            bound = physics.bind(geom)
-            matrix = bound.xmat.reshape(3, 3)
-            lowest = bound.xpos[2] - np.abs(matrix[2]) @ bound.size
-            self.assertGreater(lowest, -0.01, geom.name)
+        self.assertGreater(min(lowest(model, data)), -0.01)
 
     def test_biped_stands(self):
         _, physics = self.place('biped2d', 'position')
@@ -436,9 +531,10 @@ class OwnArenaTest(parameterized.TestCase):
             for key, value in task.observables.items()
         }
         links, joints = len(JOINTS[name]) + 1, len(JOINTS[name])
+        effectors = len(FIGURES[name].effectors.split())
         shapes = {
             'joints_pos': (joints,), 'joints_vel': (joints,), 'root_pos': (3,), 'root_mat': (9,),
-            'bodies_pos': (links, 3), 'end_effectors_pos': (2, 3),
+            'bodies_pos': (links, 3), 'end_effectors_pos': (effectors, 3),
         }  # fmt: skip
         self.assertEqual({key: np.shape(value) for key, value in read.items()}, shapes)
         for value in read.values():

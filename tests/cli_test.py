@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import pathlib
 import re
@@ -14,7 +15,7 @@ import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, cli, rendering, suite
+from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, suite
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SIZE = ('--size', '160x120')
@@ -259,7 +260,10 @@ class RolloutTest(CommandTest):
         ("'big' is not a size such as 640x480", GAPS, '--size', 'big'),
         ("'0' is not a positive integer", GAPS, '--steps', '0'),
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
-        ("invalid choice: 'walk'", GAPS, '--policy', 'walk'),
+        ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, zero", GAPS, '--policy',
+         'walk'),
+        ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
+        ('No such file', GAPS, '--policy', 'none.npz'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
         ('required: ID', '--seed', '1'),
         ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
@@ -280,6 +284,122 @@ class RolloutTest(CommandTest):
         with mock.patch.object(rendering, 'frame', interrupted):
             status, out, err = run('rollout', GAPS, '--video', 'a.mp4', '--trajectory', 'a.npz')
         self.assertEqual((status, out, err), (130, '', 'trl-suite: interrupted\n'))
+        self.assert_only()
+
+
+def save_policy(path, id_, seed=0):
+    """Writes a policy with random weights that fits an environment."""
+    task, rng = suite.build_task(suite.find(id_)), np.random.default_rng(seed)
+    blocks = [(name, part.stop - part.start) for name, part in task.blocks.items()]
+    k, a = sum(size for _, size in blocks), len(task.action_map)
+    policy = policies.Policy(
+        id=id_, blocks=blocks, actions=task.action_map.names,
+        quantity=task.action_map.quantity, mean=np.zeros(k), std=np.ones(k), clip=5.0, weights=[rng.normal(0, 0.2, (k, a))], biases=[np.zeros(a)], activation='tanh',
+        log_std=np.zeros(a),
+    )  # fmt: skip
+    policies.save(policy, path)
+    return policy
+
+
+class TrainedTest(CommandTest):
+    """Policies from a file or shipped, in rollout."""
+
+    def test_a_file(self):
+        policy = save_policy('mine.npz', GAPS)
+        self.output(
+            'rollout', GAPS, '--steps', '40', '--policy', 'mine.npz', '--trajectory', 'a.npz'
+        )
+        with np.load('a.npz') as t:
+            acted = t['step_types'] != 2
+            acted[-1] = False
+            self.assertGreater(acted.sum(), 30)
+            expected = policy(t['observations'][acted])
+            np.testing.assert_array_equal(t['actions'][acted], expected)
+
+    def test_the_reference(self):
+        save_policy(f'{GAPS}.npz', GAPS)
+        with mock.patch.object(resources, 'directory', lambda kind: self.folder):
+            self.assertEqual(policies.available(), (GAPS,))
+        directory = resources.directory
+        with mock.patch.object(
+            resources,
+            'directory',
+            lambda kind: self.folder if kind == 'trained' else directory(kind),
+        ):
+            arguments = 'plaid/biped_gaps', '--steps', '30', '--policy'
+            found = self.output('rollout', *arguments, 'reference')
+            self.assertEqual(found, self.output('rollout', *arguments, f'{GAPS}.npz'))
+            for command in ('rollout', 'evaluate'):
+                self.assert_refused(
+                    f"no policy is shipped for 'PD_Dog2D_Gaps_Terrain-v0'.*: {GAPS}",
+                    command, 'PD_Dog2D_Gaps_Terrain-v0', '--policy', 'reference',
+                )  # fmt: skip
+
+    def test_one_that_does_not_fit(self):
+        save_policy('mine.npz', GAPS)
+        pathlib.Path('broken.npz').write_bytes(b'no')
+        for command in ('rollout', 'evaluate'):
+            self.assert_refused(
+                'observes terrain 50, .* the environment gives terrain 50, ',
+                command, 'plaid/dog_gaps', '--policy', 'mine.npz',
+            )  # fmt: skip
+            self.assert_refused('broken.npz: no readable', command, GAPS, '--policy', 'broken.npz')
+
+
+class EvaluateTest(CommandTest):
+    def test_prints_and_writes_what_was_evaluated(self):
+        policy = save_policy('mine.npz', GAPS)
+        out = self.output(
+            'evaluate', 'plaid/biped_gaps', '--policy', 'mine.npz', '--episodes', '5', '--seed', '3',
+            '--threads', '1', '--json', 'a.json',
+        )  # fmt: skip
+        self.assert_only('mine.npz', 'a.json')
+        expected = evaluation.evaluate(GAPS, policy, 5, 3)
+        found = json.loads(pathlib.Path('a.json').read_text())
+        self.assertEqual(found, {**expected, 'policy': 'mine.npz'})
+        lines = out.splitlines()
+        self.assertEqual(lines[0], GAPS)
+        table = dict(
+            re.fullmatch(r'  (\w+(?: \w+)*)  +(\S.*)', line).groups() for line in lines[1:]
+        )
+        self.assertEqual(
+            table,
+            {
+                'policy': 'mine.npz',
+                'episodes': '5, seed 3',
+                'return': f'{expected["return"]:.2f} +- {expected["return_interval"]:.2f} '
+                f'(95 % confidence), {expected["fraction"]:.1%} of the maximum 256',
+                'length': f'{expected["length"]:.1f} of 256 steps',
+                'distance': f'{expected["distance"]:.2f} m',
+                'full length': f'{expected["full"]:.0%} of the episodes',
+                'falls': f'{expected["falls"]:.0%} of the episodes',
+            },
+        )
+
+    @parameterized.parameters('clip', 'zero', 'random')
+    def test_baselines(self, name):
+        out = self.output('evaluate', GAPS, '--policy', name, '--episodes', '2')
+        expected = evaluation.evaluate(GAPS, evaluation.BASELINES[name], 2, factory=True)
+        self.assertIn(f'  policy       {name}\n', out)
+        self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
+
+    def test_one_episode_has_no_interval(self):
+        out = self.output('evaluate', GAPS, '--policy', 'zero', '--episodes', '1')
+        self.assertRegex(out, r'\n  return +[\d.]+, [\d.]+% of the maximum 256\n')
+
+    @parameterized.parameters(
+        ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
+        ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
+        ('No such file', GAPS, '--policy', 'none.npz'),
+        ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
+        ("'0' is not a positive integer", GAPS, '--episodes', '0'),
+        ('seed is -1; expected 0 or', GAPS, '--policy', 'zero', '--seed', '-1'),
+        ('num_threads is -1', GAPS, '--policy', 'zero', '--threads', '-1'),
+        ("suffix '.txt'; expected .json", GAPS, '--json', 'a.txt'),
+        ("the folder 'no' does not exist", GAPS, '--json', 'no/a.json'),
+    )
+    def test_refusals_leave_nothing_behind(self, message, *arguments):
+        self.assert_refused(message, 'evaluate', *arguments)
         self.assert_only()
 
 

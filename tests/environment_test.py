@@ -310,12 +310,19 @@ class EpisodeTest(parameterized.TestCase):
         self.assertTrue(touched)
 
     def test_terms_sum_to_the_reward(self):
-        environment = suite.make(GAPS, {'random': 0})
-        environment.reset()
-        step = environment.step(np.zeros(11))
-        terms = environment.info['reward_terms']
-        self.assertCountEqual(terms, ('pose', 'velocity', 'end_effector', 'com', 'root'))
-        self.assertAlmostEqual(sum(terms.values()), step.reward, delta=1e-12)
+        environment = suite.make(GAPS, {'random': 0, 'step_limit': 5})
+        for end in 1, 2:  # of an episode: the reset after it is a step's
+            begin = environment.reset() if end == 1 else environment.step(np.zeros(11))
+            self.assertTrue(begin.first())
+            terms = environment.info['reward_terms']
+            self.assertCountEqual(terms, ('pose', 'velocity', 'end_effector', 'com', 'root'))
+            self.assertEqual(set(terms.values()), {0.0})
+            step = begin
+            while not step.last():
+                step = environment.step(np.zeros(11))
+                terms = environment.info['reward_terms']
+                self.assertAlmostEqual(sum(terms.values()), step.reward, delta=1e-12)
+                self.assertGreater(step.reward, 0)
 
     def test_distance(self):
         environment = held()

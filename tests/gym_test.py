@@ -78,7 +78,8 @@ class EveryIdTest(Same, parameterized.TestCase):
     def test_episode_of_a_seed_is_that_of_the_suite(self, id_):
         env = gymnasium.make(f'trl_suite/{id_}')
         env.reset(seed=1)  # what came before does not matter
-        observation, _ = env.reset(seed=7)
+        observation, info = env.reset(seed=7)
+        self.assertEqual(set(info['reward_terms'].values()), {0.0})
         theirs = suite.make(id_, {'random': 7}, {'flat_observation': True})
         flat = [theirs.reset().observation['observations']]
         ours = [observation]
@@ -92,7 +93,7 @@ class EveryIdTest(Same, parameterized.TestCase):
             self.assertEqual(reward, time_step.reward)
             self.assertEqual(terminated or truncated, time_step.last())
             self.assertEqual(info, theirs.info)
-            self.assertAlmostEqual(sum(info['reward_terms'].values()), reward)
+            self.assertAlmostEqual(sum(info['reward_terms'].values()), reward, delta=1e-12)
         self.assertEqual(ours[0].dtype, np.float32)
         np.testing.assert_array_equal(ours, np.array(flat, np.float32))
 
@@ -329,6 +330,40 @@ class VectorTest(Same, parameterized.TestCase):
         self.assertIs(envs.metadata['autoreset_mode'], AutoresetMode(mode or 'NextStep'))
         self.assertEqual(envs.observation_space, batch_space(envs.single_observation_space, 4))
         self.assertEqual(gymnasium.make_vec(envs.spec).num_envs, 4)
+
+    @parameterized.parameters(
+        ({}, 3, 3), ({'step_limit': 2}, 3, 2), ({}, 9, 8), ({}, -1, 8), ({}, None, 8),
+        ({'time_limit': 0.15}, 8, 5),
+    )  # fmt: skip
+    def test_max_episode_steps(self, options, steps, expected):
+        """Whichever limit comes first, as in a single environment and its wrapper."""
+        options = {'task_kwargs': {'step_limit': 8, **options}}
+        given = options if steps is None else {**options, 'max_episode_steps': steps}
+        ours = gymnasium.make_vec(f'trl_suite/{GAPS}', 2, num_threads=1, **given)
+        theirs = gymnasium.make_vec(f'trl_suite/{GAPS}', 2, 'sync', **given)
+        own = SuiteEnv(GAPS, **given)
+        again = gymnasium.make_vec(ours.spec)
+        for each in theirs, again:
+            self.assert_same(ours.reset(seed=[5, 9])[0], each.reset(seed=[5, 9])[0])
+        own.reset(seed=5)
+        clip, count, over = own.environment.task.clip_action, 0, False
+        while not over:
+            action = np.tile(np.clip(clip(0), -1, 1), (2, 1))
+            our, their, count = ours.step(action), theirs.step(action), count + 1
+            self.assert_same(our[:1] + our[2:4], their[:1] + their[2:4])
+            self.assert_same(our, again.step(action))
+            _, _, terminated, over, _ = own.step(action[0])
+            self.assertEqual((terminated, over), (our[2][0], our[3][0]))
+        self.assertEqual(count, expected)
+
+    @parameterized.parameters(0, 2.5, -3)
+    def test_refused_max_episode_steps(self, steps):
+        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
+            SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
+        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
+            SuiteEnv(FLAT, max_episode_steps=steps)
+        with self.assertRaisesRegex(ValueError, 'already made'):
+            SuiteEnv(suite.make(FLAT), max_episode_steps=5)
 
     def test_async(self):
         """Single environments live in processes as well."""

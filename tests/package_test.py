@@ -119,7 +119,7 @@ class WheelTest(absltest.TestCase):
         work.mkdir()
         # Built from a copy: building writes beside setup.py.
         source.mkdir()
-        for name in ('trl_suite', 'xml', 'mocap'):
+        for name in ('trl_suite', 'xml', 'mocap', 'trained'):
             shutil.copytree(
                 CHECKOUT / name, source / name, ignore=shutil.ignore_patterns('__pycache__')
             )

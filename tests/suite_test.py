@@ -227,7 +227,7 @@ class BuildTest(parameterized.TestCase):
     @parameterized.parameters(
         *(
             (name, model)
-            for name in characters.CHARACTERS
+            for name in suite.DEFAULT_CLIPS
             for model in ('position', 'torque', 'velocity', 'muscle')
         )
     )

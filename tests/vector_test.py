@@ -1,7 +1,10 @@
 """Many rows behave as single environments do, bit for bit, and never disturb each other."""
 
 import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 from absl.testing import parameterized
@@ -109,6 +112,104 @@ class IdentityTest(parameterized.TestCase):
                     for one in alone:
                         one._reset_next_step = False
         self.assertGreater(float(v.x.min()), 9.0)
+
+    @parameterized.parameters(*AUTORESET)
+    def test_terms_sum_to_the_reward(self, autoreset):
+        rows = VectorEnvironment(FLAT, 3, 1, seed=3, autoreset=autoreset, step_limit=LIMIT)
+        alone = singles(rows.seeds, FLAT)
+
+        def check(reward, info):
+            total = sum(info['reward_terms'].values())
+            np.testing.assert_allclose(total, reward, rtol=0, atol=1e-12)
+            np.testing.assert_array_equal(total[reward == 0], 0)
+
+        rows.reset()
+        check(np.zeros(3), rows.info)
+        for one in alone:
+            one.reset()
+        random, begun, ended = np.random.default_rng(0), np.zeros(3, bool), np.zeros(3, bool)
+        reward = np.zeros(3)
+        for _ in range(3 * LIMIT):
+            if autoreset == 'disabled' and ended.any():
+                rows.reset(ended)
+                check(np.where(ended, 0, reward), rows.info)
+            action = random.uniform(-1, 1, (3, len(rows.action_map)))
+            step = rows.step(action)
+            reward = step.reward
+            check(reward, step.info)
+            if autoreset == 'next_step':
+                np.testing.assert_array_equal(step.reward[ended], 0)
+                for row, one in enumerate(alone):
+                    one.step(action[row])
+                    for name, value in one.info['reward_terms'].items():
+                        self.assertEqual(step.info['reward_terms'][name][row], value)
+            ended = step.terminated | step.truncated
+            begun |= ended
+            if autoreset == 'same_step':
+                check(np.where(ended, 0, reward), rows.info)
+        self.assertTrue(begun.all())
+
+
+class LimitTest(parameterized.TestCase):
+    """Episodes are cut where those of a single environment are."""
+
+    @parameterized.parameters(
+        ({}, 256), ({'step_limit': None, 'time_limit': 8.99}, 270), ({'time_limit': 0.5}, 15),
+        ({'time_limit': 0.1}, None), ({'time_limit': 0.7}, None), ({'time_limit': 1e-9}, 1),
+        ({'time_limit': 0.5, 'step_limit': 7}, 7), ({'time_limit': 0.2, 'step_limit': 7}, None),
+    )  # fmt: skip
+    def test_same_step_as_a_single_environment(self, options, expected):
+        rows = VectorEnvironment(FLAT, 2, 1, seed=0, task_kwargs=options)
+        one = suite.make(FLAT, {'random': int(rows.seeds[0]), **options})
+        for environment in rows, one:
+            environment.task.finish_step = _never_failing(environment.task)
+        rows.reset()
+        one.reset()
+        idle, ends = np.zeros((2, 6)), []
+        for count in range(1, 2 * (expected or 30) + 3):
+            step, time_step = rows.step(idle), one.step(idle[0])
+            self.assertFalse(step.terminated.any())
+            np.testing.assert_array_equal(step.truncated, time_step.last())
+            if time_step.last():
+                ends.append(count)
+        self.assertGreaterEqual(len(ends), 2)
+        self.assertEqual(ends[0], expected or ends[0])
+        self.assertEqual(ends[1], 2 * ends[0] + 1)
+
+    def test_rows_are_cut_each_in_its_time(self):
+        options = {'time_limit': 0.3}
+        rows = VectorEnvironment(
+            FLAT, 3, 1, seed=0, autoreset='disabled', task_kwargs=options, step_limit=None
+        )
+        rows.reset()
+        idle = np.zeros((3, 6))
+        for _ in range(4):
+            rows.step(idle)
+        rows.reset([1])
+        state = rows.get_state()
+        other = VectorEnvironment(
+            FLAT, 3, 1, seed=9, autoreset='disabled', task_kwargs=options, step_limit=None
+        )
+        other.set_state(state)
+        for environments in rows, other:
+            for _ in range(5):
+                step = environments.step(idle)
+            np.testing.assert_array_equal(step.truncated, [True, False, True])
+            environments.reset([0, 2])
+            for _ in range(4):
+                step = environments.step(idle)
+            np.testing.assert_array_equal(step.truncated, [False, True, False])
+
+    @parameterized.parameters(
+        ({'time_limit': 0}, 'time_limit is 0; expected a positive number of seconds'),
+        ({'time_limit': float('nan')}, 'time_limit is nan'),
+        ({'step_limit': 0}, 'step_limit is 0; expected a positive integer or None'),
+        ({'step_limit': -1}, 'step_limit is -1'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
+        ({'random': 3}, "'random'.*`seed`"), ({'time_limt': 3}, 'time_limt'),
+    )  # fmt: skip
+    def test_refused(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            VectorEnvironment(FLAT, 2, 1, task_kwargs=options)
 
 
 class AutoresetTest(parameterized.TestCase):
@@ -268,14 +369,67 @@ class RobustnessTest(parameterized.TestCase):
         self.assertEqual(child.exitcode, 0)
         rows.step(np.zeros((2, 6)))
 
-    def test_made_in_a_spawned_child(self):
+    def test_spawned_workers_go_on_where_the_parent_is(self):
         context = multiprocessing.get_context('spawn')
-        answers = context.Queue()
-        child = context.Process(target=_make_in_child, args=(answers,))
-        child.start()
-        found = answers.get(timeout=60)
-        child.join(timeout=60)
-        np.testing.assert_array_equal(found, VectorEnvironment(FLAT, 2, 2, seed=0).reset())
+        spec = {'environment': FLAT, 'num_envs': 3, 'num_threads': 1, 'seed': 0}
+        random = np.random.default_rng(0)
+        actions = random.uniform(-1, 1, (25, 3, 6))  # falls and resets are among the steps
+        for action in actions[:10]:
+            self.rows.step(action)
+        arguments = pickle.dumps((spec, self.rows.get_state(), actions[10:]))
+        answers, workers = context.Queue(), []
+        for _ in range(2):
+            workers.append(context.Process(target=_go_on, args=(arguments, answers)))
+            workers[-1].start()
+        steps = [self.rows.step(action) for action in actions[10:]]
+        self.assertTrue(any(step.terminated.any() for step in steps))
+        expected = [np.column_stack([*step[:4]]) for step in steps]
+        first = VectorEnvironment(**spec).reset()
+        for _ in workers:
+            theirs, found = answers.get(timeout=100)
+            np.testing.assert_array_equal(theirs, first)
+            np.testing.assert_array_equal(found, expected)
+        for worker in workers:
+            worker.join(timeout=60)
+            self.assertEqual(worker.exitcode, 0)
+
+    @parameterized.parameters('os._exit(0)', 'sys.exit(0)')
+    def test_a_forked_worker_makes_its_own(self, leave):
+        if not hasattr(os, 'fork'):
+            self.skipTest('no fork here')
+        done = subprocess.run(
+            [sys.executable, '-c', FORKED.replace('LEAVE', leave)],
+            capture_output=True, text=True, timeout=100,
+        )  # fmt: skip
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn('does not survive a fork', done.stdout)
+        self.assertEndsWith(done.stdout, 'True\nchild 0\n')
+
+
+FORKED = f"""
+import os, signal, sys
+import numpy as np
+from trl_suite.vector import VectorEnvironment
+
+make = lambda: VectorEnvironment({FLAT!r}, 2, 2, seed=0)
+roll = lambda rows: [rows.reset(), rows.step(np.ones((2, 6))).observation]
+rows, other = make(), make()
+expected = roll(rows)
+child = os.fork()
+if child == 0:
+    signal.alarm(30)
+    try:
+        rows.step(np.ones((2, 6)))
+    except RuntimeError as error:
+        print(error)
+    other.close()
+    rows = make()  # lets the inherited one go, which must not wait for its threads
+    print(np.array_equal(roll(rows), expected), flush=True)
+    LEAVE
+status = os.waitpid(child, 0)[1]
+rows.step(np.ones((2, 6)))  # unharmed
+print('child', status)
+"""
 
 
 def _step_in_child(rows, answers):
@@ -285,5 +439,19 @@ def _step_in_child(rows, answers):
         answers.put(str(error))
 
 
-def _make_in_child(answers):
-    answers.put(VectorEnvironment(FLAT, 2, 2, seed=0).reset())
+def _never_failing(task):
+    finish_step = task.finish_step
+
+    def finish(*arguments):
+        finish_step(*arguments)
+        task.failed[:] = False
+
+    return finish
+
+
+def _go_on(arguments, answers):
+    spec, state, actions = pickle.loads(arguments)
+    rows = VectorEnvironment(**spec)
+    first = rows.reset()
+    rows.set_state(state)
+    answers.put((first, [np.column_stack([*rows.step(action)[:4]]) for action in actions]))

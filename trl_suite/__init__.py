@@ -23,7 +23,10 @@ if (
 
 __version__ = '0.1.0'
 
-_FROM_SUITE = ('ALL_IDS', 'ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN', 'build', 'load', 'make')
+_FROM_SUITE = (
+    'ALL_IDS', 'ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN', 'build', 'load', 'make',
+    'reference_policy',
+)  # fmt: skip
 __all__ = ['suite', *_FROM_SUITE]
 
 

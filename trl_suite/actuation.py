@@ -1,4 +1,4 @@
-"""Four actuation models, selectable on every character: torque, velocity, position, muscle.
+"""Four actuation models: torque, velocity, position, and muscle where a character has muscles.
 
 Each adds actuators to a character's MJCF and returns an `ActionMap`: the affine map from the
 agent's action in [-1, 1] to physical units. No model lets a joint exceed the torque limit of the
@@ -8,6 +8,8 @@ The servos follow the original's gains, with what explicit simulation needs adde
 every actuated joint gets an armature, a joint limit of two physics steps stiffness, and some
 passive damping. All of a servo's damping inside its force clamp chatters, all of it outside caps
 the joint's speed below what a bound needs, so it is split.
+
+Where a joint is prismatic, read m for rad, N for N m and kg for kg m^2.
 """
 
 from __future__ import annotations
@@ -27,8 +29,10 @@ ARMATURE = 0.01  # kg m^2
 DAMPING_DIVISOR = 50.0  # passive damping of torque and position joints: torque limit / this, in s
 MUSCLE_DAMPING_DIVISOR = 100.0  # the force-velocity curve damps as well
 TORQUE_SCALE = 0.75  # of the limit at full action
+FORCE_SCALE = 1.0  # the same of a prismatic joint
 VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
-POSITION_HALF_RANGE = 1.5  # rad at full action
+SLIDE_VELOCITY_SCALE = 10.0  # m/s; at rest the hopper's leg then meets its force limit
+POSITION_HALF_RANGE = 1.5  # rad at full action; of a prismatic joint half its range
 EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
 
 
@@ -39,7 +43,7 @@ class ActionMap:
     Attributes:
       names: what each action drives, shape (k,).
       quantity: what the controls are, e.g. 'target angle'.
-      unit: physical unit of the controls.
+      unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
       centre: control at action 0, shape (k,).
       half_range: change of control per unit action, shape (k,).
     """
@@ -80,6 +84,17 @@ def _prepare(character: Character, timestep: float, damping: np.ndarray) -> None
         joint.solreflimit = (2 * timestep, 1)
 
 
+def _by_type(character: Character, revolute: float, prismatic: float) -> np.ndarray:
+    """Returns one of two figures for each joint, shape (J,)."""
+    return np.where(character.prismatic, prismatic, revolute)
+
+
+def _unit(character: Character, revolute: str, prismatic: str) -> str:
+    """Returns the unit of controls that drive joints."""
+    slides = np.array(list(character.row.joints))[character.prismatic]
+    return f'{revolute} ({", ".join(slides)}: {prismatic})' if len(slides) else revolute
+
+
 def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap:
     limits = character.torque_limits
     _prepare(character, timestep, limits / DAMPING_DIVISOR)
@@ -88,7 +103,9 @@ def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap
             'motor', name=name, joint=joint, ctrllimited=True, ctrlrange=(-limit, limit)
         )
     names = tuple(character.row.joints)
-    return ActionMap(names, 'torque', 'N m', np.zeros(len(limits)), TORQUE_SCALE * limits)
+    scale = _by_type(character, TORQUE_SCALE, FORCE_SCALE)
+    unit = _unit(character, 'N m', 'N')
+    return ActionMap(names, 'torque', unit, np.zeros(len(limits)), scale * limits)
 
 
 def _add_velocity(character: Character, timestep: float, **_: object) -> ActionMap:
@@ -105,8 +122,8 @@ def _add_velocity(character: Character, timestep: float, **_: object) -> ActionM
         )  # fmt: skip
     names = tuple(character.row.joints)
     return ActionMap(
-        names, 'target velocity', 'rad/s', np.zeros(len(limits)),
-        np.full(len(limits), VELOCITY_SCALE),
+        names, 'target velocity', _unit(character, 'rad/s', 'm/s'), np.zeros(len(limits)),
+        _by_type(character, VELOCITY_SCALE, SLIDE_VELOCITY_SCALE),
     )  # fmt: skip
 
 
@@ -114,7 +131,7 @@ def _add_position(
     character: Character,
     timestep: float,
     centre: Sequence[float] | np.ndarray | None = None,
-    half_range: float | Sequence[float] | np.ndarray = POSITION_HALF_RANGE,
+    half_range: float | Sequence[float] | np.ndarray | None = None,
     **_: object,
 ) -> ActionMap:
     limits = character.torque_limits
@@ -130,13 +147,19 @@ def _add_position(
             forcelimited=True, forcerange=(-limit, limit),
         )  # fmt: skip
     middle = np.array([joint.target for joint in joints]) if centre is None else np.array(centre)
-    reach = np.broadcast_to(np.asarray(half_range, dtype=float), middle.shape).copy()
-    if middle.shape != (len(joints),) or not (np.all(reach > 0) and np.all(np.isfinite(middle))):
+    if half_range is None:
+        slide = np.ptp(character.joint_ranges, axis=1) / 2
+        half_range = np.where(character.prismatic, slide, POSITION_HALF_RANGE)
+    reach = np.broadcast_to(np.asarray(half_range, dtype=float), len(joints)).copy()
+    if middle.shape != (len(joints),) or not (
+        np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
+    ):
         raise ValueError(
             f'position control of {character.row.name!r}: centre and half_range must be finite, '
             f'positive in range, and broadcast to ({len(joints)},)'
         )
-    return ActionMap(tuple(character.row.joints), 'target angle', 'rad', middle, reach)
+    unit = _unit(character, 'rad', 'm')
+    return ActionMap(tuple(character.row.joints), 'target angle', unit, middle, reach)
 
 
 def _add_muscle(character: Character, timestep: float, **_: object) -> ActionMap:
@@ -190,7 +213,8 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       character: a character without actuators.
       model: one of `ACTUATIONS`.
       timestep: physics time step, s; joint limits are as stiff as it allows.
-      **options: for 'position', `centre` (J,) and `half_range`, rad.
+      **options: for 'position', `centre` (J,) and `half_range`, rad (m where prismatic); by
+        default the working posture, and 1.5 rad or half the range of a prismatic joint.
 
     Returns:
       The map from actions to controls, in the order of the actuators.

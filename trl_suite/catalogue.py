@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from trl_suite import errors
+
 STEP_LIMIT = 256  # control steps after which an episode is cut
 PLAID_SAMPLES = 50  # heights that a PLAiD environment sees, unless it is blind
 
@@ -166,3 +168,15 @@ BY_TASK: dict[tuple[str, str], Row] = {(row.domain, row.task): row for row in RO
 ALIASES: dict[str, Row] = {
     alias: row for row in ROWS for alias in (*row.aliases, f'{row.domain}/{row.task}')
 }
+
+
+def find(id: str) -> Row:
+    """Returns the row of an id or alias.
+
+    Raises:
+      ValueError: unknown id; the message has the closest matches.
+    """
+    row = BY_ID.get(id) or ALIASES.get(id)
+    if row is None:
+        raise ValueError(errors.unknown('environment', id, ALIASES if '/' in str(id) else BY_ID))
+    return row

@@ -3,6 +3,7 @@
     trl-suite list --domain plaid --tag original
     trl-suite info PD_Dog2D_Gaps_Terrain-v0
     trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy clip --video dog.mp4 --ghost
+    trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite terrain slopes_mixed --output slopes.png
 
 Bad input ends with one line on stderr and exit status 2. The engine is imported only by the
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import pathlib
 import re
@@ -23,14 +25,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 import trl_suite
-from trl_suite import catalogue, describe, errors, rendering
+from trl_suite import catalogue, describe, errors, policies, rendering
 
 if TYPE_CHECKING:
     import dm_env
 
     from trl_suite.environment import Environment
 
-POLICIES = ('random', 'zero', 'clip')
+POLICIES = ('reference', 'clip', 'zero', 'random')  # or a file
 SHOWN_EPISODES = 8  # episodes that a rollout prints one by one
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
 _FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
@@ -84,6 +86,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         command.set_defaults(command=function)
         return command
 
+    def add_policy(command: argparse.ArgumentParser, default: str) -> None:
+        command.add_argument(
+            '--policy', default=default, type=_policy_name, metavar='POLICY',
+            help=f'{", ".join(POLICIES)}, or an .npz file; the reference is the trained one shipped',
+        )  # fmt: skip
+
     command = add('list', _list, 'list the environments of the catalogue')
     for name in _FILTERS:
         command.add_argument(f'--{name}', help=f'only those of one {name}')
@@ -95,7 +103,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
     command.add_argument('--steps', type=_positive, default=256, help='control steps')
-    command.add_argument('--policy', default='random', choices=POLICIES, help='what acts')
+    add_policy(command, 'random')
     command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
     command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
     command.add_argument('--columns', type=_positive, default=8, help='pictures in the strip')
@@ -103,6 +111,14 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--ghost', action='store_true', help='draw the reference clip as well')
     command.add_argument('--size', type=_size, default='640x480', metavar='WxH', help='in pixels')
     command.add_argument('--camera', default='side', help='name of a camera')
+
+    command = add('evaluate', _evaluate, 'run a policy for whole episodes, and sum up')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+    add_policy(command, 'reference')
+    command.add_argument('--episodes', type=_positive, default=50, help='how many')
+    command.add_argument('--seed', type=int, default=0, help='of all episodes')
+    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
 
     command = add('terrain', _terrain, 'plot draws of a terrain')
     command.add_argument(
@@ -121,6 +137,12 @@ def _positive(text: str) -> int:
         if int(text) > 0:
             return int(text)
     raise argparse.ArgumentTypeError(f'{text!r} is not a positive integer')
+
+
+def _policy_name(text: str) -> str:
+    if text not in POLICIES and not text.endswith('.npz'):
+        raise argparse.ArgumentTypeError(errors.unknown('policy', text, (*POLICIES, 'FILE.npz')))
+    return text
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -180,7 +202,7 @@ def _rollout(arguments: argparse.Namespace) -> None:
             rendering.check_path(path, suffixes)
     suite = _suite()
     environment = suite.make(arguments.id, {'random': arguments.seed})
-    policy = _policy(arguments.policy, environment, arguments.seed)
+    policy = _policy(arguments.policy, environment, arguments.id, arguments.seed)
     width, height = arguments.size
     in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
     pictures: list[np.ndarray] = []
@@ -219,14 +241,24 @@ def _suite() -> Any:
     return suite
 
 
-def _policy(name: str, environment: Environment, seed: int) -> rendering.Policy:
+def _trained(name: str, id: str) -> policies.Policy:
+    return policies.reference(id) if name == 'reference' else policies.load(name)
+
+
+def _policy(name: str, environment: Environment, id: str, seed: int) -> rendering.Policy:
     size = len(environment.action_map)
     if name == 'zero':
         return lambda time_step: np.zeros(size)
     if name == 'random':
         generator = np.random.default_rng(seed)
         return lambda time_step: generator.uniform(-1, 1, size)
+    if name != 'clip':
+        trained = _trained(name, id)
+        trained.check(environment)
+        return lambda time_step: trained(time_step.observation)
     task: Any = environment.task
+    if not hasattr(task, 'clip_action'):
+        raise ValueError(f'{id} has no clip to follow')
     return lambda time_step: np.clip(task.clip_action(0), -1, 1)
 
 
@@ -311,6 +343,44 @@ class _Record:
             f'{total / steps:.3f} per step; {distance:.2f} m'
         )
         return '\n'.join(lines)
+
+
+# evaluate
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    if arguments.json is not None:
+        rendering.check_path(arguments.json, ('.json',))
+    row = _suite().find(arguments.id)
+    from trl_suite import evaluation
+
+    baseline = evaluation.BASELINES.get(arguments.policy)
+    result = evaluation.evaluate(
+        row, baseline or _trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
+        arguments.threads, factory=baseline is not None,
+    )  # fmt: skip
+    if arguments.json is not None:
+        with rendering.replacing(arguments.json) as part:
+            text = json.dumps({**result, 'policy': arguments.policy}, indent=1, allow_nan=False)
+            part.write_text(f'{text}\n', encoding='utf-8')
+    interval = result['return_interval']
+    lines = (
+        ('policy', arguments.policy),
+        ('episodes', f'{result["episodes"]}, seed {result["seed"]}'),
+        (
+            'return',
+            f'{result["return"]:.2f}'
+            + ('' if interval is None else f' +- {interval:.2f} (95 % confidence)')
+            + f', {result["fraction"]:.1%} of the maximum {result["step_limit"]}',
+        ),
+        ('length', f'{result["length"]:.1f} of {result["step_limit"]} steps'),
+        ('distance', f'{result["distance"]:.2f} m'),
+        ('full length', f'{result["full"]:.0%} of the episodes'),
+        ('falls', f'{result["falls"]:.0%} of the episodes'),
+    )
+    print(row.id)
+    for name, text in lines:
+        print(f'  {name:<12} {text}')
 
 
 # terrain

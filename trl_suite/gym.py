@@ -9,8 +9,8 @@
 Gymnasium 1 has no plugins: without that import the id must name the module, as in
 'trl_suite.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. What has no id is wrapped by hand, as
 `SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the environment's
-own step limit truncates it; `info` has 'reward_terms' (a dict), 'fell', 'diverged', 'distance' (m).
-The terms of a reset are those of the start, for which there is no reward.
+own step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward), 'fell',
+'diverged', 'distance' (m).
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
     def __init__(
         self, environment: str | Row | Environment, *, flat_observation: bool = True,
         task_kwargs: Info | None = None, dtype: DTypeLike = np.float32,
-        render_mode: str | None = None, render_kwargs: Info | None = None,
+        max_episode_steps: int | None = None, render_mode: str | None = None,
+        render_kwargs: Info | None = None,
     ) -> None:  # fmt: skip
         """Makes the environment.
 
@@ -62,6 +63,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
           flat_observation: give one vector of all blocks side by side, else a dict of blocks.
           task_kwargs: as for `suite.load`.
           dtype: of observations and actions, float32 or float64.
+          max_episode_steps: truncate after as many steps, if the environment's own limit does not
+            come first. `gymnasium.make` has a wrapper of its own for it.
           render_mode: 'rgb_array', or None for no pictures.
           render_kwargs: options of `trl_suite.rendering.frame`.
 
@@ -73,9 +76,11 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
             row = suite.find(environment) if isinstance(environment, str) else environment
-            environment = suite.build_row(row, dict(task_kwargs or {}), {})
-        elif task_kwargs:
-            raise ValueError('task_kwargs cannot change an environment that is already made')
+            environment = suite.build_row(row, limited(row, task_kwargs, max_episode_steps), {})
+        elif task_kwargs or max_episode_steps is not None:
+            raise ValueError(
+                'task_kwargs and max_episode_steps cannot change an environment that is already made'
+            )
         self.environment, self._flat, self._dtype = environment, flat_observation, np.dtype(dtype)
         shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
         self.observation_space = observation_space(shapes, flat_observation, dtype)
@@ -141,8 +146,8 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         self, environment: str | Row, num_envs: int = 1, *, num_threads: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         flat_observation: bool = True, task_kwargs: Info | None = None,
-        dtype: DTypeLike = np.float32, render_mode: str | None = None,
-        render_kwargs: Info | None = None,
+        dtype: DTypeLike = np.float32, max_episode_steps: int | None = None,
+        render_mode: str | None = None, render_kwargs: Info | None = None,
     ) -> None:  # fmt: skip
         """Makes the environment; the other arguments and errors are those of `SuiteEnv`.
 
@@ -160,11 +165,12 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
-        options = dict(task_kwargs or {})
+        row = suite.find(environment) if isinstance(environment, str) else environment
+        options = limited(row, task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
-            environment, num_envs, num_threads, options.pop('random', None),
+            row, num_envs, num_threads, options.pop('random', None),
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
-            step_limit=options.pop('step_limit', -1), task_kwargs=options,
+            task_kwargs=options,
         )  # fmt: skip
         self.num_envs = n = self.environment.num_envs
         shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
@@ -206,6 +212,18 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulations."""
         self.environment.close()
+
+
+def limited(row: Row, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
+    """Options whose step limit is the smaller of a row's and Gymnasium's (None or -1 for none)."""
+    options = dict(task_kwargs or {})
+    if max_episode_steps is None or max_episode_steps == -1:
+        return options
+    if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
+        raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
+    own = options.get('step_limit', row.step_limit)
+    options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
+    return options
 
 
 def observation_space(

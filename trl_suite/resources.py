@@ -5,6 +5,6 @@ import pathlib
 
 
 def directory(kind: str) -> pathlib.Path:
-    """Returns the folder of the data files of one kind, 'xml' or 'mocap'."""
+    """Returns the folder of the data files of one kind, 'xml', 'mocap' or 'trained'."""
     inside = pathlib.Path(str(importlib.resources.files(__package__))) / kind
     return inside if inside.is_dir() else pathlib.Path(__file__).resolve().parents[1] / kind

@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from trl_suite import actuation as actuation_models
-from trl_suite import catalogue, characters, errors, motion
+from trl_suite import catalogue, characters, errors, motion, policies
 from trl_suite import terrain as terrains
 from trl_suite.arenas import PlanarTerrain
-from trl_suite.catalogue import Row
+from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
 from trl_suite.tasks.imitation import Imitation
 from trl_suite.tasks.task import Task
@@ -89,17 +89,14 @@ def make(
     return build_row(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
-def find(id: str) -> Row:
-    """Returns the row of an id or alias.
+def reference_policy(id: str) -> policies.Policy:
+    """Returns the trained policy that the suite ships for an id or alias.
 
     Raises:
       ValueError: unknown id; the message has the closest matches.
+      FileNotFoundError: none is shipped for it; the message has the closest that have one.
     """
-    row = catalogue.BY_ID.get(id) or catalogue.ALIASES.get(id)
-    if row is None:
-        known = catalogue.ALIASES if '/' in str(id) else catalogue.BY_ID
-        raise ValueError(errors.unknown('environment', id, known))
-    return row
+    return policies.reference(id)
 
 
 def build(

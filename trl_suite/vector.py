@@ -10,7 +10,9 @@ whatever the number of rows and threads, and whenever rows are reset.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -20,10 +22,23 @@ from numpy.typing import DTypeLike
 from trl_suite import errors, suite
 from trl_suite.catalogue import Row
 from trl_suite.environment import Environment
-from trl_suite.tasks.task import episode_seed
+from trl_suite.tasks.task import Task
 from trl_suite.world import BatchWorld, light_model
 
 AUTORESET = ('next_step', 'same_step', 'disabled')
+
+_worlds: weakref.WeakSet[BatchWorld] = weakref.WeakSet()  # that live in this process
+
+
+def _keep_worlds() -> None:
+    # Freeing a batch waits for its threads, of which a forked child has none: it would wait for
+    # ever. One reference too many, so that nothing frees it, not even the interpreter's end.
+    for world in _worlds:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(world))
+
+
+if hasattr(os, 'register_at_fork'):
+    os.register_at_fork(after_in_child=_keep_worlds)
 
 
 class Step(NamedTuple):
@@ -33,7 +48,7 @@ class Step(NamedTuple):
       observation: (n, size), or a dict of blocks (n, ...) in order.
       reward: (n,).
       terminated: rows that failed, (n,) bool.
-      truncated: rows that were cut by the step limit, (n,) bool.
+      truncated: rows that were cut by the step or time limit, (n,) bool.
       info: arrays of n rows: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), and with
         autoreset 'same_step' 'final_observation' where 'ended' says so.
     """
@@ -59,6 +74,7 @@ class VectorEnvironment:
       seeds: seed of each row, (n,) uint32.
       blocks: where each observation block lies in the flat vector.
       action_map: what actions mean.
+      control_timestep: duration of a step, s.
     """
 
     def __init__(
@@ -87,7 +103,8 @@ class VectorEnvironment:
           dtype: of observations and rewards, float64 or float32.
           flat_observation: give one array of all blocks side by side, else a dict of blocks.
           step_limit: control steps after which an episode is cut; by default the row's own.
-          task_kwargs: options of the task, as for `suite.load` (without seed and limits).
+          task_kwargs: as for `suite.load`, `time_limit` (s) and `step_limit` included, which goes
+            before the argument above; the seed is an argument here, not an option.
 
         Raises:
           ValueError: unknown names or options, or numbers out of range.
@@ -103,19 +120,32 @@ class VectorEnvironment:
         self.row = suite.find(environment) if isinstance(environment, str) else environment
         self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
         self.flat_observation = flat_observation
-        self.step_limit = self.row.step_limit if step_limit == -1 else step_limit
-        if self.step_limit is not None and not (
-            int(self.step_limit) == self.step_limit and self.step_limit >= 1
-        ):
+        self._task_kwargs = options = dict(task_kwargs or {})
+        if 'random' in options:
+            raise ValueError("task_kwargs has 'random'; here the argument `seed` takes its place")
+        own = self.row.step_limit if step_limit == -1 else step_limit
+        self.step_limit = step_limit = options.pop('step_limit', own)
+        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
             raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
-        self._task_kwargs = dict(task_kwargs or {})
+        self.time_limit: float = options.pop('time_limit', float('inf'))
+        if not self.time_limit > 0:
+            raise ValueError(
+                f'time_limit is {self.time_limit}; expected a positive number of seconds'
+            )
         self._num_threads = int(num_threads)
         self._task = suite.build_task(self.row, self._task_kwargs)
         model = light_model(self._task.root_entity.mjcf_model)
-        self._world: BatchWorld | None = BatchWorld(model, self.num_envs, self._num_threads)
+        self._world: BatchWorld | None = BatchWorld(
+            model, self.num_envs, self._num_threads, self._task.fields
+        )
+        _worlds.add(self._world)
         self._task.bind(self._world)
+        # Simulated time of each row; a field that is bound is copied out in every step.
+        limited = self.time_limit < np.inf
+        self._time: np.ndarray | None = self._world.batch.bind('time') if limited else None
         self._pid = os.getpid()
         self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
+        self.control_timestep: float = self._task.control_timestep
         self._steps = np.zeros(self.num_envs, int)
         self._ended = np.ones(self.num_envs, bool)  # rows that need a reset
         self._fresh = True  # whether no row was ever reset
@@ -208,7 +238,10 @@ class VectorEnvironment:
         terminated = task.failed.copy()
         truncated = np.zeros(self.num_envs, bool)
         if self.step_limit is not None:
-            truncated = (self._steps >= self.step_limit) & ~terminated
+            truncated |= self._steps >= self.step_limit
+        if self._time is not None:
+            truncated |= self._time >= self.time_limit
+        truncated &= ~terminated
         self._ended = terminated | truncated
         reward, info = task.reward.astype(self.dtype), task.infos()
         if self.autoreset == 'same_step':
@@ -238,10 +271,16 @@ class VectorEnvironment:
         self._picture.task.world.set_state(0, self._world.get_state(row))
         return rendering.frame(self._picture, **options)
 
+    @property
+    def task(self) -> Task:
+        """The rules, with arrays of n rows."""
+        self._check_usable()
+        return self._task
+
     def close(self) -> None:
         """Frees the simulations; may be called twice."""
         self._world = None
-        self._task = None  # type: ignore[assignment]
+        self._task = self._time = None  # type: ignore[assignment]
         if self._picture is not None:
             self._picture.close()
             self._picture = None
@@ -281,7 +320,7 @@ class VectorEnvironment:
         )
 
     def _begin(self, rows: np.ndarray) -> None:
-        self._task.begin_episodes(rows, [episode_seed(self._random[row]) for row in rows.tolist()])
+        self._task.begin_episodes(rows, [self._random[row] for row in rows.tolist()])
         self._steps[rows] = 0
         self._ended[rows] = False
 

@@ -31,8 +31,8 @@ class World:
     Attributes:
       n: number of simulations.
       models: the MjModel of each; write terrain there, then call `set_const`.
-      qpos, qvel, ...: the fields of MjData named in `WRITABLE` and `READABLE`, shape (n, ...);
-        live views, the latter read-only.
+      qpos, qvel, ...: the fields of MjData named in `WRITABLE` and `READABLE`, and what else was
+        asked for, shape (n, ...); live views, all but the writable read-only.
     """
 
     qpos: np.ndarray
@@ -48,6 +48,11 @@ class World:
     subtree_com: np.ndarray
     sensordata: np.ndarray
     ten_length: np.ndarray
+    # Bound only for tasks that ask for them.
+    M: np.ndarray
+    qfrc_bias: np.ndarray
+    xanchor: np.ndarray
+    site_xpos: np.ndarray
 
     def __init__(self, model: mujoco.MjModel, models: list[mujoco.MjModel]) -> None:
         self.n = len(models)
@@ -92,6 +97,9 @@ class World:
     def body_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_BODY, names)
 
+    def site_ids(self, names: Sequence[str]) -> np.ndarray:
+        return self._ids(mujoco.mjtObj.mjOBJ_SITE, names)
+
     def geom_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_GEOM, names)
 
@@ -121,14 +129,14 @@ class World:
 class PhysicsWorld(World):
     """One simulation over a dm_control Physics."""
 
-    def __init__(self, physics: mjcf.Physics) -> None:
+    def __init__(self, physics: mjcf.Physics, fields: Sequence[str] = ()) -> None:
         # The raw pointers, not the physics: dm_control hands out weak proxies of it.
         model, self._data = physics.model.ptr, physics.data.ptr
         super().__init__(model, [model])
         self._divergence = self._data.warning.number[_DIVERGED]
-        for field in WRITABLE + READABLE:
+        for field in _bound(fields):
             view = getattr(self._data, field)[None]
-            if field in READABLE:
+            if field not in WRITABLE:
                 view.flags.writeable = False
             setattr(self, field, view)
 
@@ -172,18 +180,21 @@ class BatchWorld(World):
     `trl_suite.vector`.
     """
 
-    def __init__(self, model: mujoco.MjModel, n: int, num_threads: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, n: int, num_threads: int, fields: Sequence[str] = ()
+    ) -> None:
         """Makes n simulations.
 
         Args:
           model: what all of them share; copied once per simulation, so it should be light.
           n: number of simulations.
           num_threads: threads that step them; 0 takes all cores.
+          fields: of MjData, to be bound beside those of `WRITABLE` and `READABLE`.
         """
         super().__init__(model, [copy.copy(model) for _ in range(n)])
         self.batch = batch.Batch(model, n, nthread=num_threads)
         self._edited = True  # whether the batch must be told of edits of the models
-        for field in WRITABLE + READABLE:
+        for field in _bound(fields):
             setattr(self, field, self.batch.bind(field))
         self._tell()
         # A field is zero until the first call after it was bound.
@@ -222,6 +233,10 @@ class BatchWorld(World):
 
     def diverged(self) -> np.ndarray:
         return self.batch.warning[:, _DIVERGED, 1].any(1)
+
+
+def _bound(fields: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys((*WRITABLE, *READABLE, *fields)))
 
 
 def light_model(root: mjcf.RootElement) -> mujoco.MjModel:

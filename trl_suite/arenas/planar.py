@@ -80,16 +80,22 @@ class PlanarTerrain(composer.Arena):
         self.strips[row] = strip
         self._lay(row, 0)
 
-    def follow(self, x: np.ndarray) -> None:
-        """Keeps ground under and ahead of characters whose roots are at x, m, shape (n, 1)."""
-        moved = x - self._centre
+    def follow(self, x: np.ndarray, rows: np.ndarray | None = None) -> None:
+        """Keeps ground under and ahead of characters.
+
+        Args:
+          x: where their roots are, m, (n, 1), or of the given rows only, (m, 1).
+          rows: sorted numbers of simulations; None for all.
+        """
+        moved = x - (self._centre if rows is None else self._centre[rows])
         if np.vdot(moved, moved) > _REACH**2:  # the cheap test; by rows only if it may be so
-            rows = np.flatnonzero(np.abs(moved[:, 0]) > _REACH)
-            for row in rows.tolist():
+            far = np.flatnonzero(np.abs(moved[:, 0]) > _REACH)
+            leaving = far if rows is None else rows[far]
+            for row, root in zip(leaving.tolist(), x[far, 0].tolist(), strict=True):
                 # The window starts at multiples of the advance, however far a row has jumped.
-                self._lay(row, round(float(x[row, 0]) / ADVANCE) * _ADVANCE)
-            if len(rows):  # contacts of the open step name boxes that now lie elsewhere
-                self._world.forward(rows)
+                self._lay(row, round(root / ADVANCE) * _ADVANCE)
+            if len(leaving):  # contacts of the open step name boxes that now lie elsewhere
+                self._world.forward(leaving)
 
     def height(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""

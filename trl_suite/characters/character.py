@@ -20,6 +20,9 @@ GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is dra
 class Joint:
     """Figures of one actuated joint that its MJCF element does not hold.
 
+    Units are those of a revolute joint (hinge). A prismatic joint (slide) has m for rad and N for
+    N m throughout; which of the two a joint is, its MJCF element says.
+
     Attributes:
       kp: position gain, N m/rad.
       kd: damping gain, N m s/rad.
@@ -143,13 +146,18 @@ class Character(composer.Entity):
         return [geom for geom in geoms if geom.dclass.dclass != 'group0']
 
     @property
+    def prismatic(self) -> np.ndarray:
+        """Which joints slide instead of turning, shape (number of joints,) bool."""
+        return np.array([joint.type == 'slide' for joint in self.joints])
+
+    @property
     def torque_limits(self) -> np.ndarray:
-        """Largest joint torques in N m, shape (number of joints,)."""
+        """Largest joint torques in N m, forces in N where prismatic, shape (number of joints,)."""
         return np.array([joint.actuatorfrcrange[1] for joint in self.joints])
 
     @property
     def joint_ranges(self) -> np.ndarray:
-        """Joint limits in rad, shape (number of joints, 2); infinite where a joint turns freely."""
+        """Joint limits in rad, in m where prismatic, shape (number of joints, 2); infinite if free."""
         free = (-np.inf, np.inf)
         return np.array([free if joint.range is None else joint.range for joint in self.joints])
 
@@ -168,12 +176,12 @@ class CharacterObservables(composer.Observables):
 
     @composer.observable
     def joints_pos(self) -> observable.MJCFFeature:
-        """Joint angles, rad, shape (number of joints,)."""
+        """Joint angles in rad, lengths in m where prismatic, shape (number of joints,)."""
         return observable.MJCFFeature('qpos', self._entity.joints)
 
     @composer.observable
     def joints_vel(self) -> observable.MJCFFeature:
-        """Joint rates, rad/s, shape (number of joints,)."""
+        """Joint rates in rad/s, in m/s where prismatic, shape (number of joints,)."""
         return observable.MJCFFeature('qvel', self._entity.joints)
 
     @composer.observable
@@ -226,7 +234,7 @@ def body_figures(character: Character) -> dict[str, Any]:
         inertia += frame @ np.diag(principal) @ frame.T
         inertia += m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     lowest = min(
-        lowest_point(physics.data.geom_xpos[i], physics.data.geom_xmat[i], model.geom_size[i])
+        lowest_point(data.geom_xpos[i], data.geom_xmat[i], model.geom_aabb[i, 3:])
         for i in range(model.ngeom)
         if model.geom_group[i] == GROUP_COLLISION
     )

@@ -10,7 +10,8 @@ from trl_suite.characters.character import CharacterRow, Joint
 # rad higher), but scales actions by the file's numbers.
 _FILE_RANGE = (-1.57, 1.57)
 
-# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order.
+# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; a prismatic
+# joint has m for rad and N for N m.
 _DOG_JOINTS = {
     'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
     'spine1': Joint(200, 20, 0.5),
@@ -64,6 +65,15 @@ _BIPED2D_JOINTS = {
     'left_ankle': Joint(100, 10, 0.2),
 }
 
+_BIPED2D_SIMBICON_JOINTS = {
+    'right_hip': Joint(200, 20, 0.3),
+    'right_knee': Joint(200, 20, 0.3),
+    'right_ankle': Joint(150, 15, 0.2),
+    'left_hip': Joint(200, 20, 0.3),
+    'left_knee': Joint(200, 20, 0.3),
+    'left_ankle': Joint(150, 15, 0.2),
+}
+
 _BIPED2D_FULL_JOINTS = {
     'right_hip': Joint(200, 20, 0.3),
     'right_knee': Joint(200, 20, 0.3),
@@ -76,6 +86,12 @@ _BIPED2D_FULL_JOINTS = {
     'left_shoulder': Joint(150, 15, 0.3),
     'left_forearm': Joint(100, 10, 0.3),
     'neck': Joint(100, 10, 0.3),
+}
+
+# The original calls these two spine0 and spine1. The leg is prismatic.
+_HOPPER_JOINTS = {
+    'hip': Joint(200, 20, 0.5),
+    'leg': Joint(1000, 20, 0.5),
 }
 
 DOG = CharacterRow(
@@ -119,6 +135,15 @@ BIPED2D = CharacterRow(
     description='Biped, 7 links: a trunk of 25 kg and two legs; the feet are the ankle links.',
 )
 
+BIPED2D_SIMBICON = CharacterRow(
+    name='biped2d_simbicon',
+    joints=_BIPED2D_SIMBICON_JOINTS,
+    fall_links=('root',),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
+)
+
 BIPED2D_FULL = CharacterRow(
     name='biped2d_full',
     joints=_BIPED2D_FULL_JOINTS,
@@ -131,6 +156,15 @@ BIPED2D_FULL = CharacterRow(
     description='Biped with arms and head, 12 links, with human torque limits.',
 )  # fmt: skip
 
+HOPPER = CharacterRow(
+    name='hopper',
+    joints=_HOPPER_JOINTS,
+    fall_links=('root',),
+    end_effectors=('leg',),  # none in the original's file; the foot is the lower end of the leg
+    stumble_exempt=('leg',),
+    description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
+)
+
 CHARACTERS: dict[str, CharacterRow] = {
-    row.name: row for row in (DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_FULL)
+    row.name: row for row in (DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER)
 }

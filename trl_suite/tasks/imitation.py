@@ -20,7 +20,7 @@ from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.reference import Reference
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive
+from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive, drawn_seed
 from trl_suite.terrain import Strip
 from trl_suite.world import World
 
@@ -201,12 +201,13 @@ class Imitation(Task):
         view.phase_out = block.get('phase')
         return view
 
-    def begin_episodes(self, rows: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        for row, seed in zip(rows.tolist(), seeds, strict=True):
-            terrain_seed, start_seed = seed.spawn(2)
-            phase = self._start_phase
-            if phase is None:
-                phase = np.random.default_rng(start_seed).uniform()
+    def begin_episodes(
+        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> None:
+        for row, random_state in zip(rows.tolist(), random_states, strict=True):
+            # Drawn even where it is not asked for, so that the terrain does not depend on it.
+            drawn = random_state.random_sample()
+            phase = drawn if self._start_phase is None else self._start_phase
             self.phase[row] = phase
             upstream = {}
             if self._spawn == 'upstream':
@@ -214,7 +215,11 @@ class Imitation(Task):
                 start = self.clip.pose(np.array([phase * self.reference.period]))[0]
                 upstream['centre'] = start[0] - 0.5
             strip = Strip(
-                self.arena.terrain, terrain_seed, blend=self._blend, spawn=self._spawn, **upstream
+                self.arena.terrain,
+                drawn_seed(random_state),
+                blend=self._blend,
+                spawn=self._spawn,
+                **upstream,
             )
             self.arena.begin_episode(row, strip)
         self._cycles[rows] = self._start_cycles[rows] = self.phase[rows]
@@ -278,10 +283,10 @@ class Imitation(Task):
 
     def infos(self) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
+        # An observation has terms, also that of a start; but a start has no reward, nor its parts.
+        terms = self.reward_terms.T * (self.reward != 0)
         return {
-            'reward_terms': dict(
-                zip(rewards.IMITATION_TERMS, self.reward_terms.T.copy(), strict=True)
-            ),
+            'reward_terms': dict(zip(rewards.IMITATION_TERMS, terms, strict=True)),
             'fell': self.failed & ~self.diverged,
             'diverged': self.diverged.copy(),
             'distance': self._all.x[:, 0].copy(),

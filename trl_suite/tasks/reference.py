@@ -144,5 +144,7 @@ def link_extents(
       Centres in x, half lengths in x, and lowest points, shape (3, geoms).
     """
     centre = data.geom_xpos[geoms][:, ::2] - root
-    half = (np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3)) * model.geom_size[geoms, None]).sum(2)
+    half = (np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3)) * model.geom_aabb[geoms, None, 3:]).sum(
+        2
+    )
     return np.stack([centre[:, 0], half[:, 0], centre[:, 1] - half[:, 2]])

@@ -44,6 +44,7 @@ class Task(composer.Task):
     reward: np.ndarray
     failed: np.ndarray
     diverged: np.ndarray
+    fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
     _begun = False  # whether no step was taken since composer's reset
 
     # What a family implements.
@@ -53,8 +54,10 @@ class Task(composer.Task):
         """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
 
     @abc.abstractmethod
-    def begin_episodes(self, rows: np.ndarray, seeds: Sequence[np.random.SeedSequence]) -> None:
-        """Draws terrain and start of some rows, each from its seed; `observe` is yet to follow."""
+    def begin_episodes(
+        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> None:
+        """Draws terrain and start of some rows, each from its stream; `observe` is yet to follow."""
 
     @abc.abstractmethod
     def observe(self) -> None:
@@ -99,7 +102,7 @@ class Task(composer.Task):
     # Composer's interface: one simulation.
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        self.bind(PhysicsWorld(physics))
+        self.bind(PhysicsWorld(physics, self.fields))
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
         super().set_timesteps(control_timestep, physics_timestep)
@@ -108,7 +111,7 @@ class Task(composer.Task):
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        self.begin_episodes(_ONLY_ROW, [episode_seed(random_state)])
+        self.begin_episodes(_ONLY_ROW, [random_state])
         self.observe()
         self._begun = True
 
@@ -152,9 +155,9 @@ class Task(composer.Task):
         return self._task_observables
 
 
-def episode_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
-    """Draws the seed of one episode: whatever the episode draws depends on nothing else."""
-    return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32).tolist())
+def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
+    """Draws the seed of a stream of its own, for what goes on to draw during an episode."""
+    return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32))
 
 
 def consecutive(sizes: dict[str, int]) -> dict[str, slice]:

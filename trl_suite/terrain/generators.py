@@ -320,11 +320,12 @@ def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) 
     changes, thresholds = rng.random((2, count))
     changes *= abs(parameters['SlopeDeltaRange'])
     thresholds = low + (high - low) * thresholds
-    slope, slopes = 0.0, []
+    slope = 0.0
     # Plain floats: a walk that looks at its own last value cannot be vectorised.
-    for change, threshold in zip(changes.tolist(), thresholds.tolist(), strict=True):
-        slope += -change if slope > threshold else change
-        slopes.append(slope)
+    slopes = [
+        slope := slope - change if slope > threshold else slope + change
+        for change, threshold in zip(changes.tolist(), thresholds.tolist(), strict=True)
+    ]
     offsets = np.cumsum(slopes) * SPACING
     return Profile(profile.heights + offsets, profile.vertical)
 

@@ -15,6 +15,7 @@ from trl_suite.terrain.parameters import Terrain
 STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
 PAD_END = 1.0  # m; the flat start ends here
 INTENDED_CENTRE = -1.0  # m
+_FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # draws between two parts; 2**128 by the golden ratio
 
 
 class Strip:
@@ -73,9 +74,12 @@ class Strip:
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
-        # Two far parts of one stream: quicker to make than two streams.
-        right = np.random.PCG64(_sequence(seed))
-        self._right, self._left = np.random.Generator(right), np.random.Generator(right.jumped())
+        # Two far parts of one stream; `jumped` would draw a seed from the system for nothing.
+        sequence = _sequence(seed)
+        left = np.random.PCG64(sequence)
+        left.advance(_FAR)
+        self._right = np.random.Generator(np.random.PCG64(sequence))
+        self._left = np.random.Generator(left)
 
     @property
     def extent(self) -> tuple[float, float]:

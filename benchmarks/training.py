@@ -1,0 +1,61 @@
+"""What learning costs: samples per second of examples/ppo.py against random actions alone.
+
+    python benchmarks/training.py [--seconds S]
+
+Both numbers come from one process with as many rows and threads, by turns; the ratio is what counts.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+import numpy as np
+import torch
+
+from trl_suite.vector import VectorEnvironment
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import ppo
+
+IDS = (
+    'PD_Biped2D_LLC_Imitate_Flat-v0',
+    'PD_Biped2D_Gaps_Terrain-v0',
+    'PD_Raptor2D_LLC_Imitate_Flat-v0',
+    'PD_Dog2D_Slopes_Terrain-v0',
+)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=20.0, help='per environment and kind')
+    parser.add_argument('--threads', type=int, default=2)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    print('samples per second, learning / random actions: ratio')
+    for id_ in IDS:
+        trainer = ppo.Trainer(id_, 0, ppo.settings_for(id_), arguments.threads)
+        rows = trainer.settings.num_envs
+        environments = VectorEnvironment(id_, rows, arguments.threads, 0)
+        environments.reset()
+        size = len(environments.action_map)
+        actions = np.random.default_rng(0).uniform(-1, 1, (50, rows, size))
+        steps, seconds = {'learning': 0, 'random': 0}, {'learning': 0.0, 'random': 0.0}
+        trainer.learn(trainer.collect())
+        while min(seconds.values()) < arguments.seconds:
+            begin = time.perf_counter()
+            before = trainer.samples
+            trainer.learn(trainer.collect())
+            seconds['learning'] += time.perf_counter() - begin
+            steps['learning'] += trainer.samples - before
+            begin = time.perf_counter()
+            for action in actions:
+                environments.step(action)
+            seconds['random'] += time.perf_counter() - begin
+            steps['random'] += rows * len(actions)
+        learning, random = (steps[kind] / seconds[kind] for kind in steps)
+        print(f'{id_}: {learning:.0f} / {random:.0f}: {learning / random:.2f}', flush=True)
+
+
+if __name__ == '__main__':
+    main()

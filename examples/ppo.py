@@ -1,0 +1,450 @@
+"""Trains a policy with proximal policy optimisation, in one file, on the CPU.
+
+    python examples/ppo.py PD_Biped2D_LLC_Imitate_Flat-v0 --seed 1
+    python examples/ppo.py PD_Dog2D_Gaps_Terrain-v0 --samples 4e6 --threads 2 --output runs
+
+Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it
+had never stopped), `curve.json` (settings, learning curve), `policy.npz` (the policy that scored
+best in the evaluations of the curve, for `trl_suite.policies`), and at the end `last.npz`.
+
+PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
+Implementation Details of PPO). Needs `pip install 'trl_suite[train]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import fnmatch
+import itertools
+import json
+import os
+import pathlib
+import time
+from typing import Any
+
+import numpy as np
+import torch
+import tqdm
+from torch import nn
+
+from trl_suite import evaluation, policies, suite
+from trl_suite.catalogue import Row
+from trl_suite.tasks import rewards
+from trl_suite.vector import VectorEnvironment
+
+EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
+OBSERVATION_CLIP = 10.0  # in standard deviations
+LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a run depends on besides environment and seed."""
+
+    samples: float = 1e6  # control steps in all, of all rows
+    num_envs: int = 64
+    horizon: int = 32  # control steps of each row between two updates
+    epochs: int = 5
+    minibatch: int = 512
+    learning_rate: float = 3e-4
+    last_learning_rate: float = 5e-5  # falls linearly
+    gamma: float = 0.95  # 0.67 s at 30 Hz
+    lambda_: float = 0.95
+    clip: float = 0.2
+    kl_per_action: float = 0.004  # an update stops at this mean divergence times the actions
+    hidden: tuple[int, ...] = (256, 256)
+    initial_std: float = 0.2  # of actions in [-1, 1]
+    bound_cost: float = 0.1  # times the squared excess of a mean action over 1
+    gradient_norm: float = 0.5
+    # In training an episode also ends when a reward term, as share of its maximum and smoothed over
+    # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
+    # local optimum. Evaluations are without it.
+    least_share: dict[str, float] = dataclasses.field(default_factory=dict)
+    patience: float = 0.3
+    evaluate_every: float = 1e5  # control steps
+    evaluation_episodes: int = 32
+
+
+# What differs from the defaults, by the pattern of an id; a later row wins.
+RUNS = {'least_share': {'com': 0.37}}  # about 1 m/s off the clip's speed
+RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
+OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ('*', {'samples': 0.8e6}),
+    ('*_Run_*', {'samples': 1e6, **RUNS}),
+    ('*_Raptor2D_*', {'samples': 1.5e6, **RUNS}),
+    ('*_Dog2D_*', {'samples': 2e6, **RUNS}),
+    ('PD_Raptor2D_*Flat*', {'samples': 1e6}),
+    ('PD_Dog2D_*Flat*', {'samples': 1.5e6}),
+    ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
+    ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
+    *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
+)
+
+
+def settings_for(id_: str, **changes: Any) -> Settings:
+    """The settings of an environment."""
+    values: dict[str, Any] = {}
+    for pattern, row in OVERRIDES:
+        if fnmatch.fnmatchcase(id_, pattern):
+            values.update(row)
+    return Settings(**{**values, **changes})
+
+
+class Scales:
+    """Running mean and standard deviation of observations.
+
+    The phase stays as it is, and all heights of the terrain share one scale: their shape is what
+    counts, and where the ground is flat nothing is blown up.
+    """
+
+    def __init__(self, blocks: dict[str, slice], size: int) -> None:
+        self.blocks, self.count = blocks, 0
+        self.mean, self.square = np.zeros(size), np.ones(size)
+
+    def update(self, batch: np.ndarray) -> None:
+        """Takes in observations (n, size)."""
+        weight = len(batch) / (self.count + len(batch))
+        self.count += len(batch)
+        mean, square = batch.mean(0), (batch**2).mean(0)
+        if 'phase' in self.blocks:
+            part = self.blocks['phase']
+            mean[part], square[part] = 0.0, 1.0
+        if 'terrain' in self.blocks:
+            part = self.blocks['terrain']
+            mean[part], square[part] = 0.0, square[part].mean()
+        self.mean += weight * (mean - self.mean)
+        self.square += weight * (square - self.square)
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(np.maximum(self.square - self.mean**2, LEAST_STD**2))
+
+    def __call__(self, observation: np.ndarray) -> torch.Tensor:
+        scaled = np.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        return torch.from_numpy(scaled.astype(np.float32))
+
+
+def network(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
+        linear = nn.Linear(fan_in, fan_out)
+        last = i == len(sizes) - 2
+        nn.init.orthogonal_(linear.weight, last_gain if last else 2**0.5)
+        nn.init.zeros_(linear.bias)
+        layers += [linear] if last else [linear, nn.Tanh()]
+    return nn.Sequential(*layers)
+
+
+def advantages(
+    reward: np.ndarray,
+    value: np.ndarray,
+    following: np.ndarray,
+    ended: np.ndarray,
+    gamma: float,
+    lambda_: float,
+) -> np.ndarray:
+    """Generalised advantage estimation (Schulman et al. 2016, arXiv:1506.02438).
+
+    Args:
+      reward: of each step, (time, rows), like all arrays.
+      value: estimated before the step.
+      following: estimated after it: of the state in which a truncated episode was cut, 0 after a
+        failure.
+      ended: whether the episode ended with the step.
+      gamma: discount per step.
+      lambda_: share of the longer estimates.
+    """
+    result, running = np.empty_like(reward), np.zeros(reward.shape[1])
+    for t in reversed(range(len(reward))):
+        error = reward[t] + gamma * following[t] - value[t]
+        running = error + gamma * lambda_ * ~ended[t] * running
+        result[t] = running
+    return result
+
+
+class Trainer:
+    """One run: the simulations, the networks, and where it has got to."""
+
+    def __init__(self, environment: str | Row, seed: int, settings: Settings, threads: int) -> None:
+        torch.manual_seed(seed)
+        self.seed, self.settings, self.threads = seed, settings, threads
+        s = settings
+        self.environments = VectorEnvironment(
+            environment, s.num_envs, threads, seed, autoreset='disabled'
+        )
+        self.row = self.environments.row
+        self.observation = self.environments.reset()
+        self.random = np.random.default_rng(seed)
+        inputs, outputs = self.observation.shape[1], len(self.environments.action_map)
+        self.scales = Scales(self.environments.blocks, inputs)
+        self.policy = network((inputs, *s.hidden, outputs), 0.01)
+        self.value = network((inputs, *s.hidden, 1), 1.0)
+        self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
+        self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
+        self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
+        self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
+        self.samples, self.curve, self.best = 0, [], -np.inf
+        self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
+        self.recent = np.zeros(3)  # return, steps and number of the episodes ended lately
+        self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
+
+    def collect(self) -> dict[str, torch.Tensor]:
+        """Steps all rows `horizon` times; returns the samples, flattened."""
+        s, environments = self.settings, self.environments
+        shape = (s.horizon, s.num_envs)
+        observations = np.empty((s.horizon + 1, *self.observation.shape))
+        noise = self.random.standard_normal((*shape, len(self.log_std)), np.float32)
+        means, actions = np.empty_like(noise), np.empty_like(noise)
+        reward, ended, failed = np.empty(shape), np.empty(shape, bool), np.empty(shape, bool)
+        cut: list[tuple[int, np.ndarray, np.ndarray]] = []  # what truncation left unseen
+        std = self.log_std.exp().detach().numpy()
+        for t in range(s.horizon):
+            observations[t] = self.observation
+            with torch.no_grad():
+                means[t] = self.policy(self.scales(self.observation)).numpy()
+            actions[t] = means[t] + std * noise[t]
+            step = environments.step(actions[t])
+            failed[t] = step.terminated | self.strays(step.info['reward_terms'])
+            ended[t] = failed[t] | step.truncated
+            reward[t] = step.reward
+            unseen = np.flatnonzero(ended[t] & ~failed[t])
+            if len(unseen):
+                cut.append((t, unseen, step.observation[unseen]))
+            self.count(reward[t], ended[t])
+            self.observation = step.observation
+            if ended[t].any():
+                self.observation = environments.reset(ended[t])
+                for share in self.shares.values():
+                    share[ended[t]] = 1.0
+        observations[-1] = self.observation
+        self.samples += s.horizon * s.num_envs
+
+        flat = observations.reshape(-1, observations.shape[-1])
+        inputs = self.scales(flat)
+        with torch.no_grad():
+            values = self.value(inputs)[:, 0].numpy().reshape(s.horizon + 1, s.num_envs)
+            following = values[1:].astype(float)
+            for t, rows, last in cut:
+                following[t, rows] = self.value(self.scales(last))[:, 0].numpy()
+        following[failed] = 0.0
+        advantage = advantages(reward, values[:-1], following, ended, s.gamma, s.lambda_)
+        self.scales.update(flat[: -s.num_envs])  # seen only after this update
+        log_probability = -(noise**2 / 2).sum(-1) - np.log(std).sum()
+        return {
+            'observation': inputs[: -s.num_envs],
+            'action': torch.from_numpy(actions).flatten(0, 1),
+            'log_probability': torch.from_numpy(log_probability.astype(np.float32)).flatten(),
+            'advantage': torch.from_numpy(advantage.astype(np.float32)).flatten(),
+            'target': torch.from_numpy((advantage + values[:-1]).astype(np.float32)).flatten(),
+        }
+
+    def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
+        """Rows whose reward terms have been too low for too long."""
+        s, result = self.settings, np.zeros(self.settings.num_envs, bool)
+        forget = self.environments.control_timestep / s.patience
+        for name, least in s.least_share.items():
+            self.shares[name] += forget * (
+                terms[name] / rewards.IMITATION_TERMS[name][0] - self.shares[name]
+            )
+            result |= self.shares[name] < least
+        return result
+
+    def count(self, reward: np.ndarray, ended: np.ndarray) -> None:
+        self.returns += reward
+        self.steps += 1
+        self.recent += self.returns[ended].sum(), self.steps[ended].sum(), ended.sum()
+        self.returns[ended] = self.steps[ended] = 0
+
+    def learn(self, batch: dict[str, torch.Tensor]) -> float:
+        """One update; returns the divergence of the new policy from the old one."""
+        s = self.settings
+        progress = min(self.samples / s.samples, 1.0)
+        rate = s.learning_rate + progress * (s.last_learning_rate - s.learning_rate)
+        for group in self.optimizer.param_groups:
+            group['lr'] = rate
+        advantage = batch['advantage']
+        batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        divergence = 0.0
+        for _ in range(s.epochs):
+            order = torch.from_numpy(self.random.permutation(len(advantage)))
+            for part in order.split(s.minibatch):
+                b = {name: values[part] for name, values in batch.items()}
+                mean = self.policy(b['observation'])
+                log_probability = (
+                    -(((b['action'] - mean) / self.log_std.exp()) ** 2 / 2).sum(-1)
+                    - self.log_std.sum()
+                )
+                log_ratio = log_probability - b['log_probability']
+                ratio = log_ratio.exp()
+                with torch.no_grad():
+                    divergence = float((ratio - 1 - log_ratio).mean())
+                if divergence > s.kl_per_action * mean.shape[1]:
+                    return divergence
+                gain = torch.min(
+                    ratio * b['advantage'],
+                    ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
+                ).mean()
+                value_error = (self.value(b['observation'])[:, 0] - b['target']).square().mean()
+                excess = (mean.abs() - 1).clamp(min=0).square().sum(-1).mean()
+                loss = -gain + 0.5 * value_error + s.bound_cost * excess
+                self.optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(self.parameters, s.gradient_norm)
+                self.optimizer.step()
+        return divergence
+
+    def exported(self) -> policies.Policy:
+        """The policy of now, without PyTorch."""
+        layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
+        return policies.Policy(
+            id=self.row.id,
+            blocks=tuple(
+                (name, part.stop - part.start) for name, part in self.environments.blocks.items()
+            ),
+            actions=tuple(self.environments.action_map.names),
+            quantity=self.environments.action_map.quantity,
+            mean=self.scales.mean,
+            std=self.scales.std,
+            clip=OBSERVATION_CLIP,
+            weights=tuple(layer.weight.detach().numpy().T.copy() for layer in layers),
+            biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
+            activation='tanh',
+            log_std=self.log_std.detach().numpy().copy(),
+            info={'seed': self.seed, 'samples': self.samples},
+        )
+
+    def evaluate(self, folder: pathlib.Path, divergence: float) -> None:
+        """Adds a point to the curve; keeps the policy if it is the best so far."""
+        policy = self.exported()
+        found = evaluation.evaluate(
+            self.row, policy, self.settings.evaluation_episodes, EVALUATION_SEED, self.threads
+        )
+        returned, steps, number = self.recent.tolist()
+        point = {
+            'samples': self.samples,
+            'fraction': found['fraction'],
+            'full': found['full'],
+            'distance': found['distance'],
+            'training_return': returned / max(number, 1),
+            'training_length': steps / max(number, 1),
+            'std': float(self.log_std.detach().exp().mean()),
+            'divergence': divergence,
+            'seconds': dict(self.seconds),
+        }
+        self.recent[:] = 0
+        self.curve.append(point)
+        if found['fraction'] > self.best:
+            self.best = found['fraction']
+            policies.save(policy, folder / 'policy.npz')
+
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes checkpoint and curve."""
+        state = {name: getattr(self, name) for name in _STATE}
+        state |= {
+            'settings': self.settings,
+            'networks': [part.state_dict() for part in (self.policy, self.value)],
+            'log_std': self.log_std.detach().clone(),
+            'optimizer': self.optimizer.state_dict(),
+            'scales': (self.scales.count, self.scales.mean, self.scales.square),
+            'random': self.random.bit_generator.state,
+            'environments': self.environments.get_state(),
+        }
+        part = folder / '.checkpoint.part'
+        torch.save(state, part)
+        os.replace(part, folder / 'checkpoint.pt')
+        curve = {
+            'id': self.row.id,
+            'seed': self.seed,
+            'settings': dataclasses.asdict(self.settings),
+            'threads': self.threads,
+            'curve': self.curve,
+        }
+        part = folder / '.curve.part'
+        part.write_text(json.dumps(curve, indent=1))
+        os.replace(part, folder / 'curve.json')
+
+    def restore(self, folder: pathlib.Path) -> None:
+        """Goes on where `save` was called."""
+        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file of our own
+        if state['settings'] != self.settings:
+            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        for name in _STATE:
+            setattr(self, name, state[name])
+        for network_, saved in zip((self.policy, self.value), state['networks'], strict=True):
+            network_.load_state_dict(saved)
+        self.log_std.data.copy_(state['log_std'])
+        self.optimizer.load_state_dict(state['optimizer'])
+        self.scales.count, self.scales.mean, self.scales.square = state['scales']
+        self.random.bit_generator.state = state['random']
+        self.environments.set_state(state['environments'])
+
+
+_STATE = (
+    'samples', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns', 'steps',
+)  # fmt: skip
+
+
+def train(
+    id_: str,
+    seed: int,
+    settings: Settings,
+    folder: pathlib.Path,
+    threads: int = 0,
+    progress: bool = True,
+) -> list[dict[str, Any]]:
+    """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve."""
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    trainer = Trainer(id_, seed, settings, threads)
+    if (folder / 'checkpoint.pt').exists():
+        trainer.restore(folder)
+    total = int(settings.samples)
+    with tqdm.tqdm(
+        total=total, initial=trainer.samples, unit='sample', disable=None if progress else True
+    ) as bar:
+        bar.set_description(id_)
+        while trainer.samples < total:
+            begin, before = time.perf_counter(), trainer.samples
+            batch = trainer.collect()
+            middle = time.perf_counter()
+            divergence = trainer.learn(batch)
+            end = time.perf_counter()
+            trainer.seconds['simulation'] += middle - begin
+            trainer.seconds['learning'] += end - middle
+            bar.update(trainer.samples - before)
+            number = max(trainer.recent[2], 1)
+            bar.set_postfix(
+                reward=f'{trainer.recent[0] / max(trainer.recent[1], 1):.2f}',
+                length=f'{trainer.recent[1] / number:.0f}',
+                score=f'{trainer.curve[-1]["fraction"]:.2f}' if trainer.curve else '-',
+                refresh=False,
+            )
+            every = settings.evaluate_every
+            if trainer.samples // every > before // every or trainer.samples >= total:
+                trainer.evaluate(folder, divergence)
+                trainer.seconds['evaluation'] += time.perf_counter() - end
+                trainer.save(folder)
+    policies.save(trainer.exported(), folder / 'last.npz')
+    return trainer.curve
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=0, help='0: all cores')
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--samples', type=float, help='control steps, instead of the default')
+    arguments = parser.parse_args()
+    id_ = suite.find(arguments.id).id
+    changes = {} if arguments.samples is None else {'samples': arguments.samples}
+    folder = arguments.output / id_ / f'seed_{arguments.seed}'
+    curve = train(id_, arguments.seed, settings_for(id_, **changes), folder, arguments.threads)
+    for point in curve:
+        print(f'{point["samples"]:9} {point["fraction"]:.3f} of the maximum, {point["full"]:.0%}')
+    print(folder / 'policy.npz')
+
+
+if __name__ == '__main__':
+    main()

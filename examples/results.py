@@ -1,0 +1,211 @@
+"""Writes docs/results.md and docs/learning_curves.png from what is in trained/.
+
+    python examples/results.py [--check]
+
+Needs `pip install 'trl_suite[video]'` for the picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from trl_suite import catalogue, resources
+
+DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
+MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
+MILESTONES = (0.5, 0.8, 0.9)  # of the maximum return
+
+
+def load() -> dict[str, dict[str, Any]]:
+    """What is known of every environment that has been trained, in the catalogue's order."""
+    folder = resources.directory('trained')
+    paths = {id_: folder / f'{id_}.json' for id_ in catalogue.BY_ID}
+    return {id_: json.loads(p.read_text()) for id_, p in paths.items() if p.exists()}
+
+
+def shipped(entry: dict[str, Any]) -> dict[str, Any]:
+    return next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
+
+
+def million(samples: float) -> str:
+    return f'{samples / 1e6:.2g} M'
+
+
+def reached(run: dict[str, Any], fraction: float) -> float | None:
+    """Samples after which an evaluation of the curve first reached a fraction of the maximum."""
+    return next((p['samples'] for p in run['curve'] if p['fraction'] >= fraction), None)
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = list(head)
+    lines = [head, ['---', *['--:'] * (len(head) - 1)], *map(list, rows)]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def environment_row(id_: str, entry: dict[str, Any]) -> list[str]:
+    run = shipped(entry)
+    found = run['evaluation']
+    minutes = sum(run['curve'][-1]['seconds'].values()) / 60
+    interval = found['return_interval'] / found['step_limit']
+    return [
+        f'`{id_}`',
+        f'{found["fraction"]:.3f} ± {interval:.3f}',
+        f'{found["full"]:.0%}',
+        f'{found["distance"]:.1f}',
+        million(run['settings']['samples']),
+        f'{minutes:.0f}',
+        str(run['seed']),
+    ]
+
+
+def comparison_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
+    rows = []
+    for id_, entry in entries.items():
+        row, runs = catalogue.BY_ID[id_], entry['runs']
+        if row.domain != 'imitation' or '_Run_' in id_:
+            continue
+        fractions = [run['evaluation']['fraction'] for run in runs]
+        cells = [f'{row.character}, {MODELS[row.actuation]}', str(len(runs))]
+        cells += [
+            f'{np.mean(fractions):.3f}',
+            ' '.join(f'{fraction:.3f}' for fraction in fractions),
+            f'{np.mean([run["evaluation"]["full"] for run in runs]):.0%}',
+        ]
+        for milestone in MILESTONES:
+            when = [reached(run, milestone) for run in runs]
+            arrived = [w for w in when if w is not None]
+            cells.append(
+                f'{million(np.mean(arrived))}'
+                + (f' ({len(arrived)} of {len(when)})' if len(arrived) < len(when) else '')
+                if arrived
+                else '–'
+            )
+        rows.append(cells)
+    return rows
+
+
+def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
+    path = resources.directory('trained') / 'transfer.json'
+    if not path.exists():
+        return []
+    rows = []
+    for id_, flat in json.loads(path.read_text()).items():
+        if id_ in entries:
+            own = shipped(entries[id_])['evaluation']
+            rows.append([
+                f'`{id_}`', f'{own["distance"]:.1f}', f'{flat["distance"]:.1f}',
+                f'{own["distance"] / flat["distance"]:.1f}', f'{own["full"]:.0%}',
+                f'{flat["full"]:.0%}',
+            ])  # fmt: skip
+    return rows
+
+
+def page(entries: dict[str, dict[str, Any]]) -> str:
+    runs = [run for entry in entries.values() for run in entry['runs']]
+    machines = ', '.join(sorted({run['machine'] for run in runs}))
+    episodes = sorted({run['evaluation']['episodes'] for run in runs})
+    parts = [
+        '# What has been learnt',
+        f'Made by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
+        'run of `examples/ppo.py` with the settings in its JSON file; `examples/train_all.py` '
+        'repeats them. Each environment ships with the policy of its best seed: '
+        '`suite.reference_policy(id)`.',
+        f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
+        'neither training nor the choice of the policy had seen. Return is a fraction of its '
+        'maximum, 256; an episode that ends in a fall earns nothing more. *Complete* is the share of '
+        'episodes that lasted 256 steps, *distance* the mean in m, *minutes* the wall time of the '
+        f'run. Machine: {machines}.',
+        '## Every environment',
+        table(
+            ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed'),
+            (environment_row(id_, entry) for id_, entry in entries.items()),
+        ),
+        '![Learning curves](learning_curves.png)',
+        '## Actuation models',
+        'Mean over seeds; the milestones are the samples after which the noiseless policy first '
+        'reached 0.5, 0.8 and 0.9 of the maximum, over the seeds that did (evaluated every 0.1 M).',
+        table(
+            ('character, actuation', 'seeds', 'return', 'each', 'complete', 'to 0.5', 'to 0.8',
+             'to 0.9'),
+            comparison_rows(entries),
+        ),
+    ]  # fmt: skip
+    rows = transfer_rows(entries)
+    if rows:
+        parts += [
+            '## Does training on terrain help?',
+            'Against the policy that was trained on flat ground with the same observations.',
+            table(
+                ('environment', 'distance, own', 'flat policy', 'ratio', 'complete, own',
+                 'flat policy'),
+                rows,
+            ),
+        ]  # fmt: skip
+    findings = DOCS / 'findings.md'
+    if findings.exists():  # written by hand
+        parts.append(findings.read_text().strip())
+    return '\n\n'.join(parts) + '\n'
+
+
+def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figures = {'biped2d': 'biped2d', 'biped2d_full': 'biped', 'dog': 'dog', 'raptor': 'raptor'}
+    panels: dict[tuple[str, str], list[str]] = {}
+    for id_ in entries:
+        row = catalogue.BY_ID[id_]
+        panels.setdefault((row.domain, figures[row.character]), []).append(id_)
+    columns = 3
+    count = -(-len(panels) // columns)
+    figure, axes = pyplot.subplots(
+        count, columns, figsize=(13, 4.2 * count), squeeze=False, sharey=True
+    )
+    for axis, ((domain, name), ids) in zip(axes.flat, panels.items(), strict=False):
+        axis.set_title(f'{domain}: {name}')
+        for i, id_ in enumerate(ids):
+            row, colour = catalogue.BY_ID[id_], f'C{i}' if i < 10 else 'black'
+            for run in entries[id_]['runs']:
+                ship = run['seed'] == entries[id_]['shipped']
+                axis.plot(
+                    [0, *[p['samples'] / 1e6 for p in run['curve']]],
+                    [0, *[p['fraction'] for p in run['curve']]],
+                    color=colour, alpha=1 if ship else 0.4, linewidth=1.2,
+                    label=row.task if ship else None,
+                )  # fmt: skip
+        axis.set_ylim(0, 1)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7, loc='lower right')
+        axis.set_xlabel('control steps, million')
+    for axis in axes[:, 0]:
+        axis.set_ylabel('return / 256, no noise')
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--check', action='store_true', help='only tell whether the page is fresh')
+    arguments = parser.parse_args()
+    entries = load()
+    text, path = page(entries), DOCS / 'results.md'
+    if arguments.check:
+        sys.exit(0 if path.exists() and path.read_text() == text else f'{path} is not fresh')
+    path.write_text(text)
+    plot(entries, DOCS / 'learning_curves.png')
+    print(path)
+
+
+if __name__ == '__main__':
+    main()

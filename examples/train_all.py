@@ -1,0 +1,133 @@
+"""Trains the reference policies of the suite: every row of the catalogue, some with three seeds.
+
+    python examples/train_all.py                       # all that is missing, two runs side by side
+    python examples/train_all.py --only '*Dog2D*' --jobs 8
+    python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
+
+Each run is `examples/ppo.py` on one thread. Stopped runs go on from their checkpoints in RUNS;
+finished ones are evaluated and entered into `trained/ID.json` (settings, learning curve,
+evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
+the same settings is not trained again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import concurrent.futures
+import dataclasses
+import fnmatch
+import json
+import os
+import pathlib
+import platform
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+import ppo
+import tqdm
+
+from trl_suite import catalogue, errors, evaluation, policies, resources
+
+EPISODES, SEED = 50, 0  # of the published evaluation
+SEEDS = (1,)
+COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
+
+
+def jobs(pattern: str) -> list[tuple[str, int]]:
+    """Which runs there are: first one of each environment, then the repetitions."""
+    ids = [id_ for id_ in catalogue.BY_ID if fnmatch.fnmatchcase(id_, pattern)]
+    if not ids:
+        raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
+    seeds = {
+        id_: COMPARED_SEEDS
+        if catalogue.BY_ID[id_].domain == 'imitation' and '_Run_' not in id_
+        else SEEDS
+        for id_ in ids
+    }
+    found = [(id_, seed) for id_ in ids for seed in seeds[id_]]
+    return sorted(found, key=lambda job: job[1])  # sorting is stable
+
+
+def entries(id_: str) -> list[dict[str, Any]]:
+    """The runs that have been entered for an environment."""
+    path = resources.directory('trained') / f'{id_}.json'
+    return json.loads(path.read_text())['runs'] if path.exists() else []
+
+
+def settings(id_: str) -> dict[str, Any]:
+    """Settings as JSON gives them back."""
+    return json.loads(json.dumps(dataclasses.asdict(ppo.settings_for(id_))))
+
+
+def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
+    """Trains in a process of its own; returns the folder of the run."""
+    script = pathlib.Path(ppo.__file__)
+    command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={runs}']
+    folder = runs / id_ / f'seed_{seed}'
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / 'log.txt', 'a') as log:
+        subprocess.run(command, check=True, stdout=log, stderr=log)
+    return folder
+
+
+def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
+    """Evaluates a finished run and writes it beside the others of its environment."""
+    curve = json.loads((folder / 'curve.json').read_text())
+    policy = policies.load(folder / 'policy.npz')
+    found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
+    run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
+    others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]
+    every = sorted([run, *others], key=lambda r: r['seed'])
+    best = max(every, key=lambda r: r['evaluation']['return'])
+    trained = resources.directory('trained')
+    if best is run:
+        policies.save(policy, trained / f'{id_}.npz')
+    part = trained / f'.{id_}.part'
+    part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
+    os.replace(part, trained / f'{id_}.json')
+    return run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--only', default='*', metavar='PATTERN', help='of ids')
+    parser.add_argument('--jobs', type=int, default=2, help='runs side by side')
+    parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--again', action='store_true', help='train anew what has been entered')
+    parser.add_argument(
+        '--machine',
+        default=f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}',
+        help='what to call this machine in the results',
+    )
+    arguments = parser.parse_args()
+    todo = []
+    for id_, seed in jobs(arguments.only):
+        entered = any(r['seed'] == seed and r['settings'] == settings(id_) for r in entries(id_))
+        if arguments.again:
+            shutil.rmtree(arguments.runs / id_ / f'seed_{seed}', ignore_errors=True)
+        if arguments.again or not entered:
+            todo.append((id_, seed))
+    with (
+        concurrent.futures.ThreadPoolExecutor(arguments.jobs) as pool,
+        tqdm.tqdm(total=len(todo), unit='run') as bar,
+    ):
+        running = {pool.submit(train, *job, arguments.runs): job for job in todo}
+        for done in concurrent.futures.as_completed(running):
+            id_, seed = running[done]
+            try:
+                run = enter(id_, seed, done.result(), arguments.machine)
+            except (subprocess.CalledProcessError, OSError, ValueError) as error:
+                bar.write(f'{id_} seed {seed}: {error}')  # the others go on
+            else:
+                found = run['evaluation']
+                bar.write(
+                    f'{id_} seed {seed}: {found["fraction"]:.3f} of the maximum, '
+                    f'{found["full"]:.0%} complete'
+                )
+            bar.update()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,150 @@
+"""Evaluation: the episodes of single environments, summed up, whatever the threads."""
+
+import dataclasses
+import json
+from unittest import mock
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import evaluation, policies, suite
+from trl_suite.vector import VectorEnvironment
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+FLAT = 'PD_Biped2D_Flat_Terrain-v0'
+LISTS = ('seeds', 'returns', 'lengths', 'distances', 'fell')
+
+
+def make(id_, seed=0, scale=0.1):
+    """A policy with random weights that fits an environment."""
+    task, rng = suite.build_task(suite.find(id_)), np.random.default_rng(seed)
+    blocks = [(name, part.stop - part.start) for name, part in task.blocks.items()]
+    k, a = sum(size for _, size in blocks), len(task.action_map)
+    return policies.Policy(
+        id=id_, blocks=blocks, actions=task.action_map.names,
+        quantity=task.action_map.quantity, mean=rng.normal(0, 0.1, k), std=np.ones(k), clip=5.0,
+        weights=[rng.normal(0, scale, (k, 32)), rng.normal(0, scale, (32, a))],
+        biases=[np.zeros(32), np.zeros(a)], activation='tanh', log_std=np.zeros(a),
+    )  # fmt: skip
+
+
+def alone(id_, seeds, act):
+    """Returns, lengths, distances and falls of single environments, one by one."""
+    episodes = []
+    for seed in seeds:
+        environment = suite.make(id_, {'random': seed})
+        time_step, total, length = environment.reset(), 0.0, 0
+        while not time_step.last():
+            time_step = environment.step(act(environment, time_step))
+            total, length = total + time_step.reward, length + 1
+        info = environment.info
+        episodes.append((total, length, info['distance'], info['fell'], time_step.discount))
+    return [list(column) for column in zip(*episodes, strict=True)]
+
+
+class EvaluateTest(parameterized.TestCase):
+    @parameterized.parameters(GAPS, 'PD_Raptor2D_LLC_Imitate_Flat-v0')
+    def test_episodes_are_those_of_single_environments(self, id_):
+        policy = make(id_)
+        found = evaluation.evaluate(id_, policy, episodes=6, seed=4, num_threads=2)
+        self.assertEqual(found['seeds'], VectorEnvironment(id_, 6, 1, seed=4).seeds.tolist())
+        returns, lengths, distances, fell, _ = alone(
+            id_, found['seeds'], lambda environment, time_step: policy(time_step.observation)
+        )
+        self.assertEqual(found['returns'], returns)
+        self.assertEqual(found['lengths'], lengths)
+        self.assertEqual(found['distances'], distances)
+        self.assertEqual(found['fell'], fell)
+        self.assertGreater(len(set(lengths)), 1)  # some rows went on while others had ended
+
+    def test_the_clip_is_followed_as_in_single_environments(self):
+        id_ = 'PD_Raptor2D_LLC_Imitate_Flat-v0'
+        found = evaluation.evaluate(id_, evaluation.clip, 4, 1, factory=True)
+        returns, lengths, *_ = alone(
+            id_,
+            found['seeds'],
+            lambda environment, _: np.clip(environment.task.clip_action(0), -1, 1),
+        )
+        self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
+
+    def test_threads_and_chunks_do_not_matter(self):
+        policy = make(GAPS)
+        expected = evaluation.evaluate(GAPS, policy, 7, 2, num_threads=1)
+        self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2, num_threads=2), expected)
+        with mock.patch.object(evaluation, 'CHUNK', 3):
+            self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2), expected)
+        fewer = evaluation.evaluate(GAPS, policy, 3, 2)
+        for name in LISTS:
+            self.assertEqual(fewer[name], expected[name][:3])
+        other = evaluation.evaluate(GAPS, policy, 3, 5)
+        self.assertNotEqual(other['returns'], fewer['returns'])
+
+    def test_the_random_baseline_repeats(self):
+        first = evaluation.evaluate(GAPS, evaluation.random, 5, 1, 1, factory=True)
+        self.assertEqual(evaluation.evaluate(GAPS, evaluation.random, 5, 1, 2, factory=True), first)
+
+    def test_doing_nothing_falls_early(self):
+        found = evaluation.evaluate(FLAT, evaluation.zero, 10, factory=True)
+        self.assertEqual((found['falls'], found['full'], found['diverged']), (1, 0, 0))
+        self.assertEqual(found['fell'], [True] * 10)
+        self.assertLess(max(found['lengths']), 128)
+        self.assertLess(found['fraction'], 0.3)
+        self.assertGreater(found['fraction'], 0)
+
+    def test_episodes_that_are_cut(self):
+        # A step limit that all reach: the rewards of three steps and no fall.
+        row = dataclasses.replace(suite.find(GAPS), step_limit=3)
+        found = evaluation.evaluate(row, make(GAPS), 4)
+        self.assertEqual((found['full'], found['falls'], found['lengths']), (1, 0, [3] * 4))
+        self.assertEqual(found['step_limit'], 3)
+        self.assertEqual(found['fraction'], found['return'] / 3)
+        self.assertGreater(found['fraction'], 0.3)
+
+    def test_a_fall_in_the_last_step_is_not_full_length(self):
+        found = evaluation.evaluate(FLAT, evaluation.zero, 3, factory=True)
+        row = dataclasses.replace(suite.find(FLAT), step_limit=found['lengths'][0])
+        again = evaluation.evaluate(row, evaluation.zero, 1, factory=True)
+        self.assertEqual((again['lengths'], again['fell']), (found['lengths'][:1], [True]))
+        self.assertEqual(again['full'], 0)
+
+    def test_summary(self):
+        found = evaluation.evaluate('plaid/biped_gaps', make(GAPS), 5, 3)
+        self.assertEqual((found['id'], found['episodes'], found['seed']), (GAPS, 5, 3))
+        self.assertEqual(json.loads(json.dumps(found, allow_nan=False)), found)
+        returns = np.array(found['returns'])
+        self.assertAlmostEqual(found['return'], returns.mean())
+        deviation = np.sqrt(((returns - returns.mean()) ** 2).sum() / 4)
+        self.assertAlmostEqual(found['return_interval'], 1.96 * deviation / np.sqrt(5))
+        self.assertAlmostEqual(found['fraction'], returns.mean() / 256)
+        for one, many in (('length', 'lengths'), ('distance', 'distances'), ('falls', 'fell')):
+            self.assertAlmostEqual(found[one], np.mean(found[many]))
+        for name in LISTS:
+            self.assertLen(found[name], 5)
+        self.assertIsNone(evaluation.evaluate(GAPS, make(GAPS), 1)['return_interval'])
+
+    def test_options_of_the_task(self):
+        blind = 'PD_Biped2D_Flat-v0'
+        expected = evaluation.evaluate(blind, make(blind), 2)
+        found = evaluation.evaluate(FLAT, make(blind), 2, task_kwargs={'terrain_samples': 0})
+        self.assertEqual(found['returns'], expected['returns'])
+
+    def test_refuses(self):
+        policy = make(GAPS)
+        for message, *arguments in (
+            ('episodes is 0', GAPS, policy, 0),
+            ('episodes is 1.5', GAPS, policy, 1.5),
+            ('seed is -1', GAPS, policy, 1, -1),
+            ('num_threads is -1', GAPS, policy, 1, 0, -1),
+            ('did you mean', GAPS[:-1], policy),
+            ('unknown option', GAPS, policy, 1, 0, 0, {'x': 1}),
+            ('observes terrain 50, .*gives pose', 'PD_Biped2D_Flat-v0', policy, 1),
+            (r'actions have shape \(2, 3\)', GAPS, lambda o: np.zeros((len(o), 3)), 2),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                evaluation.evaluate(*arguments)
+        with self.assertRaisesRegex(ValueError, 'torque control cannot follow a clip'):
+            evaluation.evaluate('imitation/torque_dog', evaluation.clip, 1, factory=True)
+
+
+if __name__ == '__main__':
+    absltest.main()

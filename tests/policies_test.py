@@ -1,0 +1,424 @@
+"""Trained policies: what they compute, what they refuse, their files, and those shipped."""
+
+import collections
+import io
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import unittest
+import zipfile
+from unittest import mock
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+import trl_suite
+from trl_suite import catalogue, policies, resources, suite
+from trl_suite.vector import VectorEnvironment
+
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+MAX_BYTES = 500_000  # of a shipped file
+SIZES = (('terrain', 3), ('pose', 4))  # an odd sum: rows lie at any address
+
+
+def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes):
+    """A policy with random numbers."""
+    rng = np.random.default_rng(seed)
+    k, a = sum(size for _, size in blocks), len(actions)
+    shapes = list(zip((k, *hidden), (*hidden, a), strict=True))
+    fields = {
+        'id': GAPS, 'blocks': blocks, 'actions': actions, 'quantity': 'target angle',
+        'mean': rng.normal(size=k), 'std': rng.uniform(0.5, 2, k), 'clip': 1.5,
+        'weights': [rng.normal(0, 0.6, shape) for shape in shapes],
+        'biases': [rng.normal(0, 0.3, shape[1]) for shape in shapes], 'activation': 'tanh',
+        'log_std': rng.normal(-1, 0.3, a), 'info': {'seed': seed, 'rates': [1e-3, None]},
+    }  # fmt: skip
+    return policies.Policy(**{**fields, **changes})
+
+
+def plain(policy, observation):
+    """The same in plain Python, one number after the other."""
+    hidden = {
+        'tanh': lambda x: float(np.tanh(x)),
+        'relu': lambda x: x if x > 0 else 0.0,
+        'elu': lambda x: x if x > 0 else float(np.exp(x)) - 1,
+    }[policy.activation]
+    x = [
+        min(max((float(o) - float(m)) / float(s), -policy.clip), policy.clip)
+        for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
+    ]
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        x = [
+            sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])
+            for o in range(len(bias))
+        ]
+        if i < len(policy.weights) - 1:
+            x = [hidden(value) for value in x]
+    return [min(max(value, -1.0), 1.0) for value in x]
+
+
+class FolderTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+
+class ActTest(parameterized.TestCase):
+    @parameterized.product(activation=tuple(policies.ACTIVATIONS), hidden=((), (6,), (6, 5)))
+    def test_computes_what_the_docstring_says(self, activation, hidden):
+        policy = make(hidden=hidden, activation=activation)
+        observations = np.random.default_rng(1).normal(0, 2, (50, 7))
+        expected = [plain(policy, row) for row in observations]
+        actions = policy(observations)
+        self.assertEqual((actions.shape, actions.dtype), ((50, 2), np.float64))
+        np.testing.assert_allclose(actions, expected, atol=2e-6)
+        self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all
+        self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
+
+    def test_observations_are_normalised_and_clipped(self):
+        identity = make(
+            hidden=(), actions=tuple('abcdefg'), mean=np.arange(7), std=np.full(7, 4.0), clip=0.75,
+            weights=[np.eye(7)], biases=[np.zeros(7)], log_std=np.zeros(7),
+        )  # fmt: skip
+        steps = np.array([0, 1, -1, 2.5, 3, 4, -1e30])
+        np.testing.assert_array_equal(
+            identity(np.arange(7) + steps), [0, 0.25, -0.25, 0.625, 0.75, 0.75, -0.75]
+        )
+
+    @parameterized.parameters((7, (6, 5)), (99, (33, 17)), (104, (64, 32)))
+    def test_a_row_does_not_depend_on_the_others(self, k, hidden):
+        policy = make(blocks=(('a', k),), hidden=hidden, actions=tuple('abcdefghijk'))
+        observations = np.random.default_rng(2).normal(size=(64, k))
+        batch = policy(observations)
+        for i in range(64):
+            np.testing.assert_array_equal(policy(observations[i]), batch[i])
+        np.testing.assert_array_equal(policy(observations[5:8]), batch[5:8])
+        np.testing.assert_array_equal(policy(observations[::-3]), batch[::-3])
+        np.testing.assert_array_equal(policy(np.asfortranarray(observations)), batch)
+
+    def test_blocks_are_as_good_as_the_flat_vector(self):
+        policy = make()
+        flat = np.random.default_rng(3).normal(size=(4, 7))
+        for observation in (flat, flat[0]):
+            mixed = collections.OrderedDict(
+                pose=observation[..., 3:], other=np.zeros(9), terrain=observation[..., :3]
+            )
+            np.testing.assert_array_equal(policy(mixed), policy(observation))
+            np.testing.assert_array_equal(
+                policy({'observations': observation}), policy(observation)
+            )
+        self.assertEqual(policy(flat[0]).shape, (2,))
+        self.assertEqual(policy(np.zeros((0, 7))).shape, (0, 2))
+
+    @parameterized.parameters(
+        (np.zeros(6), r'shape \(6,\); expected \(7,\) or \(n, 7\): terrain 3, pose 4'),
+        (np.zeros((7, 2)), r'shape \(7, 2\); expected'),
+        (np.zeros((1, 1, 7)), r'shape \(1, 1, 7\); expected'),
+        (0.0, r'shape \(\); expected'),
+        ({'pose': np.zeros(4)}, 'lacks terrain; expected terrain 3, pose 4'),
+        ({}, 'lacks terrain, pose; expected'),
+        (
+            {'terrain': np.zeros(3), 'pose': np.zeros(5)},
+            r"block 'pose' has shape \(5,\); expected \(4,\) or \(n, 4\)",
+        ),
+        ({'terrain': np.zeros((2, 3)), 'pose': np.zeros((3, 4))}, r"'pose' has shape \(3, 4\)"),
+        ({'terrain': np.zeros((2, 3)), 'pose': np.zeros(4)}, r"'pose' has shape \(4,\)"),
+        ({'observations': np.zeros(6)}, r'shape \(6,\); expected \(7,\)'),
+    )
+    def test_refuses_other_observations(self, observation, message):
+        with self.assertRaisesRegex(ValueError, message):
+            make()(observation)
+
+    def test_samples(self):
+        # Not clipped before the noise: a mean far outside stays outside.
+        policy = make(
+            hidden=(), weights=[np.zeros((7, 2))], biases=[[0.25, 9.0]], log_std=np.log([0.2, 0.5])
+        )
+        drawn = policy.sample(np.zeros((20_000, 7)), np.random.default_rng(4))
+        self.assertLessEqual(np.abs(drawn).max(), 1)
+        self.assertAlmostEqual(drawn[:, 0].mean(), 0.25, delta=0.01)
+        self.assertAlmostEqual(drawn[:, 0].std(), 0.2, delta=0.01)
+        np.testing.assert_array_equal(drawn[:, 1], 1)
+        again = policy.sample(np.zeros((20_000, 7)), np.random.default_rng(4))
+        np.testing.assert_array_equal(drawn, again)
+        one = policy.sample(np.zeros(7), np.random.default_rng(4))
+        np.testing.assert_array_equal(one, drawn[0])
+
+    @parameterized.parameters(
+        ({'blocks': ()}, 'blocks: expected at least one name'),
+        ({'blocks': (('a', 3), ('a', 4))}, 'blocks: .* each once'),
+        ({'blocks': (('a', 7), ('b', 0))}, 'blocks: expected positive sizes; got a 7, b 0'),
+        ({'actions': ()}, 'actions: expected at least one name'),
+        ({'activation': 'tan'}, "unknown activation 'tan'; did you mean 'tanh'"),
+        ({'mean': np.zeros(6)}, r'mean: has shape \(6,\); expected \(7,\)'),
+        ({'mean': ['x'] * 7}, 'mean: an array of numbers is needed'),
+        ({'mean': np.full(7, 1e300)}, 'mean: has numbers that are not finite'),
+        ({'std': np.zeros(7)}, 'std: expected positive numbers'),
+        ({'clip': 0}, 'clip: expected a positive number; got 0'),
+        ({'clip': np.inf}, 'clip: has numbers that are not finite'),
+        ({'log_std': np.zeros(3)}, r'log_std: has shape \(3,\); expected \(2,\)'),
+        ({'weights': [], 'biases': []}, 'weights: 0 layers'),
+        ({'biases': [np.zeros(2)]}, 'weights: 3 layers with 1 biases'),
+        ({'weights': [np.zeros((7, 2)), 3.0, np.zeros((6, 2))]}, r'bias_0: has shape \(6,\); exp'),
+        ({'info': {'a': np.zeros(2)}}, 'info: JSON cannot hold it'),
+        ({'info': {'a': np.nan}}, 'info: JSON cannot hold it'),
+        ({'info': [1]}, 'info: expected a dict'),
+    )
+    def test_refuses_malformed_fields(self, changes, message):
+        with self.assertRaisesRegex(ValueError, message):
+            make(**changes)
+
+    def test_its_arrays_are_its_own(self):
+        mean = np.zeros(7)
+        policy = make(mean=mean)
+        mean[:] = 1
+        np.testing.assert_array_equal(policy.mean, 0)
+        for array in (policy.mean, policy.std, policy.log_std, *policy.weights, *policy.biases):
+            with self.assertRaisesRegex(ValueError, 'read-only'):
+                array[...] = 0
+
+
+class CheckTest(absltest.TestCase):
+    def test_environments(self):
+        environment = suite.make(GAPS, {'random': 0})
+        blocks = [(name, part.stop - part.start) for name, part in environment.blocks.items()]
+        names = environment.action_map.names
+        policy = make(blocks=blocks, actions=names)
+        policy.check(environment)
+        policy.check(VectorEnvironment(GAPS, 2, 1))
+        # Blocks and the flat vector of the environment lead to the same action.
+        time_step = environment.reset()
+        flat = suite.make(GAPS, {'random': 0}, {'flat_observation': True}).reset()
+        np.testing.assert_array_equal(
+            policy(time_step.observation), policy(flat.observation['observations'])
+        )
+        np.testing.assert_array_equal(policy(time_step.observation), policy(flat.observation))
+
+        with self.assertRaisesRegex(ValueError, 'observes pose .*gives terrain 50, pose'):
+            make(blocks=blocks[1:], actions=names).check(environment)
+        with self.assertRaisesRegex(ValueError, 'observes pose .*gives terrain 50, pose'):
+            make(blocks=[*blocks[1:], blocks[0]], actions=names).check(environment)
+        with self.assertRaisesRegex(ValueError, 'observes terrain 49, .*gives terrain 50, '):
+            make(blocks=[('terrain', 49), *blocks[1:]], actions=names).check(environment)
+        with self.assertRaisesRegex(
+            ValueError, f'sets .* of {names[1]}, .*takes .* of {names[0]}, '
+        ):
+            make(blocks=blocks, actions=[*names[1:], names[0]]).check(environment)
+        with self.assertRaisesRegex(ValueError, 'sets the torque of .*takes the target angle of'):
+            make(blocks=blocks, actions=names, quantity='torque').check(environment)
+
+
+class FileTest(FolderTest):
+    def test_comes_back_bit_for_bit(self):
+        policy = make(clip=0.1)
+        path = self.folder / 'p.npz'
+        policies.save(policy, path)
+        self.assertEqual([each.name for each in self.folder.iterdir()], ['p.npz'])
+        for again in (policies.load(path), policies.load(str(path))):
+            for name in ('id', 'blocks', 'actions', 'quantity', 'clip', 'activation', 'info'):
+                self.assertEqual(getattr(again, name), getattr(policy, name))
+            for name in ('mean', 'std', 'log_std'):
+                np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
+            self.assertEqual(again.info, {'seed': 0, 'rates': [0.001, None]})
+            for name in ('weights', 'biases'):
+                arrays = getattr(again, name)
+                for array, expected in zip(arrays, getattr(policy, name), strict=True):
+                    self.assertEqual(array.dtype, np.float32)
+                    np.testing.assert_array_equal(array, expected)
+            observations = np.random.default_rng(1).normal(size=(9, 7))
+            np.testing.assert_array_equal(again(observations), policy(observations))
+        # The same policy is the same file.
+        policies.save(policies.load(path), self.folder / 'q.npz')
+        self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
+
+    def test_the_format_is_the_documented_one(self):
+        policies.save(make(), self.folder / 'p.npz')
+        with np.load(self.folder / 'p.npz', allow_pickle=False) as data:
+            arrays = dict(data)
+        for name in policies._FIELDS:
+            self.assertRegex(policies.__doc__, rf'\n    (\w+, )?{name}\b')
+        self.assertCountEqual(
+            arrays,
+            {*policies._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
+        )
+        self.assertEqual((str(arrays['format']), int(arrays['version'])), ('trl_suite policy', 1))
+        self.assertEqual(json.loads(str(arrays['info'])), make().info)
+        for name, array in arrays.items():
+            self.assertIn(array.dtype.kind, 'Uif', name)
+            if array.dtype.kind == 'f':
+                self.assertEqual(array.dtype, np.float32)
+
+    def test_an_old_file_stays_until_the_new_one_is_whole(self):
+        path = self.folder / 'p.npz'
+        policies.save(make(0), path)
+        before = path.read_bytes()
+        with (
+            mock.patch.object(np, 'savez_compressed', side_effect=OSError('disk full')),
+            self.assertRaisesRegex(OSError, 'disk full'),
+        ):
+            policies.save(make(1), path)
+        self.assertEqual(path.read_bytes(), before)
+        self.assertEqual(os.listdir(self.folder), ['p.npz'])
+        with self.assertRaisesRegex(ValueError, "suffix '.pkl'; expected .npz"):
+            policies.save(make(), self.folder / 'p.pkl')
+        with self.assertRaisesRegex(FileNotFoundError, 'does not exist'):
+            policies.save(make(), self.folder / 'none' / 'p.npz')
+
+    def test_a_missing_file(self):
+        with self.assertRaisesRegex(FileNotFoundError, 'p.npz'):
+            policies.load(self.folder / 'p.npz')
+
+    def test_truncated_or_damaged_or_no_archive(self):
+        path = self.folder / 'p.npz'
+        policies.save(make(), path)
+        whole = path.read_bytes()
+        single = io.BytesIO()
+        np.save(single, np.zeros(3))
+        for content in (whole[:-1], whole[: len(whole) // 2], b'', b'text', single.getvalue()):
+            path.write_bytes(content)
+            with self.assertRaisesRegex(ValueError, 'p.npz: no readable policy'):
+                policies.load(path)
+        with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+            damaged = bytearray(whole)
+            start = archive.getinfo('weight_1.npy').header_offset
+        damaged[start + 120] ^= 0xFF
+        path.write_bytes(damaged)
+        with self.assertRaisesRegex(ValueError, "p.npz: field 'weight_1'"):
+            policies.load(path)
+
+    def test_every_field_is_needed(self):
+        for name in self.fields():
+            with (
+                self.subTest(name),
+                self.assertRaisesRegex(ValueError, f'p.npz: .*{name}.*missing'),
+            ):
+                self.load_with(**{name: None})
+
+    @parameterized.parameters(
+        ({'format': 'clip'}, "'format': is 'clip'; expected 'trl_suite policy'"),
+        ({'version': 2}, "'version': is 2; expected 1"),
+        ({'version': '1'}, "'version': has type <U1 and 0 axes"),
+        ({'id': np.zeros(2)}, "'id': has type float64 and 1 axes"),
+        ({'actions': np.array(['hip', 'knee'], object)}, "'actions': Object arrays cannot"),
+        ({'weight_0': np.array([[None]])}, "'weight_0': Object arrays cannot"),
+        ({'mean': np.full(7, np.nan)}, 'mean: has numbers that are not finite'),
+        ({'std': -np.ones(7)}, 'std: expected positive'),
+        ({'clip': np.inf}, 'clip: has numbers that are not finite'),
+        ({'weight_1': np.full((6, 5), np.inf)}, 'weight_1: has numbers that are not finite'),
+        ({'bias_2': np.array([0, np.nan])}, 'bias_2: has numbers that are not finite'),
+        ({'weight_1': np.zeros((5, 6))}, r'weight_1: has shape \(5, 6\); expected \(6, 6\)'),
+        ({'weight_0': np.zeros((8, 6))}, r'weight_0: has shape \(8, 6\); expected \(7, 6\)'),
+        ({'weight_2': np.zeros((5, 3))}, r'weight_2: has shape \(5, 3\); expected \(5, 2\)'),
+        ({'bias_0': np.zeros(5)}, r'bias_0: has shape \(5,\); expected \(6,\)'),
+        ({'weight_0': np.zeros(7)}, "'weight_0': has type float64 and 1 axes"),
+        ({'weight_0': np.zeros((7, 6), int)}, "'weight_0': has type int64 and 2 axes"),
+        ({'block_sizes': np.array([3, 5])}, r'mean: has shape \(7,\); expected \(8,\)'),
+        ({'block_sizes': np.array([7])}, r'zip\(\) argument 2 is shorter'),
+        ({'activation': 'sin'}, "unknown activation 'sin'"),
+        ({'layers': 2}, "'layers': is 2, and there are arrays of others"),
+        ({'layers': 10**15}, "'weight_3': is missing"),
+        ({'layers': -1}, "'layers': is 0, and there are arrays of others"),
+        ({'other': 1}, "'other': is unknown"),
+        ({'info': '{'}, "'info': Expecting"),
+        ({'info': '[]'}, 'info: expected a dict'),
+        ({'info': '{"a": NaN}'}, 'info: JSON cannot hold it'),
+    )
+    def test_refuses(self, changes, message):
+        with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
+            self.load_with(**changes)
+
+    def fields(self):
+        policies.save(make(), self.folder / 'p.npz')
+        with np.load(self.folder / 'p.npz') as data:
+            return dict(data)
+
+    def load_with(self, **changes):
+        """Loads a file with some fields changed, or left out where None."""
+        fields = {
+            name: value for name, value in (self.fields() | changes).items() if value is not None
+        }
+        np.savez(self.folder / 'p.npz', **fields)
+        return policies.load(self.folder / 'p.npz')
+
+
+class ReferenceTest(FolderTest):
+    def setUp(self):
+        super().setUp()
+        directory = resources.directory
+        self.enterContext(
+            mock.patch.object(
+                resources, 'directory',
+                lambda kind: self.folder if kind == 'trained' else directory(kind),
+            )
+        )  # fmt: skip
+
+    def test_by_id_and_alias(self):
+        dog = 'PD_Dog2D_Gaps_Terrain-v0'
+        self.assertEqual(policies.available(), ())
+        policies.save(make(id=dog), self.folder / f'{dog}.npz')
+        policies.save(make(id=GAPS), self.folder / f'{GAPS}.npz')
+        policies.save(make(), self.folder / 'something.npz')  # no environment
+        self.assertEqual(policies.available(), (GAPS, dog))
+        for id_ in (dog, 'plaid/dog_gaps'):
+            self.assertEqual(policies.reference(id_).id, dog)
+            self.assertEqual(suite.reference_policy(id_).id, dog)
+            self.assertEqual(trl_suite.reference_policy(id_).id, dog)
+        with self.assertRaisesRegex(FileNotFoundError, f'closest that have one: {dog}, {GAPS}'):
+            policies.reference('PD_Dog2D_Steps_Terrain-v0')
+        with self.assertRaisesRegex(ValueError, "unknown environment 'x'"):
+            policies.reference('x')
+        with self.assertRaisesRegex(ValueError, "did you mean 'plaid/dog_gaps'"):
+            policies.reference('plaid/dog_gap')
+
+    def test_none_at_all(self):
+        with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; nor for any other"):
+            policies.reference(GAPS)
+
+    def test_a_file_of_another_environment(self):
+        policies.save(make(id='other'), self.folder / f'{GAPS}.npz')
+        with self.assertRaisesRegex(ValueError, f"{GAPS}.npz: field 'id': is 'other'"):
+            policies.reference(GAPS)
+
+
+class ShippedTest(parameterized.TestCase):
+    @parameterized.parameters(*((id_,) for id_ in policies.available() or (None,)))
+    def test_fits_its_environment(self, id_):
+        if id_ is None:
+            self.skipTest('no policy is shipped')
+        path = resources.directory('trained') / f'{id_}.npz'
+        self.assertLess(path.stat().st_size, MAX_BYTES)
+        policy = policies.reference(id_)
+        task = suite.build_task(catalogue.BY_ID[id_])
+        policy.check(task)
+        self.assertEqual(policy(np.zeros((3, policy.observation_size))).shape[0], 3)
+
+    def test_no_file_is_of_an_unknown_environment(self):
+        folder = resources.directory('trained')
+        names = {path.stem for path in folder.iterdir() if path.suffix in ('.npz', '.json')}
+        self.assertEqual(names - set(catalogue.BY_ID), set())
+        self.assertTrue((folder / 'README.md').exists())
+
+    @unittest.skip('until all are trained')
+    def test_every_row_has_one(self):
+        self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
+
+
+class ImportTest(absltest.TestCase):
+    def test_needs_no_engine(self):
+        code = (
+            'import sys; from trl_suite import policies; policies.available();'
+            'print([name for name in ("mujoco", "dm_control", "torch") if name in sys.modules])'
+        )
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True
+        )
+        self.assertEqual(done.stdout, '[]\n')
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,165 @@
+"""What a policy achieves: returns, lengths and distances of many seeded episodes.
+
+from trl_suite import evaluation, policies
+
+id_ = 'PD_Biped2D_Gaps_Terrain-v0'
+result = evaluation.evaluate(id_, policies.reference(id_), episodes=50, seed=0)
+print(result['return'], result['return_interval'], result['fraction'])
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from trl_suite.catalogue import Row
+from trl_suite.policies import Policy
+from trl_suite.vector import VectorEnvironment
+
+BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
+CHUNK = 256  # episodes that run side by side
+_NORMAL_95 = 1.96  # standard errors on either side of a mean
+
+
+def evaluate(
+    environment: str | Row,
+    policy: Callable[[Any], Any],
+    episodes: int = 50,
+    seed: int = 0,
+    num_threads: int = 0,
+    task_kwargs: Mapping[str, Any] | None = None,
+    *,
+    factory: bool = False,
+) -> dict[str, Any]:
+    """Runs whole episodes of an environment, and tells how each went and how they went on average.
+
+    Episode i has the i-th number of `numpy.random.SeedSequence(seed)` as its seed: it is the first
+    episode of `suite.make(id, {'random': result['seeds'][i]})`, whatever the number of episodes and
+    threads, if the policy treats each row by itself (a `Policy` does).
+
+    Args:
+      environment: id, alias, or row of the catalogue.
+      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and rows whose
+        episode has ended go on with another that does not count.
+      episodes: how many.
+      seed: of them all.
+      num_threads: threads that step the physics; 0 takes all cores.
+      task_kwargs: options of the task, as for `suite.load` (without seed and limits).
+      factory: `policy` is not a policy but makes one: `VectorEnvironment` -> policy. So can a
+        policy see more than observations; the values of `BASELINES` are such.
+
+    Returns:
+      What JSON can hold. Settings: 'id', 'episodes', 'seed', 'step_limit'. Summary: 'return' (mean),
+      'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
+      standard errors; None for a single episode), 'fraction' (mean return over the step limit; no
+      step has a reward above 1), 'full' (share of episodes that last until the step limit),
+      'length' (mean, steps), 'distance' (mean, m), 'falls' and 'diverged' (shares of episodes).
+      Lists, one entry per episode: 'seeds', 'returns', 'lengths', 'distances', 'fell'.
+
+    Raises:
+      ValueError: unknown names or options, numbers out of range, or a `Policy` that does not fit.
+    """
+    if int(episodes) != episodes or episodes < 1:
+        raise ValueError(f'episodes is {episodes}; expected a positive integer')
+    if int(seed) != seed or seed < 0:
+        raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
+    seeds = np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
+    chunks = []
+    for start in range(0, len(seeds), CHUNK):
+        chunk = seeds[start : start + CHUNK]
+        environments = VectorEnvironment(
+            environment, len(chunk), num_threads, chunk, autoreset='disabled',
+            task_kwargs=task_kwargs,
+        )  # fmt: skip
+        row, step_limit = environments.row, environments.step_limit
+        try:
+            if step_limit is None:
+                raise ValueError(f'{row.id} has no step limit, so its episodes may never end')
+            if isinstance(policy, Policy):
+                policy.check(environments)
+            chunks.append(_run(environments, policy(environments) if factory else policy))
+        finally:
+            environments.close()
+    assert step_limit is not None
+    of = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    mean = float(of['returns'].mean())
+    interval = None
+    if len(seeds) > 1:
+        interval = _NORMAL_95 * float(of['returns'].std(ddof=1)) / math.sqrt(len(seeds))
+    return {
+        'id': row.id,
+        'episodes': len(seeds),
+        'seed': int(seed),
+        'step_limit': step_limit,
+        'return': mean,
+        'return_interval': interval,
+        'fraction': mean / step_limit,
+        'full': float(of['full'].mean()),
+        'length': float(of['lengths'].mean()),
+        'distance': float(of['distances'].mean()),
+        'falls': float(of['fell'].mean()),
+        'diverged': float(of['diverged'].mean()),
+        'seeds': seeds,
+        **{name: of[name].tolist() for name in ('returns', 'lengths', 'distances', 'fell')},
+    }
+
+
+def _run(environments: VectorEnvironment, policy: BatchPolicy) -> dict[str, np.ndarray]:
+    """Runs one episode in every row."""
+    n = environments.num_envs
+    returns, lengths, distances = np.zeros(n), np.zeros(n, int), np.zeros(n)
+    fell, diverged, full = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
+    runs = np.ones(n, bool)  # rows in their first episode
+    observation = environments.reset()
+    while runs.any():
+        observation, reward, terminated, truncated, info = environments.step(policy(observation))
+        returns[runs] += reward[runs]
+        lengths[runs] += 1
+        ended = terminated | truncated
+        ends = ended & runs
+        distances[ends] = info['distance'][ends]
+        fell[ends], diverged[ends] = info['fell'][ends], info['diverged'][ends]
+        full[ends] = truncated[ends]
+        runs &= ~ended
+        if ended.any() and runs.any():  # every row must go on
+            observation = environments.reset(ended)
+    return {
+        'returns': returns, 'lengths': lengths, 'distances': distances, 'fell': fell,
+        'diverged': diverged, 'full': full,
+    }  # fmt: skip
+
+
+def zero(environments: VectorEnvironment) -> BatchPolicy:
+    """Makes a policy that always takes action 0."""
+    action = np.zeros((environments.num_envs, len(environments.action_map)))
+    return lambda observation: action
+
+
+def random(environments: VectorEnvironment) -> BatchPolicy:
+    """Makes a policy that draws actions evenly from [-1, 1]."""
+    generator = np.random.default_rng(environments.seeds.tolist())
+    shape = environments.num_envs, len(environments.action_map)
+    return lambda observation: generator.uniform(-1, 1, shape)
+
+
+def clip(environments: VectorEnvironment) -> BatchPolicy:
+    """Makes a policy that follows the reference clip without looking.
+
+    Raises:
+      ValueError: the task has no clip; or, when the policy acts, its actuation cannot follow one.
+    """
+    task: Any = environments.task
+    if not hasattr(task, 'clip_action'):
+        raise ValueError(f'{environments.row.id} has no clip to follow')
+    rows = range(environments.num_envs)
+    return lambda observation: np.clip([task.clip_action(row) for row in rows], -1, 1)
+
+
+BASELINES: dict[str, Callable[[VectorEnvironment], BatchPolicy]] = {
+    'random': random,
+    'zero': zero,
+    'clip': clip,
+}

@@ -1,0 +1,373 @@
+"""Trained policies as data: a small network in one .npz file, run with NumPy alone.
+
+    from trl_suite import policies, suite
+
+    policy = policies.reference('PD_Biped2D_Gaps_Terrain-v0')  # shipped with the suite
+    environment = suite.make(policy.id, task_kwargs={'random': 1})
+    policy.check(environment)
+    time_step = environment.reset()
+    while not time_step.last():
+        time_step = environment.step(policy(time_step.observation))
+
+A file holds these arrays and no pickled objects (U is text, a the number of actions, k the number
+of observations, L the number of layers):
+
+    format       U ()        'trl_suite policy'
+    version      int ()      1
+    id           U ()        environment in which the policy was trained
+    block_names  U (B,)      observation blocks in order
+    block_sizes  int (B,)    numbers in each; they sum to k
+    actions      U (a,)      names of the actions in order
+    quantity     U ()        what an action sets, e.g. 'target angle'
+    mean, std    float (k,)  normalisation: (observation - mean) / std
+    clip         float ()    bound of the normalised observation
+    activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
+    layers       int ()      L
+    weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
+    bias_0...    float       (outputs,); the last layer is linear and has a outputs
+    log_std      float (a,)  logarithm of the exploration noise's standard deviation
+    info         U ()        a JSON object: how the policy was made
+
+Floats are written as float32.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import io
+import json
+import os
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite import catalogue, errors, resources
+
+FORMAT = 'trl_suite policy'
+VERSION = 1
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    'tanh': np.tanh,
+    'relu': lambda x: np.maximum(x, 0),
+    'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+}
+_FLAT = 'observations'  # key of the flat vector, where an environment gives one
+# Key in the file -> kinds of dtype, number of axes.
+_FIELDS = {
+    'format': ('U', 0), 'version': ('iu', 0), 'id': ('U', 0), 'block_names': ('U', 1),
+    'block_sizes': ('iu', 1), 'actions': ('U', 1), 'quantity': ('U', 0), 'mean': ('f', 1), 'std': ('f', 1),
+    'clip': ('f', 0), 'activation': ('U', 0), 'layers': ('iu', 0), 'log_std': ('f', 1),
+    'info': ('U', 0),
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A fully connected network from observations to actions in [-1, 1].
+
+    Row i of a batch gets, bit for bit, the action that it would get alone.
+
+    Attributes:
+      id: environment in which the policy was trained.
+      blocks: name and size of the observation blocks, in order; k numbers in all.
+      actions: names of the a actions, in order.
+      quantity: what an action sets, as `ActionMap.quantity` has it.
+      mean: subtracted from observations, (k,) float32, like all arrays read-only.
+      std: divides what is left, (k,).
+      clip: bound of the normalised observation.
+      weights: per layer (inputs, outputs).
+      biases: per layer (outputs,).
+      activation: of all layers but the last, one of `ACTIVATIONS`.
+      log_std: logarithm of the exploration noise's standard deviation, (a,).
+      info: how the policy was made; what JSON can hold.
+
+    Raises:
+      ValueError: a field is malformed, or fields do not fit each other; the message names it.
+    """
+
+    id: str
+    blocks: tuple[tuple[str, int], ...]
+    actions: tuple[str, ...]
+    quantity: str
+    mean: np.ndarray = dataclasses.field(repr=False)
+    std: np.ndarray = dataclasses.field(repr=False)
+    clip: float
+    weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    activation: str
+    log_std: np.ndarray = dataclasses.field(repr=False)
+    info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put('id', str(self.id))
+        put('blocks', tuple((str(name), int(size)) for name, size in self.blocks))
+        put('actions', tuple(map(str, self.actions)))
+        put('quantity', str(self.quantity))
+        for name, items in (('blocks', [n for n, _ in self.blocks]), ('actions', self.actions)):
+            if not items or len(set(items)) < len(items) or '' in items:
+                raise ValueError(f'{name}: expected at least one name, each once; got {items}')
+        if min(size for _, size in self.blocks) < 1:
+            raise ValueError(f'blocks: expected positive sizes; got {_words(self.blocks)}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(errors.unknown('activation', self.activation, ACTIVATIONS))
+        k, a = self.observation_size, len(self.actions)
+        put('mean', _array('mean', self.mean, (k,)))
+        put('std', _array('std', self.std, (k,)))
+        if not (self.std > 0).all():
+            raise ValueError('std: expected positive numbers')
+        put('log_std', _array('log_std', self.log_std, (a,)))
+        put('clip', float(_array('clip', self.clip, ())))
+        if not self.clip > 0:
+            raise ValueError(f'clip: expected a positive number; got {self.clip}')
+        layers = len(self.weights)
+        if not layers or len(self.biases) != layers:
+            raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
+        weights, biases, inputs = [], [], k
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            outputs = a if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
+            weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
+            biases.append(_array(f'bias_{i}', bias, (outputs,)))
+            inputs = outputs
+        put('weights', tuple(weights))
+        put('biases', tuple(biases))
+        try:
+            put('info', json.loads(json.dumps(self.info, allow_nan=False)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'info: JSON cannot hold it ({error})') from None
+        if not isinstance(self.info, dict):
+            raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
+
+    @property
+    def observation_size(self) -> int:
+        """How many numbers an observation has, k."""
+        return sum(size for _, size in self.blocks)
+
+    def __call__(self, observation: Any) -> np.ndarray:
+        """Returns the action without noise, in [-1, 1].
+
+        Args:
+          observation: (k,) or (n, k); or a mapping with all blocks, each (size,) or (n, size), of
+            which entries that are no blocks of the policy are left out.
+
+        Returns:
+          (a,) or (n, a), float64.
+
+        Raises:
+          ValueError: an observation of another size, or a missing block.
+        """
+        return np.clip(self._output(self._flat(observation)), -1, 1)
+
+    def sample(self, observation: Any, random: np.random.Generator) -> np.ndarray:
+        """Returns the action with exploration noise, clipped to [-1, 1].
+
+        Arguments, results and errors are those of calling the policy.
+        """
+        output = self._output(self._flat(observation))
+        noise = random.standard_normal(output.shape)
+        return np.clip(output + np.exp(self.log_std.astype(float)) * noise, -1, 1)
+
+    def check(self, environment: Any) -> None:
+        """Checks that observation and action are what the policy was trained with.
+
+        Args:
+          environment: an `Environment` or `VectorEnvironment`.
+
+        Raises:
+          ValueError: they are not; the message has both.
+        """
+        blocks = tuple((name, part.stop - part.start) for name, part in environment.blocks.items())
+        if blocks != self.blocks:
+            raise ValueError(
+                f'the policy of {self.id!r} observes {_words(self.blocks)}; the environment gives '
+                f'{_words(blocks)}'
+            )
+        actions, quantity = tuple(environment.action_map.names), environment.action_map.quantity
+        if (actions, quantity) != (self.actions, self.quantity):
+            raise ValueError(
+                f'the policy of {self.id!r} sets the {self.quantity} of {", ".join(self.actions)}; '
+                f'the environment takes the {quantity} of {", ".join(actions)}'
+            )
+
+    def _flat(self, observation: Any) -> np.ndarray:
+        names = [name for name, _ in self.blocks]
+        if isinstance(observation, Mapping):
+            if _FLAT in observation and _FLAT not in names:
+                return self._flat(observation[_FLAT])
+            missing = [name for name in names if name not in observation]
+            if missing:
+                raise ValueError(
+                    f'the observation lacks {", ".join(missing)}; expected {_words(self.blocks)}'
+                )
+            parts = [np.asarray(observation[name], dtype=float) for name in names]
+            for (name, size), part in zip(self.blocks, parts, strict=True):
+                if part.ndim not in (1, 2) or part.shape != (*parts[0].shape[:-1], size):
+                    raise ValueError(
+                        f'observation block {name!r} has shape {part.shape}; expected ({size},) or '
+                        f'(n, {size}), with the same n in all blocks'
+                    )
+            return np.concatenate(parts, axis=-1)
+        flat = np.asarray(observation, dtype=float)
+        k = self.observation_size
+        if flat.ndim not in (1, 2) or flat.shape[-1] != k:
+            raise ValueError(
+                f'the observation has shape {flat.shape}; expected ({k},) or (n, {k}): '
+                f'{_words(self.blocks)}'
+            )
+        return flat
+
+    def _output(self, flat: np.ndarray) -> np.ndarray:
+        x = np.clip((np.atleast_2d(flat) - self.mean) / self.std, -self.clip, self.clip)
+        x = x.astype(np.float32, order='C')
+        activation = ACTIVATIONS[self.activation]
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            # Row by row, so that an action does not depend on how many rows there are.
+            x = np.matmul(x[:, None], weight)[:, 0] + bias
+            if i < len(self.weights) - 1:
+                x = activation(x)
+        return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+
+def save(policy: Policy, path: str | os.PathLike[str]) -> None:
+    """Writes a policy as .npz; an old file stays until the new one is whole.
+
+    Raises:
+      ValueError: another suffix.
+      OSError: the file cannot be written.
+    """
+    from trl_suite import rendering
+
+    fields: dict[str, Any] = {
+        'format': FORMAT,
+        'version': VERSION,
+        'id': policy.id,
+        'block_names': [name for name, _ in policy.blocks],
+        'block_sizes': [size for _, size in policy.blocks],
+        'actions': policy.actions,
+        'quantity': policy.quantity,
+        'mean': policy.mean,
+        'std': policy.std,
+        'clip': np.float32(policy.clip),
+        'activation': policy.activation,
+        'layers': len(policy.weights),
+        'log_std': policy.log_std,
+        'info': json.dumps(policy.info),
+    }
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        fields[f'weight_{i}'], fields[f'bias_{i}'] = weight, bias
+    with rendering.replacing(rendering.check_path(path, ('.npz',))) as part:
+        np.savez_compressed(part, allow_pickle=False, **fields)
+
+
+def load(path: str | os.PathLike[str]) -> Policy:
+    """Reads a policy that `save` wrote.
+
+    Raises:
+      ValueError: a broken or malformed file; the message names file and field.
+      FileNotFoundError: there is no such file.
+    """
+    path = pathlib.Path(path)
+    content = io.BytesIO(path.read_bytes())
+    fields: dict[str, Any] = {}
+    field = ''
+    try:
+        archive = np.load(content, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError('a single array')
+        for field, (kind, axes) in _FIELDS.items():
+            fields[field] = _read(archive, field, kind, axes).tolist()
+            if field == 'format' and fields[field] != FORMAT:
+                raise ValueError(f'is {fields[field]!r}; expected {FORMAT!r}')
+            if field == 'version' and fields[field] != VERSION:
+                raise ValueError(f'is {fields[field]}; expected {VERSION}')
+        weights: list[np.ndarray] = []
+        biases: list[np.ndarray] = []
+        for i in range(fields['layers']):
+            for field, axes, into in ((f'weight_{i}', 2, weights), (f'bias_{i}', 1, biases)):
+                into.append(_read(archive, field, 'f', axes))
+        field = 'info'
+        fields[field] = json.loads(fields[field])
+        for field in archive:
+            if field not in _FIELDS and field.partition('_')[0] not in ('weight', 'bias'):
+                raise ValueError('is unknown')
+        if len(archive.files) != len(_FIELDS) + 2 * len(weights):
+            field = 'layers'
+            raise ValueError(f'is {len(weights)}, and there are arrays of others')
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        where = f'field {field!r}' if field else 'no readable policy'
+        raise ValueError(f'{path}: {where}: {error}') from None
+    names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
+    for field in ('format', 'version', 'layers'):
+        del fields[field]
+    try:
+        return Policy(
+            blocks=tuple(zip(names, sizes, strict=True)),
+            weights=tuple(weights),
+            biases=tuple(biases),
+            **fields,
+        )
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def reference(id: str) -> Policy:
+    """Returns the policy shipped for an environment.
+
+    Args:
+      id: id of the environment, or an alias ('plaid/dog_gaps').
+
+    Raises:
+      ValueError: unknown id; the message has the closest matches.
+      FileNotFoundError: no policy is shipped for it; the message has the closest that have one.
+    """
+    row = catalogue.find(id)
+    shipped = available()
+    if row.id not in shipped:
+        near = difflib.get_close_matches(row.id, shipped, n=3, cutoff=0)
+        raise FileNotFoundError(
+            f'no policy is shipped for {row.id!r}; '
+            + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
+        )
+    path = resources.directory('trained') / f'{row.id}.npz'
+    policy = load(path)
+    if policy.id != row.id:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {row.id!r}")
+    return policy
+
+
+def available() -> tuple[str, ...]:
+    """Returns the ids of the environments that have a shipped policy, as the catalogue has them."""
+    files = {path.stem for path in resources.directory('trained').glob('*.npz')}
+    return tuple(id for id in catalogue.BY_ID if id in files)
+
+
+def _read(archive: Any, field: str, kind: str, axes: int) -> np.ndarray:
+    if field not in archive:
+        raise ValueError('is missing')
+    array = archive[field]
+    if array.dtype.kind not in kind or array.ndim != axes:
+        raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
+    return array
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns a read-only copy, float32, of the given shape."""
+    try:
+        with np.errstate(over='ignore'):
+            array = np.array(value, dtype=np.float32, order='C')
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
+    if array.shape != shape:
+        raise ValueError(f'{name}: has shape {array.shape}; expected {shape}')
+    if not np.isfinite(array).all():
+        raise ValueError(f'{name}: has numbers that are not finite')
+    array.setflags(write=False)
+    return array
+
+
+def _words(blocks: Sequence[tuple[str, int]]) -> str:
+    return ', '.join(f'{name} {size}' for name, size in blocks)
