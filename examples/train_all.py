@@ -23,6 +23,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Collection
 from typing import Any
 
 import ppo
@@ -35,7 +36,7 @@ SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
 
 
-def jobs(pattern: str) -> list[tuple[str, int]]:
+def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
     """Which runs there are: first one of each environment, then the repetitions."""
     ids = [id_ for id_ in catalogue.BY_ID if fnmatch.fnmatchcase(id_, pattern)]
     if not ids:
@@ -46,7 +47,7 @@ def jobs(pattern: str) -> list[tuple[str, int]]:
         else SEEDS
         for id_ in ids
     }
-    found = [(id_, seed) for id_ in ids for seed in seeds[id_]]
+    found = [(id_, seed) for id_ in ids for seed in seeds[id_] if seed in only_seeds]
     return sorted(found, key=lambda job: job[1])  # sorting is stable
 
 
@@ -93,6 +94,7 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--only', default='*', metavar='PATTERN', help='of ids')
+    parser.add_argument('--seeds', type=int, nargs='+', default=COMPARED_SEEDS, help='only these')
     parser.add_argument('--jobs', type=int, default=2, help='runs side by side')
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs'))
     parser.add_argument('--again', action='store_true', help='train anew what has been entered')
@@ -103,7 +105,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     todo = []
-    for id_, seed in jobs(arguments.only):
+    for id_, seed in jobs(arguments.only, arguments.seeds):
         entered = any(r['seed'] == seed and r['settings'] == settings(id_) for r in entries(id_))
         if arguments.again:
             shutil.rmtree(arguments.runs / id_ / f'seed_{seed}', ignore_errors=True)
