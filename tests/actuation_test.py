@@ -1,4 +1,4 @@
-"""Tests of trl_suite.actuation: what an action means, and what a joint can get."""
+"""Tests of the actuation of planar characters: what an action means, what a joint can get."""
 
 import dataclasses
 

@@ -13,6 +13,7 @@ from absl.testing import absltest, parameterized
 from scipy.spatial.transform import Rotation
 
 from trl_suite import motion
+from trl_suite.motion import quaternion
 
 PERIOD = 0.8
 
@@ -35,6 +36,46 @@ def free(loop=True, rate=(0.3, -0.4, 1.2), n=33):
     turn = wxyz(Rotation.from_rotvec(np.outer(times, rate)))
     poses = np.column_stack([times, -times, 1 + 0 * times, turn, turn, 0.7 + 0 * times])
     return motion.Clip('free', times, poses, 'free', ('ball', 'hinge'), (4, 1), loop)
+
+
+def circle(turn=0.9, radius=2.0, n=41):
+    """Walks a part of a circle to the left, climbing; the root rolls, a ball joint swings."""
+    times = np.linspace(0, PERIOD, n)
+    share = times / PERIOD
+    heading = 0.4 + turn * share
+    x, y = radius * np.sin(heading), -radius * np.cos(heading)
+    roll = 0.2 * np.sin(2 * np.pi * share)
+    root = wxyz(Rotation.from_euler('ZX', np.stack([heading, roll], axis=1)))
+    ball = wxyz(Rotation.from_rotvec(np.outer(np.sin(2 * np.pi * share), (0.3, 0.1, 0.2))))
+    poses = np.column_stack([x, y, 1 + 0.1 * share, root, ball])
+    return motion.Clip(
+        'circle', times, poses, 'free', ('right_hip',), (4,), loop=True, turning=True
+    )
+
+
+def steps(n=7):
+    """Two steps: the root advances, the right hip and knee move, the left ones stand."""
+    times = np.linspace(0, 0.5, n)
+    poses = []
+    for speed, rate in ((1.0, 0.3), (2.0, 0.6)):
+        turn = wxyz(Rotation.from_rotvec(np.outer(times, (0, 0.2, rate))))
+        still = np.tile((1.0, 0, 0, 0), (n, 1))
+        poses.append(
+            np.column_stack(
+                [speed * times, 0.1 * times, 1 + 0 * times, turn, turn, times, still, 0 * times]
+            )
+        )
+    return motion.Steps(
+        'steps',
+        times,
+        np.array(poses),
+        ('right_hip', 'right_knee', 'left_hip', 'left_knee'),
+        (4, 1, 4, 1),
+        labels=[(0.5, 0.15, 0.1), (1.0, 0.2, -0.3)],
+        previous=[(0.5, 0.15, 0.0)] * 2,
+        features=np.arange(14.0).reshape(2, 7),
+        description='two',
+    )
 
 
 class SamplingTest(parameterized.TestCase):
@@ -69,6 +110,54 @@ class SamplingTest(parameterized.TestCase):
     def test_heading_does_not_accumulate(self):
         clip = free()
         np.testing.assert_allclose(clip.pose(PERIOD + 0.1)[3:7], clip.pose(0.1)[3:7])
+
+    @parameterized.parameters(0.9, -2.5, 1e-5, 1e-12)
+    def test_heading_accumulates_where_it_shall(self, turn):
+        clip = circle(turn)
+        self.assertAlmostEqual(clip.heading_change, turn)
+        cycles = np.array([-3, -1, 0, 1, 2, 7])
+        t = 0.3 * PERIOD
+        found, first = clip.pose(t + cycles * PERIOD), clip.pose(t)
+        heading = quaternion.heading(first[3:7]) + cycles * turn
+        gap = quaternion.heading(found[:, 3:7]) - heading
+        np.testing.assert_allclose(np.exp(1j * gap), 1, atol=1e-9)
+        # On the circle for ever, but for the sag between frames; the climb goes on.
+        np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 1]), 2, atol=5e-3)
+        np.testing.assert_allclose(found[:, 2], 1.03 + 0.1 * cycles, atol=1e-9)
+        np.testing.assert_allclose(found[:, 7:], [first[7:]] * 6, atol=1e-12)
+        # Each cycle is the one before it, moved.
+        for axis in (0, 1):
+            expected = quaternion.turned(np.tile(first[:2], (6, 1)), cycles * turn)[:, axis]
+            np.testing.assert_allclose(found[:, axis], expected, atol=1e-6)
+
+    @parameterized.parameters(0.9, -2.5)
+    def test_turning_is_smooth_over_the_seams(self, turn):
+        clip = circle(turn)
+        t = np.linspace(-2 * PERIOD, 2 * PERIOD, 401)
+        velocity = clip.velocity(t)
+        ways = np.hypot(velocity[:, 0], velocity[:, 1])
+        np.testing.assert_allclose(ways, 2 * abs(turn) / PERIOD, rtol=2e-3)
+        at = clip.velocity([0.0, PERIOD, -3 * PERIOD])
+        np.testing.assert_allclose(at[:, 2:], [at[0, 2:]] * 3, atol=1e-9)
+
+    def test_straight_on_when_turning_by_nothing(self):
+        straight = dataclasses.replace(free(rate=(0, 0, 0)), turning=True)
+        t = np.linspace(-2, 2, 41)
+        expected = dataclasses.replace(straight, turning=False).pose(t)
+        np.testing.assert_allclose(straight.pose(t), expected, atol=1e-9)
+
+    def test_mirrored_it_turns_the_other_way(self):
+        clip = circle()
+        mirrored = clip.mirrored()
+        self.assertAlmostEqual(mirrored.heading_change, -0.9)
+        t = np.linspace(-2, 2, 41)
+        np.testing.assert_allclose(
+            mirrored.pose(t), clip.layout.mirror.pose(clip.pose(t)), atol=1e-9
+        )
+
+    def test_heading_change_is_the_shorter_way(self):
+        self.assertAlmostEqual(circle(2 * np.pi - 0.5).heading_change, -0.5)
+        self.assertEqual(planar().heading_change, 0)
 
     def test_somersault_goes_on_turning(self):
         times = np.linspace(0, 1, 11)
@@ -157,6 +246,24 @@ class MirrorTest(absltest.TestCase):
             ]
             np.testing.assert_allclose(turn[1], mirror @ turn[0] @ mirror, atol=1e-12)
 
+    def test_by_name(self):
+        library = steps()
+        clip = library.clip(0)
+        pairs = [('right_hip', 'left_hip'), ('right_knee', 'left_knee')]
+        np.testing.assert_array_equal(clip.mirrored().poses, clip.mirrored(pairs).poses)
+        mirrored = clip.mirrored().poses
+        np.testing.assert_array_equal(mirrored[:, 7:11], [(1, 0, 0, 0)] * 7)
+        np.testing.assert_array_equal(mirrored[:, 16], clip.poses[:, 11])
+
+    def test_velocity_is_that_of_the_mirrored_clip(self):
+        for clip in (planar(), free(), circle(), steps().clip(1)):
+            t = np.linspace(0.05, 0.4, 11)
+            pairs = [('right', 'left')] if clip.root == 'planar' else None
+            mirror = motion.Mirror(clip.layout, pairs) if pairs else clip.layout.mirror
+            np.testing.assert_allclose(
+                mirror.velocity(clip.velocity(t)), clip.mirrored(pairs).velocity(t), atol=1e-9
+            )
+
     def test_refusals(self):
         with self.assertRaisesRegex(ValueError, "unknown joint 'rihgt'.*'right'"):
             planar().mirrored([('rihgt', 'left')])
@@ -178,6 +285,7 @@ class ConstructionTest(parameterized.TestCase):
         ('size', {'sizes': (1, 3)}, 'sizes'),
         ('sizes', {'sizes': (1,)}, 'sizes: 1 for 2 joints'),
         ('twice', {'joints': ('left', 'left')}, 'joints: a name occurs twice'),
+        ('turning', {'turning': True}, 'turning: a planar root'),
     )
     def test_refuses(self, change, message):
         with self.assertRaisesRegex(ValueError, f"clip 'planar', {message}"):
@@ -215,7 +323,7 @@ class FileTest(parameterized.TestCase):
         self.addCleanup(folder.cleanup)
         self.folder = pathlib.Path(folder.name)
 
-    @parameterized.parameters(planar, free)
+    @parameterized.parameters(planar, free, circle)
     def test_round_trip(self, make):
         path = self.folder / 'clip.npz'
         clip = dataclasses.replace(make(), name='clip', description='Größe')
@@ -303,6 +411,123 @@ class FileTest(parameterized.TestCase):
         np.savez(path, **fields)
         with self.assertRaisesRegex(ValueError, f'bad.npz: .*{message}'):
             motion.load(path)
+
+    def test_files_from_before_turning(self):
+        path = self.folder / 'clip.npz'
+        free().save(path)
+        with np.load(path) as archive:
+            fields = dict(archive)
+        del fields['turning']
+        np.savez(path, **fields)
+        self.assertFalse(motion.load(path).turning)
+
+
+class StepsTest(parameterized.TestCase):
+    """Libraries of made-up steps; the shipped ones are tested with the clips."""
+
+    def test_each_row_has_its_own_step_time_and_side(self):
+        library = steps()
+        index, t = np.array([0, 1, 1, 0]), np.array([0.1, 0.2, 0.5, 0.0])
+        mirrored = np.array([False, True, False, True])
+        pose = library.pose(index, t, mirrored)
+        velocity = library.velocity(index, t, mirrored)
+        self.assertEqual(pose.shape, (4, 17))
+        self.assertEqual(velocity.shape, (4, 14))
+        for row in range(4):
+            clip = library.clip(index[row], mirrored[row])
+            np.testing.assert_allclose(pose[row], clip.pose(t[row]), atol=1e-12)
+            np.testing.assert_allclose(velocity[row], clip.velocity(t[row]), atol=1e-9)
+
+    def test_broadcasts(self):
+        library = steps()
+        self.assertEqual(library.pose(0, np.zeros((2, 3))).shape, (2, 3, 17))
+        self.assertEqual(library.pose([0, 1], 0.1).shape, (2, 17))
+        self.assertEqual(library.pose(1, 0.1, [True, False]).shape, (2, 17))
+        self.assertEqual(library.velocity(1, 0.1).shape, (14,))
+
+    def test_holds_its_ends(self):
+        library = steps()
+        found = library.pose([0, 0], [-1, 9])
+        np.testing.assert_allclose(found, library.poses[0, [0, -1]], atol=1e-12)
+        self.assertAlmostEqual(library.velocity(0, 9)[0], 1.0)
+
+    def test_figures(self):
+        library = steps()
+        self.assertLen(library, 2)
+        self.assertEqual(library.duration, 0.5)
+        np.testing.assert_allclose(library.landing([0, 1]), [(0.5, 0.15, 0.1), (1.0, 0.2, -0.3)])
+        np.testing.assert_allclose(
+            library.landing([0, 1], [True, False]), [(0.5, -0.15, -0.1), (1.0, 0.2, -0.3)]
+        )
+        np.testing.assert_allclose(library.landing(1, True), (1.0, -0.2, 0.3))
+        with self.assertRaises(ValueError):
+            library.poses[0, 0, 0] = 1
+
+    def test_features(self):
+        # A walker that faces +y, at (1, 2), right foot 0.1 m to its right and 0.2 m ahead.
+        root, heading = np.array([[1.0, 2.0]]), np.array([np.pi / 2])
+        right, left = np.array([[1.1, 2.2]]), np.array([[0.9, 1.7]])
+        target, planned = np.array([[0.95, 2.7]]), np.array([np.pi / 2 + 0.3])
+        feet = (0.2, -0.1, -0.3, 0.1)
+        found = motion.step_features(root, heading, right, left, target, planned, np.array([True]))
+        np.testing.assert_allclose(found, [(*feet, 0.5, 0.15, 0.3)], atol=1e-12)
+        # In left stance what lies to the right takes the place of the left.
+        found = motion.step_features(root, heading, right, left, target, planned, np.array([False]))
+        np.testing.assert_allclose(found, [(-0.3, -0.1, 0.2, 0.1, 1.0, 0.05, -0.3)], atol=1e-12)
+
+    def test_heading_takes_the_shorter_way(self):
+        place = np.zeros((2, 2))
+        found = motion.step_features(
+            place, np.array([3.0, -3.0]), place, place, place, np.array([-3.0, 9.0]),
+            np.array([True, True]),
+        )  # fmt: skip
+        np.testing.assert_allclose(found[:, 6], (2 * np.pi - 6, 12 - 4 * np.pi))
+
+    def test_selects_the_nearest(self):
+        library = steps()
+        query = np.zeros((3, 7))
+        query[1:] = library.features[1]
+        query[2, :4] = -100  # the feet at the start have no weight by default
+        np.testing.assert_array_equal(library.select(query), (0, 1, 1))
+        np.testing.assert_array_equal(library.select(query, np.ones(7)), (0, 1, 0))
+
+    @parameterized.named_parameters(
+        ('no_clips', {'poses': np.zeros((0, 7, 17))}, 'poses: one or more'),
+        ('one_clip', {'poses': np.zeros((7, 17))}, 'poses: one or more'),
+        ('labels', {'labels': np.zeros((2, 2))}, r'labels: shape is \(2, 2\), needed \(2, 3\)'),
+        ('previous', {'previous': np.full((2, 3), np.nan)}, 'previous: not finite'),
+        ('features', {'features': [['a'] * 7] * 2}, 'features: an array of numbers'),
+    )
+    def test_refuses(self, change, message):
+        with self.assertRaisesRegex(ValueError, f"steps 'steps', {message}"):
+            dataclasses.replace(steps(), **change)
+
+    def test_refuses_what_a_clip_refuses(self):
+        with self.assertRaisesRegex(ValueError, r"clip 'steps\[0\]', sizes"):
+            dataclasses.replace(steps(), sizes=(4, 1, 4, 2))
+
+    def test_round_trip(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        path = pathlib.Path(folder.name) / 'steps_steps.npz'
+        library = steps()
+        library.save(path)
+        for found in (motion.load_steps(path), motion.load_steps(str(path))):
+            for field in dataclasses.fields(library):
+                np.testing.assert_array_equal(
+                    getattr(found, field.name), getattr(library, field.name), field.name
+                )
+        with self.assertRaisesRegex(ValueError, "'root': is missing"):
+            motion.load(path)
+        planar().save(path)
+        with self.assertRaisesRegex(ValueError, "steps_steps.npz: field 'labels': is missing"):
+            motion.load_steps(path)
+
+    def test_unknown_name(self):
+        with self.assertRaisesRegex(ValueError, "unknown step library 'biped3d'.*'biped3d_mocap'"):
+            motion.load_steps('biped3d')
+        with self.assertRaisesRegex(ValueError, 'unknown clip'):
+            motion.load('biped3d_mocap_steps')
 
 
 class ReaderTest(parameterized.TestCase):
@@ -400,11 +625,18 @@ class ReaderTest(parameterized.TestCase):
         climbing = self.deepmimic(Loop='wrap', CycleSyncRootHeight=True)
         np.testing.assert_allclose(climbing.displacement, (4, -1, 0.4))
 
-    @parameterized.parameters(('CycleSyncRootPos', False), ('CycleSyncRootRot', True))
-    def test_deepmimic_refuses_other_cycles(self, field, value):
-        with self.assertRaisesRegex(ValueError, f'walk.txt: {field}: {value} is not supported'):
-            self.deepmimic(Loop='wrap', **{field: value})
-        self.deepmimic(Loop='none', **{field: value})
+    def test_deepmimic_heading(self):
+        self.assertFalse(self.deepmimic(Loop='wrap').turning)
+        self.assertTrue(self.deepmimic(Loop='wrap', CycleSyncRootRot=True).turning)
+        self.assertFalse(self.deepmimic(Loop='none', CycleSyncRootRot=True).turning)
+        with self.assertRaisesRegex(ValueError, 'walk.txt: CycleSyncRootRot: true or false'):
+            self.deepmimic(Loop='wrap', CycleSyncRootRot=1)
+
+    def test_deepmimic_refuses_other_cycles(self):
+        message = 'walk.txt: CycleSyncRootPos: False is not supported'
+        with self.assertRaisesRegex(ValueError, message):
+            self.deepmimic(Loop='wrap', CycleSyncRootPos=False)
+        self.deepmimic(Loop='none', CycleSyncRootPos=False)
 
     @parameterized.parameters(
         (motion.read_deepmimic, True, "'wrap' or 'none'"),

@@ -156,7 +156,7 @@ class WheelTest(absltest.TestCase):
             print(pathlib.Path(trl_suite.__file__).resolve())
             print(resources.directory('xml').resolve())
             print(resources.directory('mocap').resolve())
-            print(len(motion.names()))
+            print(len(motion.names()) + len(motion.steps_names()))
             for id_ in ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0'):
                 environment = suite.make(id_, {'random': 0})
                 environment.reset()

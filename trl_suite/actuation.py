@@ -9,23 +9,27 @@ every actuated joint gets an armature, a joint limit of two physics steps stiffn
 passive damping. All of a servo's damping inside its force clamp chatters, all of it outside caps
 the joint's speed below what a bound needs, so it is split.
 
-Where a joint is prismatic, read m for rad, N for N m and kg for kg m^2.
+Where a joint is prismatic, read m for rad, N for N m and kg for kg m^2. A spherical joint has three
+actions, about the x (forward), y (left) and z (up) axes of its link in the zero pose; a limb swings
+forward by a rotation about -y. Its torque limit bounds the norm of the three torques; velocity
+servos, which MuJoCo clamps axis by axis, get that limit / sqrt(3) about each.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
+from dm_control import mjcf
 
 from trl_suite import errors, hill
 from trl_suite.characters import muscles as muscle_tables
 from trl_suite.characters.character import Character
 from trl_suite.characters.muscles import Muscle
 
-ARMATURE = 0.01  # kg m^2
 DAMPING_DIVISOR = 50.0  # passive damping of torque and position joints: torque limit / this, in s
 MUSCLE_DAMPING_DIVISOR = 100.0  # the force-velocity curve damps as well
 TORQUE_SCALE = 0.75  # of the limit at full action
@@ -33,7 +37,13 @@ FORCE_SCALE = 1.0  # the same of a prismatic joint
 VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
 SLIDE_VELOCITY_SCALE = 10.0  # m/s; at rest the hopper's leg then meets its force limit
 POSITION_HALF_RANGE = 1.5  # rad at full action; of a prismatic joint half its range
+ORIGINAL_SPAN = 2.0  # of the range of a joint; how far the original's position targets go at most
+ROTATIONS = ('vector', 'angle_axis')  # how position actions describe the rotation of a ball joint
+AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
 EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
+# The original's axis lies behind the angle: forward, up, right.
+_FORWARD_LEFT_UP, _SIGNS = np.array([1, 3, 2]), np.array([1.0, -1.0, 1.0])
+_TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +56,8 @@ class ActionMap:
       unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
       centre: control at action 0, shape (k,).
       half_range: change of control per unit action, shape (k,).
+      actuators: names of the actuators that take the controls, one after the other; those of ball
+        joints take three each. Empty where a controller stands between.
     """
 
     names: tuple[str, ...]
@@ -53,6 +65,7 @@ class ActionMap:
     unit: str
     centre: np.ndarray
     half_range: np.ndarray
+    actuators: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -76,17 +89,102 @@ class ActionMap:
         return (control - self.centre) / self.half_range
 
 
-def _prepare(character: Character, timestep: float, damping: np.ndarray) -> None:
-    """Gives every joint its armature, passive damping (J,) and a stiff limit."""
-    for joint, value in zip(character.joints, damping, strict=True):
-        joint.armature = ARMATURE
+@dataclasses.dataclass(frozen=True)
+class TorqueMap(ActionMap):
+    """Torques of joints, some of them spherical: their norm is clamped after the affine map.
+
+    Attributes:
+      balls: where the three torques of each ball joint are, shape (B, 3).
+      limits: the largest norm of each, N m, shape (B,).
+    """
+
+    balls: np.ndarray = dataclasses.field(kw_only=True)
+    limits: np.ndarray = dataclasses.field(kw_only=True)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        control = super().control(action)
+        torque = control.take(self.balls, -1)
+        torque *= (self.limits / np.maximum(_norm(torque), self.limits))[..., None]
+        control[..., self.balls] = torque
+        return control
+
+
+@dataclasses.dataclass(frozen=True)
+class AngleAxisMap(ActionMap):
+    """The position actions of the original: angle and axis of a rotation for every ball joint.
+
+    The affine map yields an angle, then an axis of any length, forward, up and right; the axis of
+    length 0 stands for the one to the right. `control` goes on to rotation vectors, so it returns
+    fewer numbers than it takes, and `action` gives back one of many equal actions.
+
+    Attributes:
+      angles: where the angle of each ball joint is in an action, shape (B,); its axis follows.
+      balls: where its rotation vector is in the controls, shape (B, 3).
+      hinges: where the other joints are in an action and in the controls, shape (2, H).
+    """
+
+    angles: np.ndarray = dataclasses.field(kw_only=True)
+    balls: np.ndarray = dataclasses.field(kw_only=True)
+    hinges: np.ndarray = dataclasses.field(kw_only=True)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        value = super().control(action)
+        axis = value.take(self._axes, -1)
+        axis *= _SIGNS
+        length = _norm(axis)
+        if not length.all():
+            axis[length == 0] = _TO_THE_RIGHT
+            length[length == 0] = 1
+        axis *= (value.take(self.angles, -1) / length)[..., None]
+        control = np.empty((*value.shape[:-1], self.balls.size + len(self.hinges[1])))
+        control[..., self.hinges[1]] = value.take(self.hinges[0], -1)
+        control[..., self.balls] = axis
+        return control
+
+    @functools.cached_property
+    def _axes(self) -> np.ndarray:
+        """Where forward, left and up are in an action, shape (B, 3)."""
+        return self.angles[:, None] + _FORWARD_LEFT_UP
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        vector = control[..., self.balls]
+        angle = _norm(vector)
+        turned = angle[..., None] > 0
+        axis = np.where(turned, vector / np.where(turned, angle[..., None], 1), _TO_THE_RIGHT)
+        value = np.empty((*control.shape[:-1], len(self)))
+        value[..., self.hinges[0]] = control[..., self.hinges[1]]
+        value[..., self.angles] = angle
+        # Of such a length that actions in [-1, 1] reach every axis.
+        value[..., self._axes] = axis * _SIGNS * (1 - AXIS_OFFSET)
+        return super().action(value)
+
+
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    """Lengths of vectors (..., 3); in every row the same whatever the number of rows."""
+    square = vectors * vectors
+    return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])
+
+
+def _prepare(
+    character: Character, timestep: float, damping: np.ndarray, least: np.ndarray | None = None
+) -> None:
+    """Gives every joint its armature, at least `least` (J,), damping (J,) and a stiff limit."""
+    armature = np.array([joint.armature for joint in character.row.joints.values()])
+    armature = armature if least is None else np.maximum(armature, least)
+    for joint, inertia, value in zip(character.joints, armature, damping, strict=True):
+        joint.armature = inertia
         joint.damping = value
         joint.solreflimit = (2 * timestep, 1)
 
 
+def _spread(character: Character, per_joint: np.ndarray) -> np.ndarray:
+    """Returns figures of joints (J, ...) for every degree of freedom, (D, ...)."""
+    return np.repeat(per_joint, character.dofs, axis=0)
+
+
 def _by_type(character: Character, revolute: float, prismatic: float) -> np.ndarray:
-    """Returns one of two figures for each joint, shape (J,)."""
-    return np.where(character.prismatic, prismatic, revolute)
+    """Returns one of two figures for each degree of freedom, shape (D,)."""
+    return _spread(character, np.where(character.prismatic, prismatic, revolute))
 
 
 def _unit(character: Character, revolute: str, prismatic: str) -> str:
@@ -95,35 +193,93 @@ def _unit(character: Character, revolute: str, prismatic: str) -> str:
     return f'{revolute} ({", ".join(slides)}: {prismatic})' if len(slides) else revolute
 
 
+def _split(character: Character, parts: Sequence[str]) -> tuple[str, ...]:
+    """Returns the names of the joints, each ball joint's once for every part of it."""
+    return tuple(
+        f'{name}_{part}' if ball else name
+        for name, ball in zip(character.row.joints, character.spherical, strict=True)
+        for part in (parts if ball else ('',))
+    )
+
+
+def _balls(character: Character, size: int) -> np.ndarray:
+    """Returns where ball joints begin if each takes `size` numbers, shape (B,)."""
+    ball = character.spherical
+    sizes = np.where(ball, size, 1)
+    return (np.cumsum(sizes) - sizes)[ball]
+
+
+def _dofs(character: Character) -> Iterator[tuple[str, mjcf.Element, dict[str, Any]]]:
+    """Yields name and joint of every degree of freedom, and what its actuator needs to know."""
+    for name, joint, ball in zip(
+        character.row.joints, character.joints, character.spherical, strict=True
+    ):
+        if ball:
+            for axis, gear in zip('xyz', np.eye(3), strict=True):
+                yield f'{name}_{axis}', joint, {'gear': gear}
+        else:
+            yield name, joint, {}
+
+
+def original_ranges(character: Character) -> np.ndarray:
+    """Limits by which the original scales position actions, rad or m, shape (J, 2).
+
+    Of a ball joint they are the extremes over its three axes.
+    """
+    ranges = character.joint_ranges
+    ranges[character.spherical, 0] = -ranges[character.spherical, 1]
+    for i, joint in enumerate(character.row.joints.values()):
+        if joint.original_range is not None:
+            ranges[i] = joint.original_range
+    free = ~np.isfinite(ranges).all(1)
+    return np.where(free[:, None], (-np.pi, np.pi), ranges)
+
+
 def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap:
     limits = character.torque_limits
     _prepare(character, timestep, limits / DAMPING_DIVISOR)
-    for name, joint, limit in zip(character.row.joints, character.joints, limits, strict=True):
+    each = _spread(character, limits)
+    for (name, joint, options), limit in zip(_dofs(character), each, strict=True):
         character.mjcf_model.actuator.add(
-            'motor', name=name, joint=joint, ctrllimited=True, ctrlrange=(-limit, limit)
+            'motor', name=name, joint=joint, ctrllimited=True, ctrlrange=(-limit, limit), **options
         )
-    names = tuple(character.row.joints)
+    names = _split(character, 'xyz')
     scale = _by_type(character, TORQUE_SCALE, FORCE_SCALE)
     unit = _unit(character, 'N m', 'N')
-    return ActionMap(names, 'torque', unit, np.zeros(len(limits)), scale * limits)
+    affine = names, 'torque', unit, np.zeros(len(names)), scale * each, names
+    ball = character.spherical
+    if not ball.any():
+        return ActionMap(*affine)
+    balls = _balls(character, 3)[:, None] + np.arange(3)
+    return TorqueMap(*affine, balls=balls, limits=limits[ball])
 
 
 def _add_velocity(character: Character, timestep: float, **_: object) -> ActionMap:
-    limits = character.torque_limits
-    # A passive part would pull every joint towards rest instead of towards the target.
-    _prepare(character, timestep, np.zeros(len(limits)))
-    gains = [joint.kd for joint in character.row.joints.values()]
-    for name, joint, limit, kd in zip(
-        character.row.joints, character.joints, limits, gains, strict=True
+    limits, ball = character.torque_limits, character.spherical
+    kd = np.array([joint.kd for joint in character.row.joints.values()])
+    passive, least, clamps = np.zeros(len(limits)), None, limits
+    if ball.any():
+        # Limbs on ball joints spin up without passive damping. The drive makes up for its pull
+        # towards rest: below the clamp the law is that of a servo with all of kd.
+        passive = np.minimum(limits / DAMPING_DIVISOR, kd)
+        # With a clamp for every axis thin limbs would shiver for good: a force that changes sign at
+        # every step feeds itself unless 2 * inertia > gain * timestep.
+        least = (kd - passive) * timestep / 2
+        clamps = np.where(ball, limits / np.sqrt(3), limits)
+    _prepare(character, timestep, passive, least)
+    figures = (_spread(character, each) for each in (clamps, kd, kd - passive))
+    for (name, joint, options), limit, gain, damping in zip(
+        _dofs(character), *figures, strict=True
     ):
         character.mjcf_model.actuator.add(
-            'velocity', name=name, joint=joint, kv=kd, ctrllimited=False,
-            forcelimited=True, forcerange=(-limit, limit),
+            'general', name=name, joint=joint, gaintype='fixed', biastype='affine',
+            gainprm=(gain,), biasprm=(0, 0, -damping), ctrllimited=False,
+            forcelimited=True, forcerange=(-limit, limit), **options,
         )  # fmt: skip
-    names = tuple(character.row.joints)
+    names = _split(character, 'xyz')
     return ActionMap(
-        names, 'target velocity', _unit(character, 'rad/s', 'm/s'), np.zeros(len(limits)),
-        _by_type(character, VELOCITY_SCALE, SLIDE_VELOCITY_SCALE),
+        names, 'target velocity', _unit(character, 'rad/s', 'm/s'), np.zeros(len(names)),
+        _by_type(character, VELOCITY_SCALE, SLIDE_VELOCITY_SCALE), names,
     )  # fmt: skip
 
 
@@ -132,34 +288,82 @@ def _add_position(
     timestep: float,
     centre: Sequence[float] | np.ndarray | None = None,
     half_range: float | Sequence[float] | np.ndarray | None = None,
+    rotations: str = 'vector',
     **_: object,
 ) -> ActionMap:
+    if rotations not in ROTATIONS:
+        raise ValueError(errors.unknown('way to describe rotations', rotations, ROTATIONS))
     limits = character.torque_limits
     joints = list(character.row.joints.values())
     kd = np.array([joint.kd for joint in joints])
     passive = np.minimum(limits / DAMPING_DIVISOR, kd)
     _prepare(character, timestep, passive)
-    for name, joint, element, limit, servo in zip(
-        character.row.joints, joints, character.joints, limits, kd - passive, strict=True
-    ):
-        character.mjcf_model.actuator.add(
-            'position', name=name, joint=element, kp=joint.kp, kv=servo, ctrllimited=False,
-            forcelimited=True, forcerange=(-limit, limit),
-        )  # fmt: skip
-    middle = np.array([joint.target for joint in joints]) if centre is None else np.array(centre)
+    for name, joint, element, limit, servo, ball in zip(
+        character.row.joints, joints, character.joints, limits, kd - passive, character.spherical,
+        strict=True,
+    ):  # fmt: skip
+        if ball:
+            # Its control is a rotation vector, its force range bounds a norm. At the clamp MuJoCo
+            # 3.17 drops or keeps the implicit damping of a step as the norm's last bit has it.
+            character.mjcf_model.actuator.add(
+                'orientation', name=name, joint=element, kp=joint.kp, kv=servo,
+                forcelimited=True, forcerange=(0, limit),
+            )  # fmt: skip
+        else:
+            character.mjcf_model.actuator.add(
+                'position', name=name, joint=element, kp=joint.kp, kv=servo, ctrllimited=False,
+                forcelimited=True, forcerange=(-limit, limit),
+            )  # fmt: skip
+    if rotations == 'angle_axis':
+        if centre is not None or half_range is not None:
+            raise ValueError('angles and axes are those of the original: no centre, no half_range')
+        return _angle_axis(character)
+    names = _split(character, 'xyz')
+    if centre is None:
+        middle = np.concatenate([
+            np.broadcast_to(joint.target, size)
+            for joint, size in zip(joints, character.dofs, strict=True)
+        ]).astype(float)  # fmt: skip
+    else:
+        middle = np.array(centre)
     if half_range is None:
         slide = np.ptp(character.joint_ranges, axis=1) / 2
-        half_range = np.where(character.prismatic, slide, POSITION_HALF_RANGE)
-    reach = np.broadcast_to(np.asarray(half_range, dtype=float), len(joints)).copy()
-    if middle.shape != (len(joints),) or not (
+        # Joints that hardly move get the original's reach.
+        original = ORIGINAL_SPAN * np.ptp(original_ranges(character), axis=1)
+        turn = np.minimum(POSITION_HALF_RANGE, original)
+        half_range = _spread(character, np.where(character.prismatic, slide, turn))
+    reach = np.broadcast_to(np.asarray(half_range, dtype=float), len(names)).copy()
+    if middle.shape != (len(names),) or not (
         np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
     ):
         raise ValueError(
             f'position control of {character.row.name!r}: centre and half_range must be finite, '
-            f'positive in range, and broadcast to ({len(joints)},)'
+            f'positive in range, and broadcast to ({len(names)},)'
         )
+    quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')
-    return ActionMap(tuple(character.row.joints), 'target angle', unit, middle, reach)
+    return ActionMap(names, quantity, unit, middle, reach, tuple(character.row.joints))
+
+
+def _angle_axis(character: Character) -> AngleAxisMap:
+    """Returns the original's map of position actions."""
+    ranges, ball = original_ranges(character), character.spherical
+    span = np.ptp(ranges, axis=1)
+    span[~character.prismatic] *= ORIGINAL_SPAN
+    span[character.prismatic] /= 2
+    names = _split(character, ('angle', 'forward', 'up', 'right'))
+    sizes = np.where(ball, 4, 1)
+    angles = _balls(character, 4)
+    centre = np.repeat(np.where(ball, 0, ranges.mean(1)), sizes)
+    half_range = np.repeat(span, sizes)
+    centre[angles + 3] = AXIS_OFFSET
+    half_range[angles[:, None] + np.arange(1, 4)] = 1
+    others = [np.cumsum(width)[~ball] - 1 for width in (sizes, character.dofs)]
+    return AngleAxisMap(
+        names, 'target angle and axis', _unit(character, 'rad and 1', 'm'), centre, half_range,
+        tuple(character.row.joints), angles=angles,
+        balls=_balls(character, 3)[:, None] + np.arange(3), hinges=np.array(others),
+    )  # fmt: skip
 
 
 def _add_muscle(character: Character, timestep: float, **_: object) -> ActionMap:
@@ -179,6 +383,7 @@ def _add_muscle(character: Character, timestep: float, **_: object) -> ActionMap
     return ActionMap(
         tuple(unit.name for unit in units), 'excitation', '1',
         np.full(len(units), EXCITATION_CENTRE), np.full(len(units), EXCITATION_HALF_RANGE),
+        tuple(unit.name for unit in units),
     )  # fmt: skip
 
 
@@ -213,8 +418,11 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       character: a character without actuators.
       model: one of `ACTUATIONS`.
       timestep: physics time step, s; joint limits are as stiff as it allows.
-      **options: for 'position', `centre` (J,) and `half_range`, rad (m where prismatic); by
-        default the working posture, and 1.5 rad or half the range of a prismatic joint.
+      **options: for 'position', `centre` and `half_range` of every degree of freedom, (D,), rad (m
+        where prismatic); by default the working posture, and 1.5 rad, half the range of a prismatic
+        joint, or for joints that hardly move twice their range. `rotations`: how actions describe
+        the rotation of a ball joint: by a rotation vector, 'vector', or by an angle and an axis,
+        'angle_axis', in the manner and range of the original.
 
     Returns:
       The map from actions to controls, in the order of the actuators.

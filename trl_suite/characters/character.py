@@ -21,22 +21,25 @@ class Joint:
     """Figures of one actuated joint that its MJCF element does not hold.
 
     Units are those of a revolute joint (hinge). A prismatic joint (slide) has m for rad and N for
-    N m throughout; which of the two a joint is, its MJCF element says.
+    N m throughout; a spherical joint (ball) has the same gains about every axis. Which of the three
+    a joint is, its MJCF element says.
 
     Attributes:
       kp: position gain, N m/rad.
       kd: damping gain, N m s/rad.
       weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
-      target: working posture of position control, rad.
+      target: working posture of position control, rad; of a spherical joint a rotation vector, or 0.
       original_range: limits in rad by which the original scales position actions, where they are
-        not the limits that act.
+        not the limits that act; of a spherical joint the extremes over its three axes.
+      armature: inertia in kg m^2 that is added to keep stiff servos of light links steady.
     """
 
     kp: float
     kd: float
     weight: float
-    target: float = 0.0
+    target: float | tuple[float, float, float] = 0.0
     original_range: tuple[float, float] | None = None
+    armature: float = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +55,7 @@ class CharacterRow:
       description: one line.
       root_weight: weight of the root in the imitation reward.
       path: MJCF file of a user's own character; by default xml/<name>.xml of the suite.
+      spatial: whether its root is free in three dimensions, instead of moving in the x-z plane.
     """
 
     name: str
@@ -62,6 +66,7 @@ class CharacterRow:
     description: str
     root_weight: float = 1.0
     path: str | None = None
+    spatial: bool = False
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -85,7 +90,7 @@ class CharacterRow:
 
 
 class Character(composer.Entity):
-    """A planar articulated figure that can be attached to any arena.
+    """An articulated figure, planar or in three dimensions, that can be attached to any arena.
 
     The entity owns its MJCF tree and its observables. Gains, limits and muscles become actuators
     only when an actuation model is added (see `trl_suite.actuation`).
@@ -106,14 +111,17 @@ class Character(composer.Entity):
         return self._mjcf_root
 
     def create_root_joints(self, frame: mjcf.Element) -> tuple[mjcf.Element, ...]:
-        """Lets an attached character move in the x-z plane.
+        """Lets an attached character move: in three dimensions if it is spatial, else in x and z.
 
         Args:
           frame: the attachment frame that `arena.attach(character)` returned.
 
         Returns:
-          The joints root_x (m), root_z (m) and root_pitch (rad, positive lifts the front).
+          The joints root_x (m), root_z (m) and root_pitch (rad, positive lifts the front); of a
+          spatial character one free joint, root.
         """
+        if self.row.spatial:
+            return (frame.add('freejoint', name='root'),)
         root = {'limited': False, 'damping': 0, 'armature': 0}
         return (
             frame.add('joint', name='root_x', type='slide', axis=(1, 0, 0), **root),
@@ -151,13 +159,29 @@ class Character(composer.Entity):
         return np.array([joint.type == 'slide' for joint in self.joints])
 
     @property
+    def spherical(self) -> np.ndarray:
+        """Which joints are ball joints, shape (number of joints,) bool."""
+        return np.array([joint.type == 'ball' for joint in self.joints])
+
+    @property
+    def dofs(self) -> np.ndarray:
+        """Degrees of freedom: 3 of a ball joint, otherwise 1, shape (number of joints,) int."""
+        return np.where(self.spherical, 3, 1)
+
+    @property
     def torque_limits(self) -> np.ndarray:
-        """Largest joint torques in N m, forces in N where prismatic, shape (number of joints,)."""
+        """Largest joint torques in N m, forces in N where prismatic, shape (number of joints,).
+
+        Of a ball joint the largest norm.
+        """
         return np.array([joint.actuatorfrcrange[1] for joint in self.joints])
 
     @property
     def joint_ranges(self) -> np.ndarray:
-        """Joint limits in rad, in m where prismatic, shape (number of joints, 2); infinite if free."""
+        """Joint limits in rad, in m where prismatic, shape (number of joints, 2); infinite if free.
+
+        Of a ball joint 0 and the largest angle of its rotation.
+        """
         free = (-np.inf, np.inf)
         return np.array([free if joint.range is None else joint.range for joint in self.joints])
 
@@ -176,12 +200,18 @@ class CharacterObservables(composer.Observables):
 
     @composer.observable
     def joints_pos(self) -> observable.MJCFFeature:
-        """Joint angles in rad, lengths in m where prismatic, shape (number of joints,)."""
+        """Joint angles in rad, lengths in m where prismatic, unit quaternions of ball joints.
+
+        Side by side in the order of `joints`, shape (number of joints + 3 per ball joint,).
+        """
         return observable.MJCFFeature('qpos', self._entity.joints)
 
     @composer.observable
     def joints_vel(self) -> observable.MJCFFeature:
-        """Joint rates in rad/s, in m/s where prismatic, shape (number of joints,)."""
+        """Joint rates in rad/s, in m/s where prismatic; three per ball joint, axes of the link.
+
+        Side by side in the order of `joints`, shape (number of joints + 2 per ball joint,).
+        """
         return observable.MJCFFeature('qvel', self._entity.joints)
 
     @composer.observable

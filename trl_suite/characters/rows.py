@@ -1,4 +1,4 @@
-"""The planar characters as rows of data. Source: the character files of the original simulator."""
+"""The characters as rows of data. Source: the character files of the original simulator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trl_suite.characters.character import CharacterRow, Joint
 _FILE_RANGE = (-1.57, 1.57)
 
 # Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; a prismatic
-# joint has m for rad and N for N m.
+# joint has m for rad and N for N m. Which joints are spherical, the MJCF files say.
 _DOG_JOINTS = {
     'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
     'spine1': Joint(200, 20, 0.5),
@@ -94,6 +94,51 @@ _HOPPER_JOINTS = {
     'leg': Joint(1000, 20, 0.5),
 }
 
+_BIPED3D_JOINTS = {
+    'torso': Joint(1000, 100, 0.5),
+    'right_hip': Joint(300, 30, 0.5),
+    'right_knee': Joint(300, 30, 0.3),
+    'right_ankle': Joint(100, 10, 0.2),
+    'left_hip': Joint(300, 30, 0.5),
+    'left_knee': Joint(300, 30, 0.3),
+    'left_ankle': Joint(100, 10, 0.2),
+}
+
+# Five times the gain on half the foot: with an armature of 0.01 an ankle that has met its torque
+# limit may go on shivering there.
+_BIPED3D_MOCAP_RUN_JOINTS = {
+    'torso': Joint(1000, 100, 0.5),
+    'right_hip': Joint(500, 50, 0.5),
+    'right_knee': Joint(500, 50, 0.3),
+    'right_ankle': Joint(500, 50, 0.2, armature=0.03),
+    'left_hip': Joint(500, 50, 0.5),
+    'left_knee': Joint(500, 50, 0.3),
+    'left_ankle': Joint(500, 50, 0.2, armature=0.03),
+}
+
+# The original spells sholder. Arms and head move by a hundredth of a radian.
+_BIPED3D_FULL_MOCAP_JOINTS = {
+    **_BIPED3D_JOINTS,
+    'right_shoulder': Joint(100, 10, 0.001),
+    'right_elbow': Joint(100, 10, 0.001),
+    'right_wrist': Joint(100, 10, 0.001),
+    'left_shoulder': Joint(100, 10, 0.001),
+    'left_elbow': Joint(100, 10, 0.001),
+    'left_wrist': Joint(100, 10, 0.001),
+    'neck': Joint(100, 10, 0.001),
+    'head': Joint(100, 10, 0.001),
+}
+
+# The only spherical joints whose limits are not the same to both sides.
+_BIPED3D_SIMBICON_JOINTS = {
+    'right_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
+    'right_knee': Joint(200, 20, 0.3),
+    'right_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
+    'left_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
+    'left_knee': Joint(200, 20, 0.3),
+    'left_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
+}
+
 DOG = CharacterRow(
     name='dog',
     joints=_DOG_JOINTS,
@@ -165,6 +210,53 @@ HOPPER = CharacterRow(
     description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
 )
 
+BIPED3D = CharacterRow(
+    name='biped3d',
+    joints=_BIPED3D_JOINTS,
+    fall_links=('root', 'torso'),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle'),
+    description='Biped in 3D, 8 links: a pelvis, a torso and two legs; waist, hips and ankles are balls.',
+    spatial=True,
+)
+
+BIPED3D_MOCAP = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_mocap',
+    description='Biped in 3D with longer legs and a narrower pelvis, 8 links: the walker of DeepLoco.',
+)
+
+BIPED3D_MOCAP_RUN = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_mocap_run',
+    joints=_BIPED3D_MOCAP_RUN_JOINTS,
+    description='Biped in 3D that runs, 8 links: light legs, strong and stiff joints.',
+)
+
+BIPED3D_FULL_MOCAP = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_full_mocap',
+    joints=_BIPED3D_FULL_MOCAP_JOINTS,
+    fall_links=tuple(
+        link for link in ('root', *_BIPED3D_FULL_MOCAP_JOINTS) if not link.endswith('ankle')
+    ),
+    description='Biped in 3D with arms and head, 16 links; these are all but rigid.',
+)
+
+BIPED3D_SIMBICON = CharacterRow(
+    name='biped3d_simbicon',
+    joints=_BIPED3D_SIMBICON_JOINTS,
+    fall_links=('root',),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    description='Biped of the gait state machines in 3D, 7 links: no waist, hips close to the middle.',
+    spatial=True,
+)
+
 CHARACTERS: dict[str, CharacterRow] = {
-    row.name: row for row in (DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER)
-}
+    row.name: row
+    for row in (
+        DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER, BIPED3D, BIPED3D_MOCAP,
+        BIPED3D_MOCAP_RUN, BIPED3D_FULL_MOCAP, BIPED3D_SIMBICON,
+    )
+}  # fmt: skip

@@ -1,6 +1,7 @@
-"""Reference motions: clips, their sampling, and readers for two JSON formats. Pure NumPy."""
+"""Reference motions: clips and step libraries, their sampling, and readers. Pure NumPy."""
 
 from trl_suite.motion.clip import Clip, load, names
+from trl_suite.motion.layout import Layout, Mirror
 from trl_suite.motion.readers import (
     DOG3D,
     HUMANOID3D,
@@ -8,14 +9,24 @@ from trl_suite.motion.readers import (
     read_terrainrl,
     write_terrainrl,
 )
+from trl_suite.motion.steps import Steps
+from trl_suite.motion.steps import features as step_features
+from trl_suite.motion.steps import load as load_steps
+from trl_suite.motion.steps import names as steps_names
 
 __all__ = [
     'DOG3D',
     'HUMANOID3D',
     'Clip',
+    'Layout',
+    'Mirror',
+    'Steps',
     'load',
+    'load_steps',
     'names',
     'read_deepmimic',
     'read_terrainrl',
+    'step_features',
+    'steps_names',
     'write_terrainrl',
 ]

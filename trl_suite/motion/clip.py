@@ -2,31 +2,39 @@
 
 Sampling follows the original simulator (anim/Motion.cpp): positions and angles interpolate
 linearly, rotations along the shorter arc, and a looping clip goes on where it ended: its root
-displacement accumulates, height included, its heading does not. The velocity differs on purpose:
-a central instead of a forward difference, over the same 1/60 s.
+displacement accumulates, height included, its heading only if the clip says so. The velocity
+differs on purpose: a central instead of a forward difference, over the same 1/60 s.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 import os
 import pathlib
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from trl_suite import errors, resources
-from trl_suite.motion import quaternion
+from trl_suite.motion import archive, quaternion
+from trl_suite.motion.layout import Layout, Mirror
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a velocity
-ROOT_SIZES = {'planar': 3, 'free': 7}  # columns of a pose: x, z, pitch; x, y, z, quaternion
-JOINT_SIZES = (1, 4)  # hinge angle; ball-joint quaternion
+STEPS_SUFFIX = '_steps'  # of the names of files that hold a step library instead of a clip
 _UNIT_TOLERANCE = 1e-6
-_FIELDS = ('times', 'poses', 'root', 'joints', 'sizes', 'loop', 'description')
+_STRAIGHT = 1e-9  # rad; a cycle that turns less goes straight on
+_FIELDS: dict[str, tuple[str, int] | None] = {
+    'times': None,
+    'poses': None,
+    'root': ('U', 0),
+    'joints': ('U', 1),
+    'sizes': ('iu', 1),
+    'loop': ('b', 0),
+    'description': ('U', 0),
+    'turning': ('b', 0),
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,6 +51,8 @@ class Clip:
       sizes: columns per joint, 1 for a hinge (rad), 4 for a ball joint (unit quaternion wxyz).
       loop: whether the motion repeats.
       description: one line.
+      turning: whether the heading that a cycle gains accumulates too, as on a circle; else every
+        cycle of a loop repeats the heading of the first. Needs a free root.
 
     Raises:
       ValueError: if a field is malformed; the message names clip and field.
@@ -56,6 +66,7 @@ class Clip:
     sizes: tuple[int, ...]
     loop: bool = False
     description: str = ''
+    turning: bool = False
 
     def __post_init__(self) -> None:
         for field in ('times', 'poses'):
@@ -68,23 +79,21 @@ class Clip:
         object.__setattr__(self, 'joints', tuple(map(str, self.joints)))
         object.__setattr__(self, 'sizes', tuple(map(int, self.sizes)))
         object.__setattr__(self, 'loop', bool(self.loop))
+        object.__setattr__(self, 'turning', bool(self.turning))
         self._check()
 
     def _error(self, field: str, what: str) -> ValueError:
         return ValueError(f'clip {self.name!r}, {field}: {what}')
 
     def _check(self) -> None:
-        if self.root not in ROOT_SIZES:
-            raise self._error('root', errors.unknown('root', self.root, ROOT_SIZES))
-        if len(set(self.joints)) != len(self.joints):
-            raise self._error('joints', 'a name occurs twice')
-        if len(self.sizes) != len(self.joints):
-            raise self._error('sizes', f'{len(self.sizes)} for {len(self.joints)} joints')
-        if not set(self.sizes) <= set(JOINT_SIZES):
-            raise self._error('sizes', 'a joint has 1 (hinge) or 4 (ball) columns')
+        try:
+            columns = self.layout.columns
+        except ValueError as error:
+            raise ValueError(f'clip {self.name!r}, {error}') from None
+        if self.turning and self.root == 'planar':
+            raise self._error('turning', 'a planar root has no heading')
         if self.times.ndim != 1 or self.times.size < 2:
             raise self._error('times', f'at least 2 are needed, shape is {self.times.shape}')
-        columns = ROOT_SIZES[self.root] + sum(self.sizes)
         if self.poses.shape != (self.times.size, columns):
             raise self._error(
                 'poses', f'shape is {self.poses.shape}, needed ({self.times.size}, {columns})'
@@ -95,7 +104,7 @@ class Clip:
                 raise self._error(field, f'not finite at {bad[0].tolist()}')
         if self.times[0] != 0 or np.any(np.diff(self.times) <= 0):
             raise self._error('times', 'must start at 0 and increase strictly')
-        for q, _ in self._rotations:
+        for q, _ in self.layout.rotations:
             norms = np.linalg.norm(self.poses[:, q : q + 4], axis=1)
             bad = np.argwhere(np.abs(norms - 1) > _UNIT_TOLERANCE)
             if bad.size:
@@ -106,27 +115,9 @@ class Clip:
                 )
 
     @functools.cached_property
-    def _rotations(self) -> tuple[tuple[int, int], ...]:
-        """First column in the pose and in the velocity of every quaternion."""
-        found = [(3, 3)] if self.root == 'free' else []
-        q, v = (7, 6) if self.root == 'free' else (3, 3)
-        for size in self.sizes:
-            if size == 4:
-                found.append((q, v))
-            q, v = q + size, v + min(size, 3)
-        return tuple(found)
-
-    @functools.cached_property
-    def _straight(self) -> np.ndarray:
-        """Columns of the pose that are no part of a quaternion."""
-        turned = [q + i for q, _ in self._rotations for i in range(4)]
-        return np.setdiff1d(np.arange(self.poses.shape[1]), turned)
-
-    @functools.cached_property
-    def _straight_velocities(self) -> np.ndarray:
-        """Columns of the velocity that belong to `_straight`."""
-        turned = [v + i for _, v in self._rotations for i in range(3)]
-        return np.setdiff1d(np.arange(len(self._straight) + len(turned)), turned)
+    def layout(self) -> Layout:
+        """The columns of poses and velocities."""
+        return Layout(self.root, self.joints, self.sizes)
 
     @functools.cached_property
     def _cycle(self) -> np.ndarray:
@@ -150,6 +141,14 @@ class Clip:
         return self.poses[-1, :position] - self.poses[0, :position]
 
     @property
+    def heading_change(self) -> float:
+        """What a cycle adds to the heading of a free root, rad in (-pi, pi]; planar: 0."""
+        if self.root == 'planar':
+            return 0.0
+        start, end = quaternion.heading(self.poses[[0, -1], 3:7])
+        return float(np.pi - (np.pi - (end - start)) % (2 * np.pi))
+
+    @property
     def speed(self) -> float:
         """Mean horizontal speed, m/s."""
         return float(np.linalg.norm(self.displacement[:-1])) / self.duration
@@ -169,12 +168,24 @@ class Clip:
         t = np.clip(t - cycle * self.duration, 0, self.duration)
         i = np.clip(np.searchsorted(self.times, t, side='right') - 1, 0, self.times.size - 2)
         u = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
-        before, after = self.poses[i], self.poses[i + 1]
-        poses = before + u[..., None] * (after - before)
-        for q, _ in self._rotations:
-            here = slice(q, q + 4)
-            poses[..., here] = quaternion.slerp(before[..., here], after[..., here], u)
+        poses = self.layout.blend(self.poses[i], self.poses[i + 1], u)
+        if self.turning:
+            return self._turned(poses, cycle)
         return poses + cycle[..., None] * self._cycle
+
+    def _turned(self, poses: np.ndarray, cycle: np.ndarray) -> np.ndarray:
+        """Returns poses of the first cycle where later cycles (...) have them."""
+        turn = self.heading_change
+        angle = cycle * turn
+        # The displacements of k cycles are the sides of a polygon: its chord.
+        small = abs(turn) < _STRAIGHT
+        chord = cycle if small else np.sin(angle / 2) / np.sin(turn / 2)
+        start, way = self.poses[0, :3], self.displacement
+        shift = quaternion.turned(way[:2], (angle - turn) / 2) * chord[..., None]
+        poses[..., :2] = quaternion.turned(poses[..., :2] - start[:2], angle) + start[:2] + shift
+        poses[..., 2] += cycle * way[2]
+        poses[..., 3:7] = quaternion.multiply(quaternion.about_z(angle), poses[..., 3:7])
+        return poses
 
     def velocity(self, t: ArrayLike) -> np.ndarray:
         """Returns the velocities at times `t` in s: a central difference over 1/60 s.
@@ -195,12 +206,7 @@ class Clip:
         start, end = t - VELOCITY_STEP / 2, t + VELOCITY_STEP / 2
         if not self.loop:
             start, end = np.clip([start, end], 0, self.duration)
-        a, b = self.pose(start), self.pose(end)
-        velocity = np.empty((*t.shape, self._straight_velocities.size + 3 * len(self._rotations)))
-        velocity[..., self._straight_velocities] = (b - a)[..., self._straight]
-        for q, v in self._rotations:
-            turn = quaternion.multiply(quaternion.conjugate(a[..., q : q + 4]), b[..., q : q + 4])
-            velocity[..., v : v + 3] = quaternion.rotation_vector(turn)
+        velocity = self.layout.change(self.pose(start), self.pose(end))
         if self.loop:
             return velocity / VELOCITY_STEP
         inside = (t >= 0) & (t <= self.duration)
@@ -211,7 +217,7 @@ class Clip:
         cycles = np.asarray(t, dtype=float) / self.duration
         return cycles - np.floor(cycles) if self.loop else np.clip(cycles, 0, 1)
 
-    def mirrored(self, pairs: Iterable[tuple[str, str]]) -> Clip:
+    def mirrored(self, pairs: Iterable[tuple[str, str]] | None = None) -> Clip:
         """Returns the clip with left and right exchanged.
 
         Hinge angles keep their sign, which is right for hinges about the lateral axis, the only
@@ -219,42 +225,18 @@ class Clip:
         x-z plane.
 
         Args:
-          pairs: names of joints to swap, (right, left) in either order. Others keep their place.
+          pairs: names of joints to swap, (right, left) in either order. Others keep their place. By
+            default the joints named right_... and left_....
 
         Raises:
           ValueError: if a name is unknown or a pair's joints differ in kind.
         """
-        first = np.cumsum([ROOT_SIZES[self.root], *self.sizes])
-        source = np.arange(self.poses.shape[1])
-        for pair in pairs:
-            for joint in pair:
-                if joint not in self.joints:
-                    raise ValueError(errors.unknown('joint', joint, self.joints))
-            i, j = map(self.joints.index, pair)
-            if self.sizes[i] != self.sizes[j]:
-                raise ValueError(f'joints {pair[0]!r} and {pair[1]!r} differ in kind')
-            left = np.arange(first[i], first[i + 1])
-            right = np.arange(first[j], first[j + 1])
-            source[left], source[right] = right, left
-        poses = self.poses[:, source]
-        if self.root == 'free':
-            poses[:, 1] *= -1
-        for q, _ in self._rotations:
-            poses[:, q : q + 4] = quaternion.reflect(poses[:, q : q + 4])
-        return dataclasses.replace(self, poses=poses)
+        mirror = self.layout.mirror if pairs is None else Mirror(self.layout, pairs)
+        return dataclasses.replace(self, poses=mirror.pose(self.poses))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the clip as .npz without pickled objects; an old file stays until it is whole."""
-        path = pathlib.Path(path)
-        part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-        try:
-            with part.open('wb') as file:
-                np.savez_compressed(
-                    file, allow_pickle=False, **{f: np.asarray(getattr(self, f)) for f in _FIELDS}
-                )
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
 def load(path_or_name: str | os.PathLike[str]) -> Clip:
@@ -268,37 +250,8 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
         (names file and field).
       FileNotFoundError: if there is no file at the path.
     """
-    if isinstance(path_or_name, str) and not path_or_name.endswith('.npz'):
-        if path_or_name not in names():
-            raise ValueError(errors.unknown('clip', path_or_name, names()))
-        path = resources.directory('mocap') / f'{path_or_name}.npz'
-    else:
-        path = pathlib.Path(path_or_name)
-    content = io.BytesIO(path.read_bytes())
-    fields: dict[str, Any] = {}
-    field = ''
-    try:
-        archive = np.load(content, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError('a single array')
-        for field in _FIELDS:
-            if field not in archive:
-                raise ValueError('is missing')
-            fields[field] = archive[field]
-    except Exception as error:  # a damaged archive fails in a dozen ways
-        where = f'field {field!r}' if field else 'no readable clip'
-        raise ValueError(f'{path}: {where}: {error}') from None
-    for field, kind, dims in (
-        ('root', 'U', 0),
-        ('joints', 'U', 1),
-        ('sizes', 'iu', 1),
-        ('loop', 'b', 0),
-        ('description', 'U', 0),
-    ):
-        value = fields[field]
-        if value.dtype.kind not in kind or value.ndim != dims:
-            raise ValueError(f'{path}: field {field!r} has type {value.dtype}, {value.ndim} axes')
-        fields[field] = value.tolist()
+    path = shipped(path_or_name, 'clip', names())
+    fields = archive.read(path, 'clip', _FIELDS, {'turning': False})
     try:
         return Clip(name=path.stem, **fields)
     except ValueError as error:
@@ -307,4 +260,20 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
 
 def names() -> list[str]:
     """Returns the names of the shipped clips, sorted."""
-    return sorted(path.stem for path in resources.directory('mocap').glob('*.npz'))
+    stems = sorted(path.stem for path in resources.directory('mocap').glob('*.npz'))
+    return [stem for stem in stems if not stem.endswith(STEPS_SUFFIX)]
+
+
+def shipped(
+    path_or_name: str | os.PathLike[str], kind: str, known: list[str], suffix: str = ''
+) -> pathlib.Path:
+    """Returns the path of a shipped file, or the path itself: a PathLike or ending in .npz.
+
+    Raises:
+      ValueError: for a name that is not `known` (names the closest).
+    """
+    if not isinstance(path_or_name, str) or path_or_name.endswith('.npz'):
+        return pathlib.Path(path_or_name)
+    if path_or_name not in known:
+        raise ValueError(errors.unknown(kind, path_or_name, known))
+    return resources.directory('mocap') / f'{path_or_name}{suffix}.npz'

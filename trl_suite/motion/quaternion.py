@@ -50,3 +50,22 @@ def rotation_vector(q: np.ndarray) -> np.ndarray:
 def reflect(q: np.ndarray) -> np.ndarray:
     """Returns the mirror image in the x-z plane (left and right exchanged), shape (..., 4)."""
     return q * np.array([1, -1, 1, -1])
+
+
+def about_z(angle: np.ndarray) -> np.ndarray:
+    """Returns the rotation by an angle about the vertical, shape (...) -> (..., 4)."""
+    half = np.asarray(angle) / 2
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def heading(q: np.ndarray) -> np.ndarray:
+    """Returns the direction of the turned x axis in the ground plane, rad, shape (...)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def turned(way: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Returns (x, y) turned by an angle about the vertical; broadcasts (..., 2) and (...)."""
+    x, y, cos, sin = way[..., 0], way[..., 1], np.cos(angle), np.sin(angle)
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

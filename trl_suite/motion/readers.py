@@ -2,8 +2,8 @@
 
 Both hold `Frames`, arrays of [duration of the frame in s, root x, y, z, root quaternion wxyz, then
 one number per hinge and a quaternion wxyz per ball joint, in the order of the character file]. They
-differ in `Loop`: a boolean in TerrainRL, 'wrap' or 'none' in DeepMimic, which also centres the root
-and does not carry its height over a cycle.
+differ in `Loop`: a boolean in TerrainRL, 'wrap' or 'none' in DeepMimic, which also centres the
+root, does not carry its height over a cycle and may carry its heading.
 
 The files' frame has x forward, y up and z to the right. Turned into ours, (x, y, z) -> (x, -z, y),
 hinge angles keep their sign: their hinges turn about +z, ours about (0, -1, 0), the same axis.
@@ -11,6 +11,7 @@ hinge angles keep their sign: their hinges turn about +z, ours about (0, -1, 0),
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -19,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.motion.clip import JOINT_SIZES, Clip
+from trl_suite.motion.clip import Clip
+from trl_suite.motion.layout import JOINT_SIZES
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
 _FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by
@@ -84,9 +86,10 @@ def read_deepmimic(
 ) -> Clip:
     """Reads a DeepMimic motion file; the layout is humanoid3d's unless given.
 
-    As in DeepMimic the first frame is moved over the origin. A looping clip gains no height over
-    cycles unless `CycleSyncRootHeight` is set: what the frames gain is taken out evenly, where
-    DeepMimic would jump at the seam.
+    As in DeepMimic the first frame is moved over the origin, and `CycleSyncRootRot` lets the
+    heading that a cycle gains accumulate. A looping clip gains no height over cycles unless
+    `CycleSyncRootHeight` is set: what the frames gain is taken out evenly, where DeepMimic would
+    jump at the seam.
 
     Args:
       path: JSON file.
@@ -98,7 +101,7 @@ def read_deepmimic(
 
     Raises:
       ValueError: as `read_terrainrl`, and for a looping clip whose displacement shall not
-        accumulate (`CycleSyncRootPos` false) or whose heading shall (`CycleSyncRootRot` true).
+        accumulate (`CycleSyncRootPos` false).
       FileNotFoundError: if there is no such file.
     """
     path = pathlib.Path(path)
@@ -107,21 +110,28 @@ def read_deepmimic(
     if loop not in ('wrap', 'none'):
         raise ValueError(f"{path}: Loop: 'wrap' or 'none' is needed, found {loop!r}")
     looping = loop == 'wrap'
+    turning = motion.get('CycleSyncRootRot', False)
+    if not isinstance(turning, bool):
+        raise ValueError(f'{path}: CycleSyncRootRot: true or false is needed, found {turning!r}')
     frames = _frames(path, motion)
     if looping:
-        for field, served in (('CycleSyncRootPos', True), ('CycleSyncRootRot', False)):
-            if motion.get(field, served) is not served:
-                raise ValueError(f'{path}: {field}: {motion[field]!r} is not supported')
+        if motion.get('CycleSyncRootPos', True) is not True:
+            found = motion['CycleSyncRootPos']
+            raise ValueError(f'{path}: CycleSyncRootPos: {found!r} is not supported')
         if not motion.get('CycleSyncRootHeight', False):
             times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
             gain = frames[-1, 2] - frames[0, 2]
             frames[:, 2] -= gain * times / times[-1]
     frames[:, [1, 3]] -= frames[0, [1, 3]]
-    return _clip(path, frames, joints, sizes, 'free', looping)
+    clip = _clip(path, frames, joints, sizes, 'free', looping)
+    return dataclasses.replace(clip, turning=looping and turning)
 
 
 def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
-    """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged."""
+    """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged.
+
+    Such a file does not know that a heading accumulates: of a turning clip it holds one cycle.
+    """
     durations = np.append(np.diff(clip.times), 0.0)
     n = len(clip.times)
     frames = np.zeros((n, _HEADER + sum(clip.sizes)))
