@@ -22,6 +22,7 @@ setup(
     },
     package_data={
         'trl_suite': ['py.typed'],
+        'trl_suite.controllers': ['*.json'],
         'trl_suite.terrain': ['*.json'],
         'trl_suite.xml': ['*.xml'],
         'trl_suite.mocap': ['*.npz', '*.md'],
@@ -42,6 +43,7 @@ setup(
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
         'train': [TORCH],
+        'tune': ['cma'],
         'test': [
             'absl-py',
             'pytest',

@@ -13,6 +13,7 @@ from trl_suite import terrain as terrains
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
+from trl_suite.tasks.gait import GaitTask
 from trl_suite.tasks.imitation import Imitation
 from trl_suite.tasks.task import Task
 
@@ -43,8 +44,14 @@ def _imitation(row: Row, options: dict[str, Any]) -> Task:
     )
 
 
+def _gait(row: Row, options: dict[str, Any]) -> Task:
+    arena = PlanarTerrain(terrains.load(row.terrain))
+    return GaitTask(characters.make(row.character), arena, **options)
+
+
 _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], type[Task]]] = {
-    'imitation': (_imitation, Imitation)
+    'imitation': (_imitation, Imitation),
+    'gait': (_gait, GaitTask),
 }
 
 
@@ -101,7 +108,7 @@ def reference_policy(id: str) -> policies.Policy:
 
 def build(
     character: str | characters.CharacterRow,
-    actuation: str = 'position',
+    actuation: str | None = None,
     terrain: Any = 'flat',
     task: str = 'imitation',
     clip: str | motion.Clip | None = None,
@@ -112,10 +119,12 @@ def build(
 
     Args:
       character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
-      actuation: one of `trl_suite.actuation.ACTUATIONS`.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
+        joints by itself and takes none.
       terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping.
-      task: the rules; 'imitation'.
-      clip: name of a clip, path of an .npz, or a `Clip`; by default the character's own.
+      task: the rules, 'imitation' or 'gait'.
+      clip: name of a clip, path of an .npz, or a `Clip`; by default the character's own. Only to
+        be imitated.
       task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
       environment_kwargs: as for `load`.
 
@@ -124,15 +133,23 @@ def build(
     """
     if task not in _RULES:
         raise ValueError(errors.unknown('task', task, _RULES))
-    if actuation not in actuation_models.ACTUATIONS:
-        raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
     name = character if isinstance(character, str) else character.name
     if isinstance(character, str) and character not in characters.CHARACTERS:
         raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
-    if clip is None:
-        if name not in DEFAULT_CLIPS:
-            raise ValueError(f'character {name!r} has no clip of its own; give clip=')
-        clip = DEFAULT_CLIPS[name]
+    if task == 'gait':
+        if actuation not in (None, 'gait') or clip is not None:
+            raise ValueError(
+                'a gait drives the joints by itself: it takes no actuation and no clip'
+            )
+        actuation = 'gait'
+    else:
+        actuation = 'position' if actuation is None else actuation
+        if actuation not in actuation_models.ACTUATIONS:
+            raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
+        if clip is None:
+            if name not in DEFAULT_CLIPS:
+                raise ValueError(f'character {name!r} has no clip of its own; give clip=')
+            clip = DEFAULT_CLIPS[name]
     row = Row(
         id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{task}',
         domain='custom',

@@ -1,5 +1,6 @@
 """Arenas: terrain as collision geometry, without recompiling."""
 
 from trl_suite.arenas.planar import PlanarTerrain
+from trl_suite.arenas.spatial import SpatialTerrain
 
-__all__ = ('PlanarTerrain',)
+__all__ = ('PlanarTerrain', 'SpatialTerrain')

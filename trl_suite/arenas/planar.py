@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import boxes
+from trl_suite.arenas import boxes, stage
+from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.terrain import SPACING, Strip, Terrain
 from trl_suite.world import World
 
@@ -16,10 +17,6 @@ ADVANCE = 6.0  # m; travel after which the window is laid anew
 PROBES = 6  # draws by which the pool of boxes is sized
 SPARE = 1.3  # times the most boxes of any probe
 COARSEST = 0.1  # m; tolerance up to which pieces are merged if the pool should not suffice
-FRICTION = (0.81, 0.005, 0.0001)  # 0.9 * 0.9: the original multiplies, MuJoCo takes the larger
-SOLREF = (0.005, 1)
-SOLIMP = (0.95, 0.99, 0.001)
-PARKED = -60.0  # m; depth at which unused boxes lie
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
@@ -38,14 +35,8 @@ class PlanarTerrain(composer.Arena):
         super()._build(name=name)
         self.terrain = terrain
         root = self._mjcf_root
-        # composer's arena brings an elliptic cone and noslip iterations; neither is wanted.
-        root.option.cone = 'pyramidal'
-        root.option.noslip_iterations = 0
-        root.option.integrator = 'implicitfast'
-        root.option.gravity = (0, 0, -9.8)
-        root.compiler.boundmass = 0
-        root.compiler.boundinertia = 0
-        _decorate(root)
+        stage.prepare(root)
+        _paint(root)
         ground = root.worldbody.add('body', name='terrain')
         self.boxes = [
             ground.add(
@@ -108,10 +99,26 @@ class PlanarTerrain(composer.Arena):
         cell = whole.astype(np.int64)
         if self._world.n > 1:
             cell += self._offset[rows]
-        # Clipping only guards rows whose physics broke down; `follow` keeps the others inside.
+        # Clipping only guards rows whose physics broke down; `follow` keeps the others inside, but
+        # for what lies far behind them: see `look_far`.
         u *= self._rises.take(cell, mode='clip')
         u += self._heights.take(cell, mode='clip')
         return u
+
+    def look_far(self, x: np.ndarray, heights: np.ndarray) -> None:
+        """Puts right what `height` gave where rows ask beyond their boxes.
+
+        Args:
+          x: as given to `height` for all rows, m, (n, k).
+          heights: what it returned, (n, k). True up to the length of a window beyond the boxes;
+            further away is only who has broken down.
+        """
+        u = x * _CELLS_PER_METRE - self._start
+        for row in np.flatnonzero((u.min(1) < 0) | (u.max(1) >= _WINDOW - 1)).tolist():
+            strip, start = self.strips[row], self._start[row, 0]
+            assert strip is not None
+            low, high = (start - _WINDOW) * SPACING, (start + 2 * _WINDOW) * SPACING
+            heights[row] = strip.height(np.clip(x[row], low, high))
 
     def slope(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
@@ -179,21 +186,8 @@ def _pool_size(terrain: Terrain) -> int:
     return round(SPARE * most) + PROBES
 
 
-def _decorate(root: mjcf.RootElement) -> None:
-    """Sky and ground (the sun follows each character), cheap enough that one model serves pictures and physics."""
-    root.visual.quality.shadowsize = 1024
-    root.visual.quality.offsamples = 0
-    getattr(root.visual, 'global').offwidth = 1920
-    getattr(root.visual, 'global').offheight = 1080
-    root.statistic.extent = 3  # m; of what is looked at, not of the strip: shadows stay sharp
-    root.visual.map.znear = 0.01
-    root.visual.headlight.set_attributes(
-        ambient=(0.35, 0.35, 0.35), diffuse=(0.45, 0.45, 0.45), specular=(0.1, 0.1, 0.1)
-    )
-    root.asset.add(
-        'texture', name='sky', type='skybox', builtin='gradient', rgb1=(0.62, 0.76, 0.92),
-        rgb2=(0.95, 0.97, 1.0), width=64, height=64,
-    )  # fmt: skip
+def _paint(root: mjcf.RootElement) -> None:
+    """What the ground looks like."""
     # The checker spans the width of the strip once and its edge has the colour of the sides: where
     # tilted boxes overlap, their sides look like one.
     root.asset.add(

@@ -165,6 +165,8 @@ class PlanarFigure:
         v.sample_x += v.offsets if v.facing is None else v.offsets * v.facing
         v.effector_ground_x[...] = v.effector_x
         ground = self.arena.height(self._ground_x)
+        if v.facing is not None:  # ahead is behind, where the boxes do not reach as far
+            self.arena.look_far(self._ground_x, ground)
         under_root = ground[:, samples : samples + 1]
         np.subtract(v.z, under_root, v.height)
         if samples:

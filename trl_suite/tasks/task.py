@@ -25,7 +25,7 @@ class Task(composer.Task):
     A subclass owns arrays of n rows. It is driven by four methods: `bind` (a compiled world),
     `begin_episodes` (some rows), `act` (all rows, before the physics) and `finish_step` (all rows,
     after it). The composer hooks below are the case n = 1, so that a plain `composer.Environment`
-    runs the task as well; a subclass whose step lasts a variable time overrides `simulate`.
+    runs the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
 
     Attributes:
       world: the simulations, after compiling.

@@ -1,4 +1,4 @@
-"""Random planar terrain in plain NumPy: parameter files, generators, and the endless strip.
+"""Random terrain in plain NumPy: parameter files, generators, planar strips and 3D ground.
 
 from trl_suite import terrain
 
@@ -9,10 +9,45 @@ heights, vertical = ground.window(-40, 800)  # vertices SPACING apart, from x = 
 mine = terrain.load({'Type': 'var2d_gaps', 'Params': [{'GapWMin': 0.2, 'GapWMax': 0.4}]})
 mine.parameters()  # with the defaults of all that was not given
 sorted(terrain.PRESETS), sorted(terrain.GENERATORS)  # what there is; `register` adds a type
+
+forest = terrain.Ground(terrain.load('pillars3d'), seed=1)  # three-dimensional
+x, y, heading = forest.spawn(np.random.default_rng(1))
+forest.height(x, y), forest.goal(np.random.default_rng(2), root=(x, y))
+sorted(terrain.PRESETS3D), sorted(terrain.GENERATORS3D)  # `register3d` adds a type
+
+around = terrain.Surroundings(1, terrain.capacity(terrain.load('pillars3d')))  # of n characters
+around.begin(0, forest, (x, y))
+around.height_map(np.array([[x, y]]), np.array([heading]))  # (1, 1024), 32 x 32 samples
 """
 
 from trl_suite.terrain.generators import GENERATORS, SPACING, Profile, register
-from trl_suite.terrain.parameters import PRESETS, Terrain, load
+from trl_suite.terrain.ground import Ground
+from trl_suite.terrain.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
+from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
+from trl_suite.terrain.spatial import GENERATORS3D, register3d
 from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.surroundings import Surroundings, capacity
 
-__all__ = ['GENERATORS', 'PRESETS', 'SPACING', 'Profile', 'Strip', 'Terrain', 'load', 'register']
+__all__ = [
+    'GENERATORS',
+    'GENERATORS3D',
+    'GRID',
+    'PRESETS',
+    'PRESETS3D',
+    'SPACING',
+    'Belts',
+    'Boxes',
+    'Grid',
+    'Ground',
+    'Layout',
+    'Movers',
+    'Profile',
+    'Strip',
+    'Surroundings',
+    'Terrain',
+    'boxes',
+    'capacity',
+    'load',
+    'register',
+    'register3d',
+]

@@ -67,6 +67,20 @@ LIMITS = {
     **dict.fromkeys(('GapH', 'WallH', 'StepH0', 'StepH1', 'BumpH'), _HEIGHT),
     **dict.fromkeys(('CliffH0', 'CliffH1', 'NarrowGapDepth'), _HEIGHT),
     **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange'), _SLOPE),
+    # Of three-dimensional ground.
+    **dict.fromkeys(('PathWidth0', 'PathWidth1', 'PathWidthDeltaStdev', 'PathTurnLength'), _LENGTH),
+    **dict.fromkeys(('ConveyorStripLength', 'ConveyorSpacing'), _LENGTH),
+    **dict.fromkeys(('ObstacleWidth0', 'ObstacleWidth1'), (0.0, 40.0)),
+    **dict.fromkeys(('ObstacleHeight0', 'ObstacleHeight1'), (0.0, 1e3)),
+    **dict.fromkeys(('ObstacleSpeed0', 'ObstacleSpeed1'), (1e-6, 100.0)),
+    **dict.fromkeys(('PathHeight0', 'PathHeight1', 'StepHeight'), (-20.0, 20.0)),
+    **dict.fromkeys(('NumObstacles', 'ConveyorNumStrips', 'ConveyorNumSlices'), _COUNT),
+    'PathLength': (0.2, 1e3),
+    'PathMaxTurnDelta': (0.0, 2.0),
+    'TrailStepProb': (0.0, 1.0),
+    'ObstacleDensity': (0.0, 2.0),
+    'ObstacleSpeedLerpPow': (0.0, 100.0),
+    'Slope': (-10.0, 10.0),
 }
 
 

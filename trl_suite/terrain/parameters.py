@@ -11,6 +11,9 @@ several sets the terrain can be blended from one to the next, e.g. as a curricul
 `VertSpacingX` and `VertSpacingZ` are accepted and have no effect on planar ground, as in the
 original. The example printed in the paper is the preset `slopes_mixed_humanoid`.
 
+Three-dimensional types are keys of GENERATORS3D; their files look the same. Their height grids have
+vertices 0.2 m apart, so another `VertSpacingX` or `VertSpacingZ` is refused.
+
 The original ignored what it did not understand. Here a file is refused, with a sentence that names
 file, set and key, if it has
 * a key that its type does not use (of another type, or misspelt), or the same key twice;
@@ -19,15 +22,15 @@ file, set and key, if it has
 * a negative spacing, width or count, or a value beyond `generators.LIMITS`. Zero is allowed: every
   feature has at least one vertex, so no generator can run for ever.
 
-The presets are the planar terrain files of the original under their names there, and
-`mixed_humanoid`, which is `slopes_mixed_humanoid` without its slopes. They differ from the files of
-the original thus:
+The presets are the terrain files of the original under their names there (planar ones in PRESETS,
+three-dimensional ones in PRESETS3D), and `mixed_humanoid`, which is `slopes_mixed_humanoid` without
+its slopes. They differ from the files of the original thus:
 * `gaps_humanoid` (GapH) and `cliffs_humanoid` (StepH1) have their reversed ranges in ascending
   order, which is the same distribution;
 * `mixed_curriculum` means steps of 0.05 to 0.1 m in its first set, but spelt the names without the
   0, so that the original used the default 0.1 to 0.4 m; here they are as meant;
-* entries without effect are left out: bumps and slopes of `cliffs_rugged`, and all that has nothing
-  to do with gaps in `test_terrain`.
+* entries without effect are left out: bumps and slopes of `cliffs_rugged`, all that has nothing to
+  do with gaps in `test_terrain`, lengths of legs of trails, slices of belts, spacings of stairs.
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ from typing import Any
 
 from trl_suite.errors import unknown
 from trl_suite.terrain.generators import GENERATORS, check
+from trl_suite.terrain.layout import GRID
+from trl_suite.terrain.spatial import GENERATORS3D
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
 
@@ -55,7 +60,7 @@ class Terrain:
 
     Attributes:
       name: preset name, path of the file, or anything else that tells the user which one it is.
-      type: a key of GENERATORS.
+      type: a key of GENERATORS or of GENERATORS3D.
       parameter_sets: the sets as given, without defaults; read-only.
 
     Raises:
@@ -67,9 +72,10 @@ class Terrain:
     parameter_sets: tuple[Mapping[str, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.type not in GENERATORS:
-            raise ValueError(f'{self.name}: Type: {unknown("terrain type", self.type, GENERATORS)}')
-        defaults = GENERATORS[self.type].defaults
+        if self.type not in GENERATORS and self.type not in GENERATORS3D:
+            known = (*GENERATORS, *GENERATORS3D)
+            raise ValueError(f'{self.name}: Type: {unknown("terrain type", self.type, known)}')
+        defaults = _defaults(self.type)
         checked = []
         for i, values in enumerate(self.parameter_sets):
             where = f'{self.name}: Params[{i}]'
@@ -84,6 +90,11 @@ class Terrain:
     def __reduce__(self) -> tuple[Any, ...]:
         return Terrain, (self.name, self.type, tuple(map(dict, self.parameter_sets)))
 
+    @property
+    def spatial(self) -> bool:
+        """Whether it is three-dimensional: a `Ground`, not a `Strip`."""
+        return self.type in GENERATORS3D
+
     def parameters(self, blend: float = 0.0) -> dict[str, float]:
         """Returns a value for every parameter of the type.
 
@@ -96,7 +107,7 @@ class Terrain:
         """
         if isinstance(blend, bool) or not isinstance(blend, numbers.Real) or math.isnan(blend):
             raise ValueError(f'blend must be a number, not {blend!r}')
-        defaults = GENERATORS[self.type].defaults
+        defaults = _defaults(self.type)
         sets = [{**defaults, **values} for values in self.parameter_sets] or [dict(defaults)]
         clamped = min(max(float(blend), 0.0), len(sets) - 1.0)
         k = int(clamped)
@@ -106,11 +117,18 @@ class Terrain:
         return {key: (1 - weight) * a + weight * sets[k + 1][key] for key, a in sets[k].items()}
 
 
+def _defaults(type_name: str) -> Mapping[str, float]:
+    if type_name in GENERATORS3D:
+        return GENERATORS3D[type_name].defaults
+    return GENERATORS[type_name].defaults
+
+
 def _unknown_parameter(key: object, type_name: str) -> str:
-    owners = [name for name, generator in GENERATORS.items() if key in generator.defaults]
+    registry: Mapping[str, Any] = GENERATORS3D if type_name in GENERATORS3D else GENERATORS
+    owners = [name for name, generator in registry.items() if key in generator.defaults]
     if owners:
         return f'{key!r} has no effect in {type_name}, only in {", ".join(owners)}'
-    defaults = GENERATORS[type_name].defaults
+    defaults = registry[type_name].defaults
     if not defaults:
         return f'unknown parameter {key!r}; {type_name} has none'
     return unknown(f'parameter of {type_name}', key, defaults)
@@ -128,7 +146,10 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
     sets = content.get('Params', ())
     if not isinstance(sets, (list, tuple)):
         raise ValueError(f'{name}: Params must be a list of parameter sets, not {sets!r}')
-    check(name, {key: content[key] for key in _UNUSED if key in content})
+    unused = check(name, {key: content[key] for key in _UNUSED if key in content})
+    for key in _UNUSED[1:]:
+        if content['Type'] in GENERATORS3D and unused.get(key, GRID) != GRID:
+            raise ValueError(f'{name}: {key} must be {GRID:g} m, not {content[key]!r}')
     return Terrain(name, content['Type'], tuple(sets))
 
 
@@ -165,9 +186,9 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
         )
     name = os.fspath(source)
     if isinstance(source, str) and not name.endswith(('.json', '.txt')):
-        if name not in PRESETS:
-            raise ValueError(unknown('terrain', name, PRESETS))
-        return PRESETS[name]
+        if name not in PRESETS and name not in PRESETS3D:
+            raise ValueError(unknown('terrain', name, (*PRESETS, *PRESETS3D)))
+        return PRESETS[name] if name in PRESETS else PRESETS3D[name]
     try:
         text = pathlib.Path(name).read_text(encoding='utf-8-sig')
         content = json.loads(text, object_pairs_hook=_without_repetition)
@@ -178,9 +199,11 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
     return _from_mapping(name, content)
 
 
-def _presets() -> dict[str, Terrain]:
-    text = importlib.resources.files(__package__).joinpath('presets.json').read_text('utf-8')
-    return {name: _from_mapping(name, content) for name, content in json.loads(text).items()}
+def _presets(file: str) -> Mapping[str, Terrain]:
+    text = importlib.resources.files(__package__).joinpath(file).read_text('utf-8')
+    presets = {name: _from_mapping(name, content) for name, content in json.loads(text).items()}
+    return types.MappingProxyType(presets)
 
 
-PRESETS: Mapping[str, Terrain] = types.MappingProxyType(_presets())
+PRESETS: Mapping[str, Terrain] = _presets('presets.json')
+PRESETS3D: Mapping[str, Terrain] = _presets('presets3d.json')

@@ -60,10 +60,15 @@ class Strip:
             x m forward at its start phase.
 
         Raises:
-          ValueError: unknown spawn, a centre that is not finite or further than LONGEST, or a blend
-            that is no number.
+          ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or further
+            than LONGEST, or a blend that is no number.
           TypeError: the seed is something else.
         """
+        if terrain.spatial:
+            raise ValueError(
+                f'terrain {terrain.name!r} ({terrain.type}) is three-dimensional; planar characters '
+                'and a Strip need planar terrain'
+            )
         if spawn not in ('intended', 'upstream'):
             raise ValueError(f"spawn must be 'intended' or 'upstream', not {spawn!r}")
         if not abs(centre) <= LONGEST:
@@ -75,7 +80,7 @@ class Strip:
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
         # Two far parts of one stream; `jumped` would draw a seed from the system for nothing.
-        sequence = _sequence(seed)
+        sequence = seed_sequence(seed)
         left = np.random.PCG64(sequence)
         left.advance(_FAR)
         self._right = np.random.Generator(np.random.PCG64(sequence))
@@ -209,7 +214,9 @@ class Strip:
         )
 
 
-def _sequence(seed: int | np.random.SeedSequence | np.random.Generator) -> np.random.SeedSequence:
+def seed_sequence(
+    seed: int | np.random.SeedSequence | np.random.Generator,
+) -> np.random.SeedSequence:
     """Returns the SeedSequence that a seed stands for."""
     if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0:
         return np.random.SeedSequence(int(seed))

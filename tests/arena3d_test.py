@@ -1,0 +1,586 @@
+"""Tests of the three-dimensional arena: the collision geometry is the ground, and it moves."""
+
+import pickle
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+
+from trl_suite import terrain
+from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.world import BatchWorld, PhysicsWorld, light_model
+
+TIMESTEP = 1 / 300  # s
+SUBSTEPS = 10
+# Largest deviation of the collision geometry from a query, m: height fields are single precision.
+EXACT, SINGLE = 1e-9, 5e-6
+BOXED = (
+    'plane', 'ramp3d', 'stairs3d', 'path3d', 'path3d_straight', 'blocks3d', 'pillars3d',
+    'conveyor3d', 'conveyor3d_wide', 'dynamic_obstacles3d',
+)  # fmt: skip
+GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d1', 'trail3d2')
+BALL = {'type': 'sphere', 'size': (0.1,), 'mass': 1, 'friction': (0.81, 0.005, 0.0001)}
+CUBE = {
+    'type': 'box', 'size': (0.1, 0.1, 0.1), 'mass': 10, 'friction': (0.81, 0.005, 0.0001),
+    'solref': (0.005, 1), 'solimp': (0.95, 0.99, 0.001),
+}  # fmt: skip
+
+
+def tree(source, load=None):
+    """An arena, by itself or with one free body."""
+    arena = SpatialTerrain(terrain.load(source))
+    root = arena.mjcf_model
+    root.option.timestep = TIMESTEP
+    if load is not None:
+        body = root.worldbody.add('body', name='load')
+        body.add('freejoint', name='load')
+        body.add('geom', name='load', **load)
+        for name, other in (('body2', 'terrain'), ('subtree2', 'terrain')):
+            root.sensor.add(
+                'contact', name=f'load_{name}', body1=body, num=1, data='found', **{name: other}
+            )
+    return arena
+
+
+class Stage:
+    """An arena over one or many simulations, each with a load."""
+
+    def __init__(self, source, seeds=(0,), load=None, batch=False, xy=None):
+        self.arena = arena = tree(source, load)
+        if batch:
+            model = light_model(arena.mjcf_model)
+            self.world = BatchWorld(model, len(seeds), 1)
+        else:
+            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+            model = self.physics.model.ptr
+            self.world = PhysicsWorld(self.physics)
+            self.model, self.data = model, self.physics.data.ptr
+        self.rows = np.arange(len(seeds))
+        arena.bind(self.world)
+        self.xy = np.zeros((len(seeds), 2)) if xy is None else np.array(xy, float)
+        for row, seed in enumerate(seeds):
+            arena.begin_episode(row, terrain.Ground(arena.terrain, seed), self.xy[row])
+        if load is not None:
+            joint = model.body('load').jntadr[0]
+            self.q, self.v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self.world.forward(self.rows)
+
+    def put(self, position, velocity=(0, 0, 0)):
+        """Puts the loads somewhere, moving."""
+        q, v = self.q, self.v
+        self.world.qpos[:, q : q + 3] = position
+        self.world.qpos[:, q + 3 : q + 7] = (1, 0, 0, 0)
+        self.world.qvel[:, v : v + 6] = 0
+        self.world.qvel[:, v : v + 3] = velocity
+        self.world.forward(self.rows)
+
+    @property
+    def position(self):
+        return self.world.qpos[:, self.q : self.q + 3]
+
+    @property
+    def velocity(self):
+        return self.world.qvel[:, self.v : self.v + 3]
+
+    def run(self, seconds, xy=None):
+        for _ in range(round(30 * seconds)):
+            self.arena.follow(self.xy if xy is None else xy)
+            self.world.step(SUBSTEPS)
+
+    def height(self, x, y, row=0):
+        x, y = np.atleast_2d(x), np.atleast_2d(y)
+        return self.arena.height(x, y, slice(row, row + 1))[0]
+
+    def rays(self, x, y):
+        """Heights of the collision geometry, by rays from above."""
+        geom, heights = np.zeros(1, np.int32), []
+        for px, py in zip(np.ravel(x), np.ravel(y), strict=True):
+            distance = mujoco.mj_ray(
+                self.model, self.data, np.array([px, py, 60.0]), np.array([0, 0, -1.0]), None, True,
+                -1, geom, None,
+            )  # fmt: skip
+            heights.append(60.0 - distance if geom[0] >= 0 else np.nan)
+        return np.array(heights)
+
+
+class GeometryTest(parameterized.TestCase):
+    """Ray casts against queries."""
+
+    @parameterized.parameters(*BOXED, *GRIDS)
+    def test_geometry_is_the_ground(self, source):
+        stage = Stage(source)
+        tolerance = SINGLE if source in GRIDS else EXACT
+        for seed, xy in ((0, (0, 0)), (1, (17.3, -9.1)), (2, (-40.2, 12.0)), (3, (200.0, 31.0))):
+            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed), xy)
+            stage.world.forward(stage.rows)
+            x, y = np.transpose(xy)[:, None] + np.random.default_rng(seed).uniform(
+                -12, 12, (2, 250)
+            )
+            queried = stage.height(x, y)
+            np.testing.assert_allclose(stage.rays(x, y), queried, atol=tolerance)
+            exact = stage.arena.grounds[0].height(x, y)
+            np.testing.assert_allclose(queried, exact, atol=tolerance)
+
+    @parameterized.parameters('stairs3d', 'hills3d', 'pillars3d', 'trail3d1')
+    def test_geometry_follows(self, source):
+        stage = Stage(source, (4,))
+        rng = np.random.default_rng(0)
+        for x in np.arange(0, 60, 3.1):
+            xy = np.array([(x, 0.4 * x)])
+            stage.arena.follow(xy)
+            px, py = xy[0][:, None] + rng.uniform(-11.9, 11.9, (2, 20))
+            expected = stage.arena.grounds[0].height(px, py)
+            np.testing.assert_allclose(stage.rays(px, py), expected, atol=SINGLE)
+        stage.arena.follow(np.zeros((1, 2)))
+        px, py = rng.uniform(-11.9, 11.9, (2, 50))
+        expected = stage.arena.grounds[0].height(px, py)
+        np.testing.assert_allclose(stage.rays(px, py), expected, atol=SINGLE)
+
+    def test_sides_of_blocks_are_vertical(self):
+        stage = Stage('blocks3d', (3,))
+        boxes = stage.arena.surroundings.boxes[0]
+        geom, normal, met = np.zeros(1, np.int32), np.zeros(3), 0
+        for k in range(len(boxes.top)):
+            for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+                start = np.array([*boxes.position[k], 0.5 * boxes.top[k]])
+                start[axis] -= sign * (boxes.half_size[k, axis] + 0.05)
+                if stage.height(*start[:2])[0] > 0:
+                    continue  # another block stands there
+                direction = np.zeros(3)
+                direction[axis] = sign
+                distance = mujoco.mj_ray(
+                    stage.model, stage.data, start, direction, None, True, -1, geom, normal
+                )
+                self.assertAlmostEqual(distance, 0.05, delta=1e-9)
+                np.testing.assert_allclose(normal, -direction, atol=1e-12)
+                met += 1
+        self.assertGreater(met, 30)
+
+    @parameterized.parameters(*BOXED, *GRIDS)
+    def test_solver_and_friction(self, source):
+        model = Stage(source).model
+        planar = mjcf.Physics.from_mjcf_model(
+            PlanarTerrain(terrain.load('flat')).mjcf_model
+        ).model.ptr
+        for name in ('cone', 'integrator', 'noslip_iterations', 'gravity', 'solver', 'tolerance'):
+            np.testing.assert_array_equal(getattr(model.opt, name), getattr(planar.opt, name), name)
+        for name in ('geom_friction', 'geom_solref', 'geom_solimp', 'geom_condim'):
+            expected = getattr(planar, name)[:1].repeat(model.ngeom, 0)
+            np.testing.assert_array_equal(getattr(model, name), expected, name)
+
+    def test_number_of_geoms(self):
+        counts = {source: Stage(source).model.ngeom for source in (*BOXED, *GRIDS)}
+        self.assertEqual({counts[source] for source in GRIDS}, {1})
+        self.assertEqual((counts['plane'], counts['conveyor3d'], counts['ramp3d']), (1, 5, 3))
+        self.assertEqual(counts['dynamic_obstacles3d'], 51)
+        self.assertLess(counts['pillars3d'], 200)
+        self.assertLess(counts['blocks3d'], 60)
+
+    def test_turned_and_sloping_boxes(self):
+        @terrain.register3d('turned3d', replace=True)
+        def turned(parameters, rng):
+            return terrain.Layout(
+                level=-0.3,
+                boxes=terrain.boxes(
+                    rng.uniform(-8, 8, (6, 2)), (2, 1), rng.uniform(0.2, 0.8, 6),
+                    yaw=rng.uniform(-3, 3, 6), slope=rng.uniform(-0.2, 0.2, 6),
+                ),
+                belts=terrain.Belts(
+                    terrain.boxes([(0, 12)], (3, 1), -0.1, yaw=0.3), np.array([(0.5, 0.2)])
+                ),
+            )  # fmt: skip
+
+        self.addCleanup(terrain.spatial._generators.pop, 'turned3d')
+        for seed in range(4):
+            stage = Stage({'Type': 'turned3d'}, (seed,))
+            x, y = np.random.default_rng(seed).uniform(-13, 13, (2, 600))
+            error = np.abs(stage.rays(x, y) - stage.height(x, y))
+            # The lower ends lean out, by up to 0.2 of the height of the box.
+            lean = stage.height(x, y) == -0.3
+            np.testing.assert_allclose(error[~lean], 0, atol=EXACT)
+            self.assertLess((error[lean] > EXACT).mean(), 0.01)
+            self.assertGreater((~lean).sum(), 30)
+
+    def test_refuses(self):
+        with self.assertRaisesRegex(ValueError, 'gaps'):
+            SpatialTerrain(terrain.load('gaps'))
+        with self.assertRaisesRegex(ValueError, 'hills3d'):
+            PlanarTerrain(terrain.load('hills3d'))
+
+        @terrain.register3d('steep3d', replace=True)
+        def steep(parameters, rng):
+            return terrain.Layout(level=None, grid=lambda i, j: np.add.outer(i, 0 * j) * 0.5)
+
+        self.addCleanup(terrain.spatial._generators.pop, 'steep3d')
+        with self.assertRaisesRegex(ValueError, 'steep3d.*rises.*40 m'):
+            Stage({'Type': 'steep3d'})
+
+
+class DynamicsTest(parameterized.TestCase):
+    """Bodies on geoms that were moved after compiling."""
+
+    @parameterized.parameters('blocks3d', 'pillars3d', 'path3d')
+    def test_a_ball_stays_on_a_block(self, source):
+        stage = Stage(source, load=BALL)
+        for seed in (1, 2):
+            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            stage.world.forward(stage.rows)
+            boxes, met = stage.arena.surroundings.boxes[0], 0
+            for k in range(len(boxes.top)):
+                x, y = boxes.position[k]
+                corners = boxes.position[k] + 0.9 * boxes.half_size[k] * [(1, 1), (1, -1), (-1, 1)]
+                if np.ptp(stage.height(*corners.T)) > 0 or np.abs((x, y)).max() > 11:
+                    continue  # blocks overlap
+                top = stage.height(x, y)[0]
+                stage.put((x, y, top + 0.3))
+                mujoco.mj_step(stage.model, stage.data, 450)
+                np.testing.assert_allclose(stage.position[0], (x, y, top + 0.1), atol=2e-4)
+                met += 1
+                if met == 4:
+                    break
+            self.assertGreater(met, 1)
+
+    @parameterized.parameters(*GRIDS, 'ramp3d', 'stairs3d', 'conveyor3d')
+    def test_nothing_falls_through(self, source):
+        stage = Stage(source, load=CUBE)
+        for seed in range(3):
+            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            for x, y in np.random.default_rng(seed).uniform(-8, 8, (4, 2)):
+                stage.put((x, y, stage.height(x, y)[0] + 1.0), (1, 0, -2))
+                stage.run(1.0)
+                x, y, z = stage.position[0]
+                self.assertGreater(z, stage.height(x, y)[0] - 0.02)
+                self.assertLess(z, stage.height(np.add(x, [-0.1, 0, 0.1]), 3 * [y]).max() + 0.7)
+
+    def test_a_ball_rolls_down_the_ramp(self):
+        stage = Stage('ramp3d', load=BALL)
+        stage.put((-3, 0, stage.height(-3, 0)[0] + 0.1))
+        stage.run(2.0)
+        # A solid sphere that does not slip: 5/7 of what slides.
+        angle = np.arctan(0.1)
+        expected = 5 / 7 * 9.8 * np.sin(angle) * 2.0
+        self.assertAlmostEqual(-stage.velocity[0, 0] / np.cos(angle), expected, delta=0.03)
+        x, y, z = stage.position[0]
+        self.assertAlmostEqual(z, stage.height(x, y)[0] + 0.1 / np.cos(angle), delta=2e-3)
+
+    @parameterized.parameters('conveyor3d', 'conveyor3d_wide')
+    def test_a_body_on_a_belt_reaches_its_speed(self, source):
+        stage = Stage(source, load=CUBE)
+        for seed in range(4):
+            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            speed = stage.arena.surface_velocity(np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
+            self.assertAlmostEqual(abs(speed), {'conveyor3d': 0.4}.get(source, 0.6))
+            stage.put((4, 0, 0.11))
+            stage.run(1.0)
+            np.testing.assert_allclose(stage.velocity[0], (0, speed, 0), atol=2e-3)
+            y = stage.position[0, 1]
+            stage.run(2.0)
+            np.testing.assert_allclose(stage.position[0], (4, y + 2 * speed, 0.11), atol=5e-3)
+            # Beside the belt it comes to rest.
+            stage.put((2, 0, 0.1), (0, speed, 0))
+            stage.run(1.0)
+            np.testing.assert_allclose(stage.velocity[0], 0, atol=1e-3)
+
+    def test_belts_turn_with_the_episode(self):
+        stage = Stage('conveyor3d', load=CUBE)
+        signs = set()
+        for seed in range(6):
+            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            stage.put((4, 0, 0.11))
+            stage.run(0.5)
+            signs.add(bool(stage.velocity[0, 1] > 0))
+        self.assertEqual(signs, {True, False})
+
+    def mover(self, stage, k):
+        around = stage.arena.surroundings
+        stage.arena._look()
+        speed = around.speed[0, k] * around.direction[0, k]
+        return around.centres()[0, k], speed * around.axis[0, k], around.half_size[0, k]
+
+    def alone(self, stage):
+        """The fastest moving box with nothing near its way for two seconds."""
+        around = stage.arena.surroundings
+        centres = around.centres()[0]
+        order = np.argsort(-around.speed[0])
+        for k in order.tolist():
+            way = centres[k] + around.direction[0, k] * around.axis[0, k] * around.speed[0, k] * 2
+            gap = np.linalg.norm(centres - 0.5 * (centres[k] + way), axis=1)
+            gap[k] = np.inf
+            if gap.min() > 3.5 + np.linalg.norm(way - centres[k]) / 2 and np.abs(way).max() < 30:
+                return k
+        self.fail('no box by itself')
+
+    def test_a_moving_box_carries(self):
+        stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
+        k = self.alone(stage)
+        near = self.mover(stage, k)[0][None]  # a character nearby, so that it does not turn round
+        stage.arena.follow(near)
+        centre, velocity, _ = self.mover(stage, k)
+        stage.put((*centre, stage.height(*centre)[0] + 0.1), (*velocity, 0))
+        stage.run(2.0, near)
+        after, _, _ = self.mover(stage, k)
+        np.testing.assert_allclose(after - centre, 2 * velocity, atol=2e-3)
+        np.testing.assert_allclose(stage.position[0, :2] - after, 0, atol=5e-3)
+        np.testing.assert_allclose(stage.velocity[0, :2], velocity, atol=2e-3)
+        # From rest it is dragged along.
+        stage.put((*after, stage.height(*after)[0] + 0.1))
+        stage.run(1.0, near)
+        np.testing.assert_allclose(stage.velocity[0, :2], velocity, atol=2e-3)
+
+    def test_a_moving_box_pushes(self):
+        stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
+        k = self.alone(stage)
+        near = self.mover(stage, k)[0][None]
+        stage.arena.follow(near)
+        centre, velocity, half = self.mover(stage, k)
+        speed = np.linalg.norm(velocity)
+        ahead = velocity / speed
+        gap = 0.3 + (half / np.maximum(np.abs(ahead), 1e-6)).min() + 0.15
+        stage.put((*(centre + gap * ahead), 0.1))
+        fastest = 0.0
+        for _ in range(60):
+            stage.run(1 / 30, near)
+            fastest = max(fastest, np.linalg.norm(stage.velocity[0]))
+        after, _, _ = self.mover(stage, k)
+        np.testing.assert_allclose(after - centre, 2 * velocity, atol=5e-3)  # nothing stops it
+        away = stage.position[0, :2] - after
+        self.assertGreater(away @ ahead, 0.2)  # still in front, or pushed aside
+        outside = np.abs(away) - half
+        self.assertGreater(outside.max(), 0.05)
+        self.assertLess(fastest, 2.2 * speed + 0.05)  # pushed, not shot off
+        self.assertGreater(fastest, 0.5 * speed)
+
+    def test_boxes_keep_their_speed_and_way(self):
+        stage = Stage('dynamic_obstacles3d', (7,))
+        movers = stage.arena.grounds[0].layout.movers
+        kinematic = terrain.Surroundings(1, stage.arena.capacity)
+        kinematic.begin(0, stage.arena.grounds[0])
+        xy = np.array([(0.0, 0.0)])
+        for _ in range(900):
+            kinematic.turn(xy)
+            kinematic.way += kinematic.direction * kinematic.speed / 30
+            stage.run(1 / 30, xy)
+        stage.arena._look()
+        np.testing.assert_allclose(stage.arena.surroundings.way, kinematic.way, atol=2e-3)
+        np.testing.assert_array_equal(stage.arena.surroundings.direction, kinematic.direction)
+        self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some turned
+        # Queries and geometry agree on where they are.
+        x, y = np.random.default_rng(0).uniform(-12, 12, (2, 400))
+        stage.world.forward(stage.rows)
+        np.testing.assert_allclose(stage.rays(x, y), stage.height(x, y), atol=EXACT)
+        self.assertGreater((stage.height(x, y) > 0).sum(), 3)
+
+    def test_boxes_move_after_a_reset_of_the_world(self):
+        stage = Stage('dynamic_obstacles3d', (7,), load=BALL)
+        stage.world.reset(stage.rows)  # as placing a character does
+        stage.world.forward(stage.rows)
+        stage.arena._look()
+        before = stage.arena.surroundings.centres()[0]
+        movers = stage.arena.grounds[0].layout.movers
+        begin = movers.start + movers.phase[:, None] * (movers.end - movers.start)
+        np.testing.assert_allclose(before, begin, atol=1e-12)
+        stage.put((0, 0, 50))
+        stage.run(0.5, np.full((1, 2), 0.0))
+        stage.arena._look()
+        moved = np.linalg.norm(stage.arena.surroundings.centres()[0] - before, axis=1)
+        np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
+        self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
+
+    def test_drives_do_not_loosen_the_solver(self):
+        # The solver stops by a tolerance relative to the mean inertia.
+        with_drives, without = Stage('dynamic_obstacles3d', load=CUBE), Stage('plane', load=CUBE)
+        expected = without.model.stat.meaninertia
+        self.assertAlmostEqual(with_drives.model.stat.meaninertia, expected, delta=1e-6 * expected)
+        stage = with_drives
+        stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, 3))
+        self.assertAlmostEqual(stage.model.stat.meaninertia, expected, delta=1e-6 * expected)
+
+    def test_contact_sensors(self):
+        stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
+        sensor = stage.data.sensordata  # with the ground's body, with its subtree
+        stage.put((0, 0, 30))
+        np.testing.assert_array_equal(sensor > 0, [False, False])
+        k = self.alone(stage)
+        centre, _, _ = self.mover(stage, k)
+        stage.put((*centre, stage.height(*centre)[0] + 0.099))
+        np.testing.assert_array_equal(sensor > 0, [False, True])
+        x, y, _ = stage.arena.grounds[0].spawn(np.random.default_rng(0))
+        stage.put((x, y, 0.099))
+        np.testing.assert_array_equal(sensor > 0, [True, True])
+        for source in ('blocks3d', 'hills3d', 'conveyor3d'):
+            stage = Stage(source, load=CUBE)
+            stage.put((0, 0, stage.height(0, 0)[0] + 0.05))
+            np.testing.assert_array_equal(stage.data.sensordata > 0, [True, True])
+
+    def test_moving_boxes_touch_neither_ground_nor_each_other(self):
+        stage = Stage('dynamic_obstacles3d', (5,))
+        stage.run(1.0)
+        self.assertEqual(stage.data.ncon, 0)
+
+
+class QueryTest(parameterized.TestCase):
+    @parameterized.parameters(
+        'hills3d', 'pillars3d', 'dynamic_obstacles3d', 'conveyor3d', 'stairs3d'
+    )
+    def test_maps_are_queries_at_rotated_points(self, source):
+        seeds, rng = range(6), np.random.default_rng(0)
+        xy = np.add(rng.uniform(-6, 6, (6, 2)), (3, 0))
+        stage = Stage(source, seeds, batch=True, xy=xy, load=BALL)
+        stage.put(np.column_stack([xy, np.full(6, 20.0)]))
+        stage.run(1.0, xy)
+        heading = rng.uniform(-3, 3, 6)
+        forward, right = np.meshgrid(np.linspace(-1, 10, 32), np.linspace(-5.5, 5.5, 32))
+        forward, right = forward.ravel(), right.ravel()
+        cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
+        x = xy[:, :1] + forward * cosine + right * sine
+        y = xy[:, 1:] + forward * sine - right * cosine
+        heights = stage.arena.height_map(xy, heading)
+        under = stage.arena.height(xy[:, :1], xy[:, 1:])
+        off = np.abs(heights + under - stage.arena.height(x, y)) > 1e-6
+        self.assertLessEqual(off.sum(), 1)  # within rounding of an edge
+        flow = stage.arena.surface_velocity(x, y)
+        flow = flow - stage.arena.surface_velocity(xy[:, :1], xy[:, 1:])
+        velocities = stage.arena.velocity_map(xy, heading).reshape(6, 2, 1024)
+        ahead = flow[..., 0] * cosine + flow[..., 1] * sine
+        aside = flow[..., 0] * sine - flow[..., 1] * cosine
+        np.testing.assert_allclose(velocities[:, 0][~off], ahead[~off], atol=1e-12)
+        np.testing.assert_allclose(velocities[:, 1][~off], aside[~off], atol=1e-12)
+        self.assertEqual(bool(velocities.any()), source in ('dynamic_obstacles3d', 'conveyor3d'))
+
+    @parameterized.parameters('pillars3d', 'dynamic_obstacles3d', 'trail3d1', 'hills3d')
+    def test_goals(self, source):
+        stage = Stage(source, (3,))
+        stage.run(1.0)
+        rng = np.random.RandomState(0)
+        for _ in range(20):
+            x, y, z = stage.arena.goal(0, rng, (0.0, 0.0))
+            if max(abs(x), abs(y)) < 12:
+                self.assertAlmostEqual(z, stage.height(x, y)[0], delta=1e-5)
+            if source in ('pillars3d', 'dynamic_obstacles3d'):
+                self.assertEqual(z, 0)
+
+
+class WorldTest(parameterized.TestCase):
+    """Many simulations, states."""
+
+    SOURCES = (
+        'plane', 'hills3d', 'stairs3d', 'pillars3d', 'blocks3d', 'trail3d2', 'steps3d', 'conveyor3d',
+        'dynamic_obstacles3d',
+    )  # fmt: skip
+
+    def begin(self, source, seeds, batch):
+        grounds = [terrain.Ground(terrain.load(source), seed) for seed in seeds]
+        starts = [ground.spawn(np.random.RandomState(7)) for ground in grounds]
+        stage = Stage(source, seeds, load=BALL, batch=batch, xy=[start[:2] for start in starts])
+        x, y = stage.xy[:, :1], stage.xy[:, 1:]
+        stage.put(np.concatenate([x, y, stage.arena.height(x, y) + 0.3], 1), (3, 1, 0))
+        return stage, np.array([start[2] for start in starts])
+
+    def advance(self, stage, heading, steps):
+        """Goes with the balls; returns all that is seen."""
+        seen = []
+        for _ in range(steps):
+            xy = stage.position[:, :2].copy()
+            stage.arena.follow(xy)
+            stage.world.step(SUBSTEPS)
+            xy = stage.position[:, :2].copy()
+            maps = stage.arena.height_map(xy, heading), stage.arena.velocity_map(xy, heading)
+            seen.append(np.concatenate([stage.position, stage.velocity, *maps], 1))
+        return np.stack(seen, 1)
+
+    @parameterized.parameters(*SOURCES)
+    def test_every_row_of_a_batch_has_its_own_ground_and_equals_a_physics(self, source):
+        seeds = (11, 4, 8)
+        stage, heading = self.begin(source, seeds, batch=True)
+        seen = self.advance(stage, heading, 60)  # far enough to lay windows anew
+        for row, seed in enumerate(seeds):
+            single, psi = self.begin(source, (seed,), batch=False)
+            np.testing.assert_array_equal(self.advance(single, psi, 60)[0], seen[row])
+        if source != 'plane':
+            self.assertFalse(np.array_equal(seen[0][:, 6:], seen[1][:, 6:]))
+
+    @parameterized.parameters(*SOURCES)
+    def test_saved_and_restored(self, source):
+        stage, heading = self.begin(source, (5,), batch=False)
+        self.advance(stage, heading, 40)
+        state = pickle.loads(pickle.dumps((stage.arena.state(0), stage.world.get_state(0))))
+        seen = self.advance(stage, heading, 30)
+        others = [stage, self.begin(source, (9,), batch=False)[0]]
+        others[1].run(0.3)
+        for other in others:
+            other.arena.restore(0, state[0])
+            other.world.set_state(0, state[1])
+            np.testing.assert_array_equal(self.advance(other, heading, 30), seen)
+
+    @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d')
+    def test_restored_into_a_row_of_a_batch(self, source):
+        stage, heading = self.begin(source, (5,), batch=False)
+        self.advance(stage, heading, 40)
+        state = stage.arena.state(0), stage.world.get_state(0)
+        seen = self.advance(stage, heading, 20)
+        batch, _ = self.begin(source, (1, 2, 3), batch=True)
+        batch.run(0.2)
+        batch.arena.restore(1, state[0])
+        batch.world.set_state(1, state[1])
+        found = self.advance(batch, heading.repeat(3), 20)
+        np.testing.assert_array_equal(found[1], seen[0])
+
+    def test_rows_by_themselves(self):
+        """A row that is begun or followed leaves the others alone."""
+        stage, heading = self.begin('pillars3d', (1, 2, 3), batch=True)
+        self.advance(stage, heading, 10)
+        models = [stage.world.models[row].geom_pos.copy() for row in range(3)]
+        rows = np.array([1])
+        stage.arena.begin_episode(1, terrain.Ground(stage.arena.terrain, 77), (50.0, 3.0))
+        self.assertFalse(np.array_equal(stage.world.models[1].geom_pos, models[1]))
+        stage.arena.follow(np.array([(70.0, 3.0)]), rows)
+        for row in (0, 2):
+            np.testing.assert_array_equal(stage.world.models[row].geom_pos, models[row])
+        self.assertGreater(stage.arena.surroundings.centre[1, 0], 60)
+
+    def test_same_seed_same_ground(self):
+        for source in ('hills3d', 'pillars3d'):
+            x, y = np.random.default_rng(0).uniform(-10, 10, (2, 200))
+            grounds = [Stage(source, (seed,)) for seed in (3, 3, 4)]
+            rays = [stage.rays(x, y) for stage in grounds]
+            np.testing.assert_array_equal(rays[0], rays[1])
+            self.assertFalse(np.array_equal(rays[0], rays[2]))
+
+    def test_nothing_is_compiled_anew(self):
+        stage = Stage('pillars3d')
+        model = stage.model
+        stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, 5))
+        self.assertIs(stage.physics.model.ptr, model)
+
+    @parameterized.parameters('hills3d', 'trail3d1', 'pillars3d')
+    def test_pictures_show_the_new_ground(self, source):
+        def begin():
+            arena = tree(source, BALL)
+            arena.mjcf_model.worldbody.add(
+                'camera', name='above', pos=(0, -9, 9), xyaxes=(1, 0, 0, 0, 0.7, 0.7)
+            )
+            environment = composer.Environment(composer.NullTask(arena), random_state=0)
+            environment.reset()
+            arena.bind(PhysicsWorld(environment.physics))
+            return arena, environment
+
+        def picture(arena, environment, seed, x):
+            arena.begin_episode(0, terrain.Ground(arena.terrain, seed))
+            arena.follow(np.array([(x, 0.0)]))
+            arena.follow(np.zeros((1, 2)))
+            environment.physics.forward()
+            return environment.physics.render(60, 80, 'above').astype(int)
+
+        one, other = begin(), begin()
+        first = picture(*one, 1, 0.0)
+        second = picture(*one, 2, 0.0)
+        self.assertGreater(np.abs(first - second).mean(), 1)
+        np.testing.assert_array_equal(picture(*other, 2, 30.0), second)
+        # Laid anew in mid-episode, after there were pictures.
+        np.testing.assert_array_equal(picture(*other, 2, 30.0), second)
+        np.testing.assert_array_equal(picture(*other, 1, -30.0), first)
+
+
+if __name__ == '__main__':
+    absltest.main()

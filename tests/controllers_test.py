@@ -1,0 +1,777 @@
+"""Tests of the gait state machines: figures, dynamics, laws and transitions, by other means."""
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import mjcf
+from dm_control.locomotion.arenas import floors
+
+from trl_suite import actuation, characters, controllers, terrain
+from trl_suite.arenas import PlanarTerrain
+from trl_suite.controllers import dynamics, parameters
+from trl_suite.world import BatchWorld, PhysicsWorld, light_model
+
+DT = 1 / 600
+NAMES = ('dog', 'goat', 'raptor', 'biped2d_simbicon', 'hopper')
+STRIDERS = ('raptor', 'biped2d_simbicon')
+# Parameters, those of an action, of no state, of each state; base actions; target speed.
+COUNTS = {
+    'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 5, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
+    'biped2d_simbicon': (33, 28, 5, 7, 8, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
+}  # fmt: skip
+# Of base action 0 and the largest deviation of any other, by name.
+FIGURES = {
+    'dog': {
+        'TransTime': (0.125, 0), 'Cv': (0.014184, 0.034553), 'BackForceX': (378.334188, 432.678275),
+        'FrontForceY': (14.581642, 164.864831), 'BackStance.SpineCurve': (-0.112436, 0.665593),
+        'BackStance.Shoulder': (-2.992142, 4.541085), 'BackStance.Elbow': (6.511997, 0.478225),
+        'Extend.Hip': (1.330918, 0.174266), 'FrontStance.Knee': (-1.679779, 0.619968),
+        'Gather.Ankle': (0.930373, 1.546647),
+    },
+    'goat': {
+        'Cv': (0.034247, 0.016135), 'BackForceX': (657.431367, 206.038741),
+        'FrontForceY': (444.031403, 267.186149), 'BackStance.Shoulder': (-3.281075, 2.124269),
+        'Extend.Hip': (2.000835, 1.032987), 'Gather.Ankle': (1.469614, 0.314952),
+    },
+    'raptor': {
+        'TransTime': (0.0825, 0), 'Cv': (0.163639, 0.090977), 'Cd': (2.014739, 0.066559),
+        'ForceX': (0, 0), 'Contact.RootPitch': (0.20376, 1.009025), 'Contact.SpineCurve': (0, 0),
+        'Contact.StanceHip': (0.823847, 0.412785), 'Down.SwingHip': (1.77748, 2.061252),
+        'Passing.RootPitch': (0, 0), 'Up.SwingAnkle': (0.166636, 0.306875),
+    },
+    'biped2d_simbicon': {
+        'TransTime': (0.0825, 0), 'Cv': (0.251474, 0.06503), 'Cd': (2.099796, 0.13648),
+        'Contact.RootPitch': (-0.097252, 0.228057), 'Contact.StanceKnee': (0.273527, 1.395015),
+        'Down.SwingHip': (1.240827, 0.80722), 'Passing.RootPitch': (-0.170533, 0),
+        'Up.SwingAnkle': (0.634434, 1.221746),
+    },
+    'hopper': {
+        'MagicGain': (0.840456, 0.162049), 'Descent.Hip': (0.069732, 0.013257),
+        'DownStance.Knee': (-0.808767, 0.323382), 'UpStance.Knee': (0.516045, 0.308912),
+        'Ascent.Hip': (0.513187, 0.412821), 'Ascent.Knee': (-0.77768, 0.241009),
+    },
+}  # fmt: skip
+# Of other base actions: number -> by name.
+BLENDS = {
+    'dog': {1: {'BackForceX': 235.550357, 'Extend.Knee': -3.824514}, 7: {'BackStance.Knee': 2.516441},
+            3: {'Cv': 0.048737}, 4: {'Cv': 0.015899}},
+    'goat': {1: {'Cv': 0.018112}, 3: {'BackForceX': 863.470108}, 4: {'FrontForceY': 653.781456}},
+    'raptor': {1: {'Cv': 0.151344, 'Down.StanceKnee': 2.123645}, 7: {'Contact.RootPitch': 1.212785}},
+    'biped2d_simbicon': {1: {'Contact.StanceHip': -1.051302}, 7: {'Up.SwingAnkle': 1.85618}},
+    'hopper': {1: {'MagicGain': 0.8202}, 5: {'Ascent.Hip': 0.789777}, 7: {'Ascent.Knee': -0.536671}},
+}  # fmt: skip
+FIXED = {
+    'dog': ['TransTime'], 'goat': ['TransTime'], 'hopper': [],
+    'raptor': ['TransTime', 'ForceX', 'ForceY', 'Contact.SpineCurve', 'Down.SpineCurve',
+               'Passing.RootPitch', 'Passing.SpineCurve', 'Up.RootPitch', 'Up.SpineCurve'],
+    'biped2d_simbicon': ['TransTime', 'ForceX', 'ForceY', 'Passing.RootPitch', 'Up.RootPitch'],
+}  # fmt: skip
+ABSOLUTE = {
+    'dog': ['TransTime', 'Cv'], 'goat': ['TransTime', 'Cv'], 'raptor': ['TransTime', 'Cv', 'Cd'],
+    'biped2d_simbicon': ['TransTime', 'Cv', 'Cd'], 'hopper': ['MagicGain'],
+}  # fmt: skip
+STATES = {
+    'dog': ('BackStance', 'Extend', 'FrontStance', 'Gather'),
+    'goat': ('BackStance', 'Extend', 'FrontStance', 'Gather'),
+    'raptor': ('Contact', 'Down', 'Passing', 'Up'),
+    'biped2d_simbicon': ('Contact', 'Down', 'Passing', 'Up'),
+    'hopper': ('Descent', 'DownStance', 'UpStance', 'Ascent'),
+}
+# The foot: middle of the lower face of its box, from the link's joint.
+SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
+
+
+class ParametersTest(parameterized.TestCase):
+    """Vectors, base actions, and what an action means."""
+
+    def test_who_has_a_gait(self):
+        self.assertCountEqual(parameters.available(), NAMES)
+        self.assertCountEqual(controllers.GAITS, NAMES)
+        with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
+            controllers.load('dgo')
+
+    @parameterized.parameters(*COUNTS)
+    def test_counts(self, name):
+        gait = controllers.load(name)
+        count, actions, misc, per_state, base, speed = COUNTS[name]
+        self.assertLen(gait.names, count)
+        self.assertLen(gait.actions, actions)
+        self.assertEqual(gait.misc, misc)
+        self.assertEqual(count, misc + 4 * per_state)
+        self.assertEqual(gait.base_actions.shape, (base, count))
+        self.assertEqual(gait.target_speed, speed)
+        self.assertEqual(gait.states, STATES[name])
+        fixed = [n for i, n in enumerate(gait.names) if i not in gait.actions]
+        self.assertEqual(fixed, FIXED[name])
+        self.assertEqual([gait.names[i] for i in gait.absolute], ABSOLUTE[name])
+        for state, first in zip(gait.states, range(misc, count, per_state), strict=True):
+            for parameter in gait.names[first : first + per_state]:
+                self.assertStartsWith(parameter, f'{state}.')
+
+    @parameterized.parameters(*FIGURES)
+    def test_base_actions(self, name):
+        gait = controllers.load(name)
+        for parameter, (value, half_range) in FIGURES[name].items():
+            place = gait.place(parameter)
+            self.assertAlmostEqual(gait.base_actions[0, place], value, places=6, msg=parameter)
+            self.assertAlmostEqual(gait.half_range[place], half_range, places=6, msg=parameter)
+        for number, values in BLENDS[name].items():
+            for parameter, value in values.items():
+                found = gait.base_actions[number, gait.place(parameter)]
+                self.assertAlmostEqual(found, value, places=6, msg=parameter)
+        self.assertTrue((gait.half_range[gait.actions] > 0).all())
+        idle = np.delete(np.arange(len(gait.names)), gait.actions)
+        np.testing.assert_array_equal(gait.half_range[idle], 0)
+
+    def test_what_action_0_means(self):
+        dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
+        np.testing.assert_array_equal(dog.centre, dog.base_actions[0])
+        np.testing.assert_array_equal(hopper.centre, hopper.base_actions[0])
+        np.testing.assert_array_equal(raptor.centre, raptor.base_actions[1])
+        biped = controllers.load('biped2d_simbicon')
+        for parameter, value in (
+            ('TransTime', 0.0825), ('Cv', 0.258612), ('Cd', 2.160335), ('Contact.RootPitch', -0.331847),
+            ('Down.StanceHip', 0.665958), ('Up.SwingAnkle', 0.182327),
+        ):  # fmt: skip
+            self.assertEqual(biped.centre[biped.place(parameter)], value)
+
+    @parameterized.parameters(*NAMES)
+    def test_actions(self, name):
+        gait = controllers.load(name)
+        size, rng = len(gait.actions), np.random.default_rng(0)
+        np.testing.assert_array_equal(gait.vector(np.zeros((2, size))), [gait.centre] * 2)
+        for sign in (1, -1):
+            (vector,) = gait.vector(np.full((1, size), sign))
+            expected = gait.centre + sign * gait.half_range
+            np.testing.assert_allclose(vector, expected, rtol=0, atol=1e-12)
+            idle = np.delete(np.arange(len(vector)), gait.actions)
+            np.testing.assert_array_equal(vector[idle], gait.centre[idle])
+        one = np.zeros((1, size))
+        one[0, 3] = 1.0
+        changed = np.flatnonzero(gait.vector(one)[0] != gait.centre)
+        np.testing.assert_array_equal(changed, gait.actions[3:4])
+        actions = rng.uniform(-1, 1, (4, size))
+        vectors = gait.vector(actions)
+        np.testing.assert_allclose(gait.action(vectors), actions, atol=1e-9)
+        np.testing.assert_allclose(gait.action(vectors[2]), actions[2], atol=1e-9)
+
+    def test_files_that_are_wrong(self):
+        good = {
+            'character': 'hopper', 'misc': ['Gain'], 'states': ['Up', 'Down'],
+            'state_parameters': ['Hip'], 'fixed': ['Gain'], 'absolute': [], 'target_speed': 1.0,
+            'sets': {'a': [1, 2, 3], 'b': [2, 4, 6]}, 'base_actions': [['a', 'b', 0], ['a', 'b', 0.5]],
+            'centre': 'b', 'search_scale': {'Gain': 1, 'Hip': 2}, 'start': {},
+        }  # fmt: skip
+        gait = parameters.read(good)
+        self.assertEqual(gait.names, ('Gain', 'Up.Hip', 'Down.Hip'))
+        np.testing.assert_array_equal(gait.base_actions, [[1, 2, 3], [1.5, 3, 4.5]])
+        np.testing.assert_array_equal(gait.centre, [2, 4, 6])
+        np.testing.assert_array_equal(gait.half_range, [0.5, 1, 1.5])
+        np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
+        for message, change in (
+            ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),
+            ("set 'a' needs 3", {'sets': {'a': [1, 2, float('nan')]}}),
+            ("unknown parameter 'Up.Hp'.*'Up.Hip'", {'fixed': ['Up.Hp']}),
+            ("unknown parameter 'gain'.*'Gain'", {'absolute': ['gain']}),
+        ):
+            with self.assertRaisesRegex(ValueError, message):
+                parameters.read({**good, **change})
+
+
+class Rig:
+    """A character and its gait in a world without a task."""
+
+    def __init__(self, name, n=1, batch=False):
+        arena = PlanarTerrain(terrain.load('flat'))
+        self.character = characters.make(name)
+        self.character.create_root_joints(arena.attach(self.character))
+        self.gait = controllers.make(self.character, arena.ground_body, arena.mjcf_model)
+        actuation.add(self.character, 'torque', DT / 2)
+        for joint in self.character.joints:
+            joint.damping = joint.armature = 0
+        arena.mjcf_model.option.timestep = DT / 2
+        if batch:
+            model = light_model(arena.mjcf_model)
+            self.world = BatchWorld(model, n, 1, dynamics.FIELDS)
+        else:
+            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # must be kept alive
+            self.world = PhysicsWorld(self.physics, dynamics.FIELDS)
+        arena.bind(self.world)
+        self.gait.bind(self.world)
+        self.rows = np.arange(self.world.n)
+        for row in self.rows:
+            arena.begin_episode(row, terrain.Strip(arena.terrain, 0))
+        self.dynamics, self.name = self.gait.dynamics, name
+        self.joints = list(self.character.row.joints)
+        self.touches(())
+        self.gait.begin(self.rows)
+
+    def scatter(self, seed=0, speed=5.0):
+        """Random poses in the air, at random speeds."""
+        rng = np.random.default_rng(seed)
+        low, high = self.character.joint_ranges.T
+        low, high = np.maximum(low, -1.0), np.minimum(high, 1.0)
+        n = self.world.n
+        q = np.concatenate([
+            rng.uniform((-3, 2, -0.8), (9, 4, 0.8), (n, 3)), rng.uniform(low, high, (n, len(low)))
+        ], axis=1)  # fmt: skip
+        self.put(q, speed * rng.uniform(-1, 1, q.shape))
+        return rng
+
+    def put(self, q, v):
+        self.world.qpos[self.rows[:, None], self.dynamics.qpos] = q
+        self.world.qvel[self.rows[:, None], self.dynamics.dofs] = v
+        self.world.forward(self.rows)
+
+    def touches(self, links):
+        """Makes the gait believe in contacts: names of links, the same in every row."""
+        on = np.isin(self.character.row.links, links)
+        self.gait.touching = lambda rows: np.tile(on, (len(rows), 1))
+
+    def data(self, row=0):
+        """The engine's own view of one row, and the columns of its degrees of freedom."""
+        model = self.world.models[row]
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = self.world.qpos[row], self.world.qvel[row]
+        mujoco.mj_forward(model, data)
+        names = [f'{self.name}/root_{axis}/' for axis in ('x', 'z', 'pitch')]
+        names += [f'{self.name}/{joint}' for joint in self.joints]
+        return model, data, [model.joint(name).dofadr[0] for name in names]
+
+    def set(self, **values):
+        """Parameters by name ('Down.Hip' as Down__Hip) for all rows."""
+        for name, value in values.items():
+            place = self.gait.parameters.place(name.replace('__', '.'))
+            self.gait.vectors[:, place] = value
+
+
+def inertia(model, data, columns):
+    dense = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, dense)
+    return dense[np.ix_(columns, columns)]
+
+
+def bias(model, data, columns):
+    result = np.zeros(model.nv)
+    mujoco.mj_rne(model, data, 0, result)
+    return result[columns]
+
+
+def jacobian(model, data, columns, body, point):
+    result = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, result, None, np.array(point), body)
+    return result[np.ix_([0, 2], columns)]
+
+
+def world_angle(data, body):
+    """Turn of a body about -y, rad: of its x axis above the horizontal."""
+    matrix = data.xmat[body].reshape(3, 3)
+    return np.arctan2(matrix[2, 0], matrix[0, 0])
+
+
+def sole(model, data, link, name='dog'):
+    body = model.body(f'{name}/{link}').id
+    x, z = SOLES[link]
+    return body, data.xpos[body] + data.xmat[body].reshape(3, 3) @ (x, 0, z)
+
+
+def dense_pd(rig, row, off=(), wanted=None):
+    """Stable PD of one row, from the formula, with matrices of the engine."""
+    model, data, columns = rig.data(row)
+    links = rig.character.row.joints.values()
+    kp = np.array([0, 0, 0, *(0 if n in off else j.kp for n, j in zip(rig.joints, links, strict=True))])
+    kd = np.array([0, 0, 0, *(0 if n in off else j.kd for n, j in zip(rig.joints, links, strict=True))])
+    full_kd = np.array([0, 0, 0, *(joint.kd for joint in links)])  # stays in the matrix
+    q, v = data.qpos[columns], data.qvel[columns]
+    target = np.zeros(len(q))
+    target[3:] = rig.gait.targets[row] if wanted is None else wanted
+    for name in rig.gait.world_joints:
+        dof = 3 + rig.joints.index(name)
+        angle = world_angle(data, model.body(f'{rig.name}/{name}').id)
+        target[dof] -= angle - q[dof]
+    pull = kp * (target - q - DT * v) - kd * v
+    acceleration = np.linalg.inv(inertia(model, data, columns) + DT * np.diag(full_kd)) @ (
+        pull - bias(model, data, columns)
+    )
+    return (pull - kd * DT * acceleration)[3:]
+
+
+class DynamicsTest(parameterized.TestCase):
+    """Arrays against the engine's own functions."""
+
+    @parameterized.product(name=NAMES, batch=(False, True))
+    def test_equations_of_motion(self, name, batch):
+        rig = Rig(name, 3 if batch else 1, batch)
+        rig.scatter(1)
+        found = rig.dynamics
+        matrices, forces = found.inertia(rig.rows), found.bias(rig.rows)
+        np.testing.assert_array_equal(found.positions(rig.rows), rig.world.qpos[:, found.qpos])
+        for row in rig.rows:
+            model, data, columns = rig.data(row)
+            np.testing.assert_allclose(matrices[row], inertia(model, data, columns), atol=1e-10)
+            np.testing.assert_allclose(forces[row], bias(model, data, columns), atol=1e-9)
+            np.testing.assert_array_equal(found.velocities(rig.rows)[row], data.qvel[columns])
+            np.linalg.cholesky(matrices[row])
+        mass = sum(model.body(f'{name}/{link}').mass[0] for link in rig.character.row.links)
+        self.assertAlmostEqual(found.mass, mass)
+        self.assertAlmostEqual(matrices[0, 0, 0], mass, places=9)
+
+    @parameterized.product(name=NAMES[:4], batch=(False, True))
+    def test_kinematics(self, name, batch):
+        rig = Rig(name, 3 if batch else 1, batch)
+        rng = rig.scatter(2)
+        found, joints = rig.dynamics, np.arange(len(rig.joints))
+        q, v = found.positions(rig.rows), found.velocities(rig.rows)
+        coefficients, constants = found.frame(joints)
+        angles = q @ coefficients + constants + q[:, 3:]
+        speed = found.com_speed(rig.rows, v)
+        for row in rig.rows:
+            model, data, columns = rig.data(row)
+            root = model.body(f'{name}/root').id
+            np.testing.assert_allclose(found.com(rig.rows)[row], data.subtree_com[root], atol=1e-12)
+            mujoco.mj_subtreeVel(model, data)
+            self.assertAlmostEqual(speed[row], data.subtree_linvel[root, 0], places=9)
+            for joint, link in enumerate(rig.joints):
+                angle = world_angle(data, model.body(f'{name}/{link}').id)
+                self.assertAlmostEqual(np.cos(angles[row, joint] - angle), 1.0, places=9, msg=link)
+                self.assertLess(abs(np.sin(angles[row, joint] - angle)), 1e-9)
+        for link in rng.choice(rig.character.row.links, 6, replace=False):
+            body = model.body(f'{name}/{link}').id
+            points = rig.world.xipos[rig.rows][:, body] + rng.uniform(-0.2, 0.2, (len(rig.rows), 3))
+            matrices = found.jacobian(rig.rows, body, points)
+            for row in rig.rows:
+                expected = jacobian(*rig.data(row), body, points[row])
+                np.testing.assert_allclose(matrices[row], expected, atol=1e-10, err_msg=link)
+
+    @parameterized.parameters(*NAMES)
+    def test_gravity(self, name):
+        rig = Rig(name, 2, batch=True)
+        rig.scatter(3, speed=0.0)
+        found = rig.dynamics.gravity(rig.rows)
+        hinges = rig.dynamics.hinges | (np.arange(rig.dynamics.size) < 3)  # slides of joints: no
+        self.assertEqual(int((~hinges).sum()), int(name == 'hopper'))
+        for row in rig.rows:
+            model, data, columns = rig.data(row)
+            weight = -data.qfrc_bias[columns]  # at rest
+            np.testing.assert_allclose(found[row, hinges], weight[hinges], atol=1e-9)
+
+    @parameterized.parameters(*NAMES)
+    def test_rows_do_not_depend_on_each_other(self, name):
+        rig = Rig(name, 5, batch=True)
+        rig.scatter(4)
+        gait, feet = rig.gait, [foot for foot in rig.gait.feet] or rig.character.row.end_effectors
+        rig.touches(feet)
+        gait.state[:] = rig.rows % 4
+        gait.enter(rig.rows)
+        together = gait.torques(rig.rows)
+        for rows in ([0], [1, 3], [2], [4]):
+            np.testing.assert_array_equal(gait.torques(np.array(rows)), together[rows])
+
+
+class LawTest(parameterized.TestCase):
+    """What acts on the joints, against the formulas."""
+
+    @parameterized.product(name=NAMES, batch=(False, True))
+    def test_stable_pd(self, name, batch):
+        rig = Rig(name, 3 if batch else 1, batch)
+        rng = rig.scatter(5)
+        gait = rig.gait
+        gait.targets[...] = rng.uniform(-4, 4, gait.targets.shape)
+        q, v = rig.dynamics.positions(rig.rows), rig.dynamics.velocities(rig.rows)
+        found = gait.stable_pd(rig.rows, q, v)
+        free = rig.joints[-1]
+        off = np.tile(np.array(rig.joints) == free, (len(q), 1))
+        freed = gait.stable_pd(rig.rows, q, v, off)
+        for row in rig.rows:
+            np.testing.assert_allclose(found[row], dense_pd(rig, row), rtol=1e-8, atol=1e-7)
+            expected = dense_pd(rig, row, off=(free,))
+            np.testing.assert_allclose(freed[row], expected, rtol=1e-8, atol=1e-7)
+            self.assertEqual(freed[row, -1], 0.0)
+
+    def test_world_angles_are_wrapped(self):
+        rig = Rig('raptor')
+        q = np.zeros((1, rig.dynamics.size))
+        q[0, 1:3] = 3.0, 3.0
+        q[0, 3 + rig.joints.index('right_hip')] = 0.5  # 3.5 rad to the world: -2.78
+        rig.put(q, np.zeros_like(q))
+        rig.gait.targets[:] = 0.0
+        found = rig.gait.local_targets(rig.rows, q)
+        hip = rig.joints.index('right_hip')
+        model, data, _ = rig.data()
+        angle = world_angle(data, model.body('raptor/right_hip').id)
+        self.assertBetween(angle, -np.pi, -2.0)
+        self.assertAlmostEqual(found[0, hip], 0.5 - angle)
+        np.testing.assert_array_equal(np.delete(found[0], [hip, rig.joints.index('left_hip')]), 0)
+
+    @parameterized.parameters(*NAMES)
+    def test_what_state_entry_sets(self, name):
+        rig = Rig(name)
+        gait, figures = rig.gait, controllers.load(name)
+        vector = np.random.default_rng(0).uniform(-2, 2, len(figures.names))
+        gait.apply(rig.rows, vector[None])
+        vector = np.where(np.isin(figures.names, ABSOLUTE[name]), np.abs(vector), vector)
+        np.testing.assert_array_equal(gait.vectors[0], vector)
+        value = lambda parameter: vector[figures.names.index(parameter)]  # noqa: E731
+        files = {joint: each.target for joint, each in rig.character.row.joints.items()}
+        for number, state in enumerate(figures.states):
+            gait.state[:] = number
+            gait.enter(rig.rows)
+            expected = dict(files)
+            if name in ('dog', 'goat'):
+                for joint in ('shoulder', 'elbow', 'hip', 'knee', 'ankle'):
+                    expected[joint] = value(f'{state}.{joint.title()}')
+                for joint in ('spine0', 'spine1', 'spine2', 'spine3', 'torso'):
+                    expected[joint] = value(f'{state}.SpineCurve')
+            elif name in STRIDERS:
+                for joint in ('hip', 'knee', 'ankle'):
+                    expected[f'right_{joint}'] = value(f'{state}.Stance{joint.title()}')
+                    expected[f'left_{joint}'] = value(f'{state}.Swing{joint.title()}')
+            else:
+                expected = {'hip': value(f'{state}.Hip'), 'leg': value(f'{state}.Knee')}
+            found = dict(zip(rig.joints, gait.targets[0], strict=True))
+            self.assertEqual(found, expected)
+
+    def test_targets_of_joints_that_no_state_moves(self):
+        dog, raptor = Rig('dog'), Rig('raptor')
+        found = dict(zip(dog.joints, dog.gait.targets[0], strict=True))
+        for joint, angle in (
+            ('neck0', 0.68507), ('head', 0.20456), ('tail0', 0.4), ('wrist', 0.11488),
+            ('finger', -0.46365), ('toe', -0.62549),
+        ):  # fmt: skip
+            self.assertEqual(found[joint], angle)
+        found = dict(zip(raptor.joints, raptor.gait.targets[0], strict=True))
+        for joint, angle in (('spine0', 0.16682), ('tail4', 0.24638), ('right_toe', -0.3883)):
+            self.assertEqual(found[joint], angle)
+
+    @parameterized.product(name=STRIDERS, stance=(0, 1), state=(0, 1, 2, 3), loaded=(True, False))
+    def test_stride(self, name, stance, state, loaded):
+        """Swing feedback and stance hip, by hand."""
+        rig = Rig(name)
+        rig.scatter(6, speed=1.0)
+        gait, foot = rig.gait, {'raptor': 'toe'}.get(name, 'ankle')
+        right, left = 'right', 'left'
+        stance_leg, swing_leg = (left, right) if stance else (right, left)
+        gait.stance[:], gait.state[:] = stance, state
+        name_of = STATES[name][state]
+        rig.set(Cv=0.3, Cd=1.7)
+        rig.set(**{f'{name_of}__RootPitch': 0.4, f'{name_of}__SwingHip': 0.6})
+        gait.enter(rig.rows)
+        rig.touches((f'{stance_leg}_{foot}',) if loaded else (f'{swing_leg}_{foot}', 'root'))
+        found = gait.torques(rig.rows)[0]
+
+        model, data, columns = rig.data()
+        mujoco.mj_subtreeVel(model, data)
+        root, box = model.body(f'{name}/root').id, model.body(f'{name}/{stance_leg}_{foot}').id
+        if state < 2:
+            target = 0.6 + 0.3 * data.subtree_linvel[root, 0]
+        else:
+            target = 0.6 + 1.7 * (data.subtree_com[root, 0] - data.xipos[box, 0])
+        swing, hip = rig.joints.index(f'{swing_leg}_hip'), rig.joints.index(f'{stance_leg}_hip')
+        self.assertAlmostEqual(gait.targets[0, swing], target, places=9)
+        acts = loaded and state < 2
+        expected = dense_pd(rig, 0, off=(f'{stance_leg}_hip',) if acts else ())
+        if acts:
+            kp, kd = {'raptor': (300, 30)}.get(name, (200, 20))
+            pitch, rate = data.qpos[columns[2]], data.qvel[columns[2]]
+            expected[hip] = -expected[swing] - (kp * (0.4 - pitch) - kd * rate)
+        limits = rig.character.torque_limits
+        np.testing.assert_allclose(found, np.clip(expected, -limits, limits), atol=1e-6)
+
+    @parameterized.product(name=('dog', 'goat'), state=(0, 1, 2, 3), feet=((), ('toe',), ('finger',),
+                           ('toe', 'finger')))  # fmt: skip
+    def test_bound(self, name, state, feet):
+        """Swing feedback, virtual forces and gravity compensation, by hand."""
+        rig = Rig(name)
+        rig.scatter(7, speed=1.0)
+        gait, figures = rig.gait, STATES[name][state]
+        forces = {'toe': (31.0, 17.0), 'finger': (-12.0, 23.0)}
+        rig.set(Cv=0.2, BackForceX=31.0, BackForceY=17.0, FrontForceX=-12.0, FrontForceY=23.0)
+        rig.set(**{f'{figures}__Hip': 0.3, f'{figures}__Shoulder': -0.4})
+        gait.state[:] = state
+        gait.enter(rig.rows)
+        rig.touches(('knee', *feet))
+        found = gait.torques(rig.rows)[0]
+
+        model, data, columns = rig.data()
+        mujoco.mj_subtreeVel(model, data)
+        speed = data.subtree_linvel[model.body(f'{name}/root').id, 0]
+        for joint, foot, angle in (('hip', 'toe', 0.3), ('shoulder', 'finger', -0.4)):
+            expected = angle + (0.0 if foot in feet else 0.2 * speed)
+            target = gait.targets[0, rig.joints.index(joint)]
+            self.assertAlmostEqual(target, expected, places=9)
+        expected = dense_pd(rig, 0)
+        of_feet = {foot: jacobian(model, data, columns, *sole(model, data, foot, name)) for foot in feet}
+        if name == 'dog' and feet:
+            expected += self.weight(model, data, columns, of_feet)[3:]
+        foot = 'toe' if state < 2 else 'finger'
+        if foot in feet:
+            push = of_feet[foot].T @ -np.array(forces[foot])
+            limb = {'toe': ('hip', 'knee', 'ankle', 'toe')}.get(
+                foot, ('shoulder', 'elbow', 'wrist', 'finger')
+            )
+            for joint in limb:
+                expected[rig.joints.index(joint)] += push[3 + rig.joints.index(joint)]
+        limits = rig.character.torque_limits
+        np.testing.assert_allclose(found, np.clip(expected, -limits, limits), atol=1e-5)
+
+    def weight(self, model, data, columns, of_feet):
+        """Forces of the joints that carry the body on its feet, from those of gravity."""
+        gravity = np.zeros(len(columns))
+        for body in range(1, model.nbody):
+            if model.body_mass[body]:
+                centre = jacobian(model, data, columns, body, data.xipos[body])
+                gravity += centre.T @ (0, -9.8 * model.body_mass[body])
+        supports = np.concatenate([matrix.T for matrix in of_feet.values()], axis=1)
+        a, b = supports[:3], -gravity[:3]
+        x = np.linalg.solve(a.T @ a + 1e-4 * np.eye(a.shape[1]), a.T @ b)
+        if len(of_feet) == 2:  # two feet can carry the trunk, and without tipping it
+            np.testing.assert_allclose(a @ x, b, atol=0.05 * np.linalg.norm(b))
+        return -gravity - supports @ x
+
+    @parameterized.product(state=(0, 1, 2, 3), landed=(True, False))
+    def test_hop(self, state, landed):
+        rig = Rig('hopper')
+        rig.scatter(8, speed=0.5)
+        gait = rig.gait
+        gait.vectors[:, 0] = 0.7
+        gait.state[:] = state
+        rig.set(**{f'{STATES["hopper"][state]}__Knee': rig.dynamics.positions(rig.rows)[0, 4]})
+        gait.enter(rig.rows)
+        rig.touches(('leg',) if landed else ('root', 'hip'))
+        found = gait.torques(rig.rows)[0]
+        self.assertLess(abs(found[1]), 179.0)  # the leg's limit hides nothing
+        model, data, columns = rig.data()
+        pitch, rate = data.qpos[columns[2]], data.qvel[columns[2]]
+        expected = dense_pd(rig, 0)
+        if state in (1, 2):
+            expected[0] -= 0.7 * (200 * (0 - pitch) - 20 * rate)
+        if landed:
+            thigh = world_angle(data, model.body('hopper/hip').id)
+            expected[1] += (8.0 + 0.5) * -9.8 * np.cos(thigh)
+        expected = np.clip(expected, (-2500, -180), (2500, 180))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+    @parameterized.parameters(*NAMES)
+    def test_torques_stay_within_limits(self, name):
+        rig = Rig(name, 40, batch=True)
+        rng = rig.scatter(9, speed=30.0)
+        gait, limits = rig.gait, rig.character.torque_limits
+        spread = np.maximum(5 * np.abs(gait.parameters.half_range), 3.0)
+        gait.apply(rig.rows, gait.parameters.centre + rng.normal(size=gait.vectors.shape) * spread)
+        gait.state[:] = rig.rows % 4
+        gait.enter(rig.rows)
+        touching = rng.random((40, len(rig.character.row.links))) < 0.5
+        gait.touching = lambda rows: touching[rows]
+        torques = gait.torques(rig.rows)
+        self.assertTrue((np.abs(torques) <= limits).all())
+        self.assertTrue((np.abs(torques) == limits).any())
+        self.assertTrue((np.abs(torques) < limits).any())
+
+
+class MachineTest(parameterized.TestCase):
+    """When states end, and what follows."""
+
+    def leave(self, rig, state, links, phase=0.0):
+        """Puts the machine into a state, advances it once, and returns (state, cycle's end)."""
+        gait = rig.gait
+        gait.state[:], gait.phase[:] = state, phase
+        gait.enter(rig.rows)
+        rig.touches(links)
+        (ended,) = gait.advance(rig.rows)
+        return int(gait.state[0]), bool(ended)
+
+    def test_bound(self):
+        rig = Rig('dog')
+        feet = ((), ('toe',), ('finger',), ('toe', 'finger'), ('knee', 'wrist'))
+        for links in feet:
+            for late in (False, True):
+                phase = 0.99 if late else 0.5
+                following = [self.leave(rig, state, links, phase) for state in range(4)]
+                self.assertEqual(following[0], (int(late), False))
+                self.assertEqual(following[1], (2 if 'finger' in links else 1, False))
+                self.assertEqual(following[2], (3 if late else 2, False))
+                self.assertEqual(following[3], (3, 'toe' in links))
+
+    @parameterized.product(name=STRIDERS, stance=(0, 1))
+    def test_stride(self, name, stance):
+        rig = Rig(name)
+        foot = {'raptor': 'toe'}.get(name, 'ankle')
+        stance_foot, swing_foot = (f'right_{foot}', f'left_{foot}')[:: -1 if stance else 1]
+        for links in ((), (stance_foot,), (swing_foot,), (stance_foot, swing_foot)):
+            for phase, late in ((0.5, False), (0.99, True)):
+                for state in range(4):
+                    rig.gait.stance[:] = stance
+                    ends = late if state < 3 else swing_foot in links
+                    expected = (min(state + 1, 3), state == 3) if ends else (state, False)
+                    self.assertEqual(self.leave(rig, state, links, phase), expected)
+                    # The legs change places with the cycle, before anybody looks.
+                    self.assertEqual(rig.gait.stance[0], 1 - stance if expected[1] else stance)
+
+    def test_phase(self):
+        for name, duration in (('dog', 0.125), ('raptor', 0.0825), ('biped2d_simbicon', 0.0825)):
+            rig = Rig(name)
+            steps = 0
+            while rig.gait.state[0] == 0:
+                rig.gait.advance(rig.rows)
+                steps += 1
+            self.assertAlmostEqual(steps * DT, duration, delta=1.01 * DT)
+            self.assertEqual(rig.gait.phase[0], 0.0)
+            rig.gait.advance(rig.rows)
+            self.assertAlmostEqual(rig.gait.phase[0], 0.0 if name == 'dog' else DT / duration,
+                                   delta=DT / duration)  # fmt: skip
+
+    def test_a_new_cycle(self):
+        rig = Rig('raptor')
+        gait = rig.gait
+        gait.state[:], gait.phase[:], gait.stance[:] = 3, 0.4, 1
+        vector = gait.parameters.base_actions[2:3].copy()
+        vector[0, :3] *= -1
+        gait.apply(rig.rows, vector)
+        self.assertEqual((gait.state[0], gait.phase[0], gait.stance[0]), (0, 0.0, 1))
+        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[2:3])
+        left_knee = gait.targets[0, rig.joints.index('left_knee')]  # of the stance leg now
+        self.assertEqual(left_knee, vector[0, gait.parameters.place('Contact.StanceKnee')])
+        vector[...] = 0  # the caller's own
+        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[2:3])
+
+    def test_rows_move_on_by_themselves(self):
+        rig = Rig('dog', 4, batch=True)
+        gait = rig.gait
+        gait.state[:], gait.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
+        on = np.isin(rig.character.row.links, ('toe',))
+        gait.touching = lambda rows: np.tile(on, (len(rows), 1))
+        before = gait.targets.copy()
+        ended = gait.advance(np.array([0, 1, 2]))
+        np.testing.assert_array_equal(ended, [False, False, True])
+        np.testing.assert_array_equal(gait.state, [1, 1, 3, 0])
+        self.assertEqual(gait.phase[3], 0.3)
+        np.testing.assert_array_equal((gait.targets != before).any(1), [True, False, False, False])
+
+    def test_hop(self):
+        rig = Rig('hopper')
+        gait = rig.gait
+
+        def leave(state, landed, was_rising, rising):
+            q = np.zeros((1, 5))
+            q[0, 1] = 3.0
+            rig.put(q, np.array([[0, 1.0 if rising else -1.0, 0, 0, 0]]))
+            gait.rising[:] = was_rising
+            return self.leave(rig, state, ('leg',) if landed else ())
+
+        for was in (False, True):
+            for now in (False, True):
+                for landed in (False, True):
+                    self.assertEqual(leave(0, landed, was, now), (0, landed))
+                    turned_up = now and not was
+                    self.assertEqual(leave(1, landed, was, now), (2 if turned_up else 1, False))
+                    self.assertEqual(leave(2, landed, was, now), (2 if landed else 3, False))
+                    turned_down = was and not now
+                    self.assertEqual(
+                        leave(3, landed, was, now), (2 if landed else 0 if turned_down else 3, False)
+                    )
+                    self.assertEqual(bool(gait.rising[0]), now)
+
+    def test_hop_begins_in_the_air_and_goes_on_at_touch_down(self):
+        rig = Rig('hopper')
+        gait = rig.gait
+        gait.apply(rig.rows, gait.parameters.base_actions[3:4])
+        self.assertEqual(gait.state[0], 0)  # the first action: still in descent
+        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[3:4])
+        self.assertEqual(self.leave(rig, 0, ('leg',)), (0, True))
+        gait.apply(rig.rows, gait.parameters.base_actions[4:5])
+        self.assertEqual(gait.state[0], 1)
+        self.assertEqual(gait.targets[0, 0], gait.parameters.base_actions[4, 3])
+        gait.begin(rig.rows)
+        gait.apply(rig.rows, gait.parameters.base_actions[3:4])
+        self.assertEqual(gait.state[0], 0)
+
+    @parameterized.parameters(*NAMES)
+    def test_save_and_restore(self, name):
+        rig = Rig(name, 2, batch=True)
+        del rig.gait.touching  # the true ones
+        start(rig)
+        run(rig, 100)
+        saved = [(rig.world.get_state(row), rig.gait.get_state(row)) for row in rig.rows]
+        expected = run(rig, 300)
+        other = Rig(name, 2, batch=True)
+        del other.gait.touching
+        start(other)
+        run(other, 37)
+        for row, (world, gait) in enumerate(saved):
+            other.gait.set_state(row, gait)
+            other.world.set_state(row, world)
+        np.testing.assert_array_equal(run(other, 300), expected)
+
+
+def start(rig):
+    """The pose of the first instant; the character stands on the ground."""
+    begin, q = rig.gait.parameters.start, np.zeros((rig.world.n, rig.dynamics.size))
+    v = np.zeros_like(q)
+    q[:, 1:3], v[:, :3] = (begin['height'], begin['pitch']), begin['velocity']
+    q[:, 1] += 0.02
+    for name, (angle, rate) in begin['joints'].items():
+        dof = 3 + rig.gait.number[name]
+        q[:, dof], v[:, dof] = angle, rate
+    rig.put(q, v)
+    rig.gait.begin(rig.rows)
+
+
+def run(rig, steps):
+    """Default gait; returns all positions."""
+    gait, found = rig.gait, []
+    for _ in range(steps):
+        rig.world.ctrl[:] = gait.torques(rig.rows)
+        rig.world.step(2)
+        ended = np.flatnonzero(gait.advance(rig.rows))
+        if len(ended):
+            gait.apply(ended, np.tile(gait.parameters.centre, (len(ended), 1)))
+        found.append(rig.world.qpos.copy())
+    return np.array(found)
+
+
+class AloneTest(parameterized.TestCase):
+    """A gait needs no environment of the suite."""
+
+    def test_a_dog_on_a_floor_of_dm_control(self):
+        arena, dog = floors.Floor(), characters.make('dog')
+        option = arena.mjcf_model.option
+        option.timestep, option.gravity = controllers.CONTROL_TIMESTEP / 2, (0, 0, -9.8)
+        dog.create_root_joints(arena.attach(dog))
+        gait = controllers.make(dog, 'world', arena.mjcf_model)
+        actuation.add(dog, 'torque', option.timestep)
+        for joint in dog.joints:
+            joint.damping = joint.armature = 0
+        physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+        world, rows = PhysicsWorld(physics, dynamics.FIELDS), np.arange(1)
+        gait.bind(world)
+        begin, places, rates = gait.parameters.start, gait.dynamics.qpos, gait.dynamics.dofs
+        world.qpos[0, places[1:3]] = begin['height'], begin['pitch']
+        world.qvel[0, rates[:3]] = begin['velocity']
+        for name, (angle, rate) in begin['joints'].items():
+            dof = 3 + gait.number[name]
+            world.qpos[0, places[dof]], world.qvel[0, rates[dof]] = angle, rate
+        world.forward(rows)
+        gait.begin(rows)
+        cycles, down = 0, 0
+        trunk = [gait.link[name] for name in dog.row.fall_links]
+        for _ in range(3 * 600):
+            world.ctrl[0] = gait.torques(rows)[0]
+            world.step(2)
+            if gait.advance(rows)[0]:
+                gait.apply(rows, gait.parameters.centre[None])
+                cycles += 1
+            down += gait.touching(rows)[0, trunk].any()
+        self.assertBetween(cycles, 5, 9)
+        self.assertLess(down, 60)  # of 1800
+        self.assertGreater(world.qpos[0, places[0]], 6.0)
+        self.assertLess(abs(world.qpos[0, places[2]]), 1.2)
+
+    def test_who_has_none_is_refused(self):
+        arena, biped = floors.Floor(), characters.make('biped2d')
+        arena.attach(biped)
+        with self.assertRaisesRegex(ValueError, "unknown character with a gait 'biped2d'"):
+            controllers.make(biped, 'world', arena.mjcf_model)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,919 @@
+"""Tests of the three-dimensional part of trl_suite.terrain: figures from the original's description."""
+
+import json
+import math
+import pathlib
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import terrain
+from trl_suite.terrain import noise, spatial
+
+GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
+BOXED = ('blocks3d', 'pillars3d', 'path3d', 'path3d_wide', 'ramp3d', 'stairs3d')
+MOVING = ('conveyor3d', 'conveyor3d_wide', 'dynamic_obstacles3d')
+
+
+def make(source, seed=0, **options):
+    return terrain.Ground(terrain.load(source), seed, **options)
+
+
+def around(source, seeds, xy=None):
+    """Surroundings of characters on grounds of their own."""
+    ground = terrain.load(source)
+    found = terrain.Surroundings(len(seeds), terrain.capacity(ground))
+    xy = np.zeros((len(seeds), 2)) if xy is None else xy
+    for row, seed in enumerate(seeds):
+        found.begin(row, terrain.Ground(ground, seed), xy[row])
+    return found
+
+
+def vertices(low, high):
+    return np.arange(round(low / 0.2), round(high / 0.2) + 1)
+
+
+class NoiseTest(parameterized.TestCase):
+    def test_tile(self):
+        tile = noise.tile()
+        self.assertEqual(tile.shape, (256, 256))
+        self.assertAlmostEqual(tile.min(), 0.0005, delta=5e-5)
+        self.assertAlmostEqual(tile.max(), 0.906, delta=5e-4)
+        self.assertAlmostEqual(tile.mean(), 0.5, delta=1e-6)
+        self.assertAlmostEqual(tile.std(), 0.128, delta=5e-4)
+        np.testing.assert_allclose(tile[0], tile[-1], atol=1e-15)
+        np.testing.assert_allclose(tile[:, 0], tile[:, -1], atol=1e-15)
+        # Gradient noise is 0, here 1/2, at every lattice point; 16 of them span the 255 cells.
+        np.testing.assert_allclose(tile[::51, ::51][[0, -1], 0], 0.5, atol=1e-15)
+
+    def test_octaves(self):
+        # The formula of the original, by plain bilinear interpolation at single points.
+        offset = np.array([0.31, 0.77])
+        x, y = np.array([-31.7, 0.0, 12.3, 400.1]), np.array([-3.3, 55.5])
+        factors = (1, 1.96, 4.03, 7.92, 16.7, 31.12)
+        expected = np.zeros((4, 2))
+        for k, factor in enumerate(factors):
+            for a in range(4):
+                for b in range(2):
+                    u, v = (
+                        ((p * 0.001 * factor) + o) % 1 * 255
+                        for p, o in zip((x[a], y[b]), offset, strict=True)
+                    )
+                    i, j = int(u), int(v)
+                    corner = noise.tile()[i : i + 2, j : j + 2]
+                    weight = np.outer((1 - u + i, u - i), (1 - v + j, v - j))
+                    expected[a, b] += 2 / 2**k * (2 * (corner * weight).sum() - 1)
+        found = noise.grid(x, y, offset, 0.001, 2)
+        np.testing.assert_allclose(found, expected, atol=2e-6)
+        above = [[noise.above(p, q, offset, 0.001) for q in y] for p in x]
+        np.testing.assert_array_equal(above, expected > 0)
+
+
+class ShapeTest(parameterized.TestCase):
+    """The surfaces that are formulas."""
+
+    def points(self, low=-30, high=30, count=4000):
+        return np.random.default_rng(1).uniform(low, high, (2, count))
+
+    @parameterized.parameters('plane', 'flat3d')
+    def test_plane(self, source):
+        np.testing.assert_array_equal(make(source).height(*self.points()), 0)
+
+    @parameterized.parameters(('ramp3d', 0.1), ('rampincline3d', 0.06))
+    def test_ramp(self, source, slope):
+        x, y = self.points()
+        expected = slope * np.sign(x) * np.maximum(0, np.abs(x) - 1)
+        np.testing.assert_allclose(make(source).height(x, y), expected, atol=1e-12)
+
+    def test_checkers(self):
+        i, j = vertices(-20, 20), vertices(-20, 20)
+        x, s = np.meshgrid(i / 5, -j / 5, indexing='ij')
+        expected = 0.05 * ((np.floor(np.abs(x)) + np.floor(np.abs(s))) % 2)
+        np.testing.assert_allclose(make('checkers3d').layout.grid(i, j), expected)
+
+    @parameterized.parameters(
+        ('path3d', 3, 10, 5, 0, -2), ('path3d_wide', 4, 7, 7, 0, -1),
+        ('path3d_straight', 1.5, 10, 0, 0, -1),
+    )  # fmt: skip
+    def test_path(self, source, width, length, shift, height, below):
+        x, y = self.points()
+        s = -y
+        leg = np.floor(x / length)
+        middle = np.where(leg % 2 == 0, 0, shift)
+        on = np.abs(s - middle) < width / 2
+        crossing = np.abs(x - length * np.round(x / length)) < width / 2
+        on |= crossing & (s > -width / 2) & (s < shift + width / 2)
+        np.testing.assert_array_equal(make(source).height(x, y), np.where(on, height, below))
+
+    def test_cliff(self):
+        i, j = vertices(-20, 20), vertices(-20, 20)
+        heights = make('cliff3d').layout.grid(i, j)
+        x, s = np.meshgrid(i / 5, -j / 5, indexing='ij')
+        side = s - 5 * (np.cos(2 * np.pi * x / 12) - 1)
+        share = np.clip(0.5 * (np.abs(side) - 2.5), 0, 1)
+        smooth = np.where(side < -2.5, 2 * share, np.where(side > 2.5, -2 * share, 0))
+        rough = (share > 1e-9) & (share < 1 - 1e-9)
+        still = np.abs(np.abs(side) - 3.5) > 1 + 1e-9
+        np.testing.assert_allclose(heights[still], smooth[still], atol=1e-12)
+        noise_of = (heights - smooth)[rough]
+        self.assertLess(np.abs(noise_of).max(), 0.2)
+        self.assertAlmostEqual(noise_of.std(), 0.2 / math.sqrt(3), delta=0.005)
+        self.assertLess(abs(noise_of.mean()), 0.005)
+        # The same in every episode, and however it is asked for.
+        np.testing.assert_array_equal(heights, make('cliff3d', 9).layout.grid(i, j))
+        np.testing.assert_array_equal(
+            heights[50:70, 80:], make('cliff3d').layout.grid(i[50:70], j[80:])
+        )
+        # To the left the wall rises 2 m, to the right it falls 2 m.
+        np.testing.assert_allclose(make('cliff3d').height([0, 0, 0], [5, 0, -5]), [2, 0, -2])
+
+    def test_stairs(self):
+        x = np.arange(-100, 100, 0.05) + 0.025
+        residues = []
+        for seed in range(20):
+            ground = make('stairs3d', seed)
+            heights = ground.height(x, 0.3)
+            np.testing.assert_allclose(heights[(x > -1) & (x < 1.5)], 0.12 * 0.13154)
+            tread = np.floor(2 * np.sign(x) * np.maximum(0, np.abs(x) - 1))
+            for k in np.unique(tread):
+                self.assertEqual(len(np.unique(heights[tread == k])), 1)
+            first = np.unique(tread, return_index=True)[1]
+            residues.append(((heights - 0.05 * tread) / 0.12)[first][tread[first] != 0])
+            np.testing.assert_array_equal(heights, ground.height(x, 14.0))  # no seam
+        residues = np.concatenate(residues)
+        self.assertBetween(residues.min(), 0, 0.01)
+        self.assertBetween(residues.max(), 0.99, 1)
+        self.assertAlmostEqual(residues.mean(), 0.5, delta=4 / math.sqrt(12 * len(residues)))
+        self.assertAlmostEqual(residues.std(), 1 / math.sqrt(12), delta=0.01)
+
+    def test_hills(self):
+        spread, slopes = [], []
+        i = vertices(-40, 40)
+        for seed in range(40):
+            heights = make('hills3d', seed).layout.grid(i, i)
+            spread.append(np.abs(heights - heights.mean()).max())
+            slopes.append(np.hypot(*np.gradient(heights, 0.2)).mean())
+        self.assertBetween(np.median(spread), 1.0, 2.2)
+        self.assertAlmostEqual(np.mean(slopes), 0.07, delta=0.015)
+
+    def test_grid_is_linear_on_triangles(self):
+        heights = np.array([[0.0, 1.0, 0.0], [4.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+
+        @terrain.register3d('test_grid3d', replace=True)
+        def grid(parameters, rng):
+            return terrain.Layout(level=None, grid=terrain.Grid((0, 0), heights))
+
+        self.addCleanup(spatial._generators.pop, 'test_grid3d')
+        ground = make({'Type': 'test_grid3d'})
+        # The common edge runs from the back left (0, 0.2) to the front right corner (0.2, 0).
+        self.assertAlmostEqual(ground.height(0.1, 0.1), (1 + 4) / 2)
+        self.assertAlmostEqual(ground.height(0.05, 0.05), 0.25 * 1 + 0.25 * 4)
+        self.assertAlmostEqual(ground.height(0.15, 0.15), 2 + 0.25 * (1 - 2) + 0.25 * (4 - 2))
+        self.assertAlmostEqual(ground.height(0.2, 0.2), 2)
+        self.assertAlmostEqual(ground.height(-7.0, 0.1), 0.5)  # the rim goes on
+        self.assertEqual(ground.height(5.0, 500.0), 0)
+
+
+class ObstaclesTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ('blocks3d', 96, (0.5, 7), (1, 5), 0.18), ('pillars3d', 640, (0.75, 0.75), (2, 8), 0.05),
+        ('steps3d', 3200, (0.5, 3), (0.06, 0.14), 0.76),
+    )  # fmt: skip
+    def test_counts_sizes_and_cover(self, source, count, side, height, cover):
+        ground = terrain.load(source)
+        covered = []
+        for seed in range(6):
+            drawn = spatial._Obstacles(ground.parameters(), np.random.default_rng(seed))
+            begin, end, tops = drawn._tile((0, 0))
+            self.assertLen(tops, count)
+            self.assertTrue(((begin >= -40) & (begin <= 40)).all())
+            sides = end - begin
+            self.assertGreaterEqual(sides.min(), side[0] - 1e-9)
+            self.assertLessEqual(sides.max(), side[1] + 1e-9)
+            self.assertGreaterEqual(tops.min(), height[0])
+            self.assertLessEqual(tops.max(), height[1])
+            touching = ((begin <= 2) & (end >= -2)).all(1)
+            self.assertFalse(touching.any())
+            x, y = np.random.default_rng(seed).uniform(-30, 30, (2, 4000))
+            covered.append((terrain.Ground(ground, seed).height(x, y) > 0.03).mean())
+        self.assertAlmostEqual(np.mean(covered), cover, delta=0.25 * cover)
+
+    def test_ground_does_not_depend_on_requests(self):
+        corner = np.array([30.0, -50.0])
+        for source in ('blocks3d', 'pillars3d'):
+            once = make(source, 4).layout.boxes(corner, corner + 30)
+            ground = make(source, 4)
+            ground.layout.boxes(np.array([-200.0, 0.0]), np.array([-100.0, 90.0]))
+            parts = [
+                ground.layout.boxes(np.add(corner, (0, 10 * k)), np.add(corner, (30, 10 * k)))
+                for k in range(4)
+            ]
+            again = ground.layout.boxes(corner, corner + 30)
+            for a, b in zip(once, again, strict=True):
+                np.testing.assert_array_equal(a, b)
+            known = {tuple(p) for p in once.position}
+            self.assertGreater(len(known), 5)
+            for part in parts:
+                self.assertContainsSubset({tuple(p) for p in part.position}, known)
+        steps = [make('steps3d', 4).layout.grid for _ in range(2)]
+        i, j = vertices(30, 50), vertices(-45, -30)
+        steps[1](vertices(-30, 0), j)
+        np.testing.assert_array_equal(steps[0](i, j)[20:50, 30:], steps[1](i[20:50], j[30:]))
+
+    def test_density_goes_on_for_ever(self):
+        ground = make('pillars3d', 1)
+        for corner in ((-300.0, 100.0), (1000.0, -1000.0)):
+            low = np.array(corner)
+            self.assertAlmostEqual(len(ground.layout.boxes(low, low + 80).top), 650, delta=40)
+
+    def test_later_rubble_wins(self):
+        drawn = spatial._Obstacles(terrain.load('steps3d').parameters(), np.random.default_rng(0))
+        begin, end, tops = drawn._tile((0, 0))
+        grid = spatial._rubble(drawn)
+        i = vertices(5, 9)
+        heights = grid(i, i)
+        for a, b in ((0, 0), (7, 11), (20, 3), (13, 13)):
+            point = np.array([i[a], i[b]]) * 0.2
+            over = np.flatnonzero(((begin <= point) & (end >= point)).all(1))
+            self.assertEqual(heights[a, b], tops[over[-1]] if len(over) else 0)
+
+
+class TrailTest(parameterized.TestCase):
+    def trails(self, source, count=30):
+        for seed in range(count):
+            trail = make(source, seed).layout.trail
+            trail.extend(200)
+            yield trail
+
+    @parameterized.parameters(
+        ('trail3d1', 1, 2, 1.0), ('trail3d2', 2, 3, 1.5), ('trail3d', 1.6, 1.6, 1.5),
+        ('trail3d_wide', 2, 3, 0.5),
+    )  # fmt: skip
+    def test_segments(self, source, narrowest, widest, turn):
+        turns, narrow, headings = [], [], []
+        for trail in self.trails(source):
+            np.testing.assert_allclose(trail.start[:2], [(-1.25, 0), (0.75, 0)])
+            np.testing.assert_allclose(np.linalg.norm(trail.end - trail.start, axis=1), 2)
+            np.testing.assert_allclose(trail.start[1:], trail.end[:-1], atol=1e-12)
+            self.assertGreaterEqual(trail.width.min(), narrowest)
+            self.assertLessEqual(trail.width.max(), widest)
+            change = np.diff(trail.heading)[1:]
+            turns.append(change)
+            narrow.append(trail.width[2:] < narrowest + 0.25 * (widest - narrowest))
+            headings.append(trail.heading)
+            if source != 'trail3d2':
+                np.testing.assert_array_equal(trail.height, 0)
+        turns, narrow, headings = map(np.concatenate, (turns, narrow, headings))
+        self.assertBetween(np.abs(turns[~narrow]).max(), 0.98 * turn, turn)
+        if narrow.any():
+            self.assertBetween(np.abs(turns[narrow]).max(), 0.45 * turn, 0.5 * turn)
+        # Straight on is no preferred direction within 1 rad; further off the trail is led back.
+        self.assertAlmostEqual((turns > 0).mean(), 0.5, delta=0.03)
+        self.assertLess(np.abs(headings).max(), 0.6 * np.pi + turn)
+
+    def test_led_back(self):
+        before, turns = [], []
+        for trail in self.trails('trail3d'):
+            before.append(trail.heading[1:-1])
+            turns.append(np.diff(trail.heading)[1:])
+        before, turns = np.concatenate(before), np.concatenate(turns)
+        for heading in (1.2, 1.5, 1.8):
+            near = np.abs(np.abs(before) - heading) < 0.1
+            back = (np.sign(turns) != np.sign(before))[near].mean()
+            expected = 0.5 * (1 + (heading - 1) / (0.6 * np.pi - 1))
+            self.assertAlmostEqual(back, expected, delta=0.07)
+
+    def test_steps_of_the_trail(self):
+        changes = np.concatenate([np.diff(t.height) for t in self.trails('trail3d2')])
+        stepped = changes != 0
+        self.assertAlmostEqual(stepped.mean(), 0.5, delta=0.03)
+        self.assertBetween(np.abs(changes[stepped]).min(), 0.1, 0.102)
+        self.assertBetween(np.abs(changes[stepped]).max(), 0.198, 0.2)
+        self.assertAlmostEqual((changes[stepped] > 0).mean(), 0.5, delta=0.04)
+
+    def test_wide_enough_on_high_ground(self):
+        low, high = [], []
+        for seed in range(30):
+            trail = make('trail3d1', seed).layout.trail
+            trail.extend(100)
+            for k in range(2, 100):
+                x, y = trail.start[k]
+                above = noise.above(x, -y, trail.offset, 0.005)
+                (high if above else low).append(trail.width[k])
+        self.assertGreaterEqual(min(high), 1.25)
+        self.assertLess(min(low), 1.05)
+
+    def test_surroundings_of_the_trail(self):
+        heights, on = [], []
+        for seed in range(30):
+            ground = make('trail3d1', seed)
+            i = vertices(-16, 16)
+            grid = ground.layout.grid(i, i)
+            heights.append(grid[np.abs(grid) > 1e-6])
+            trail = ground.layout.trail
+            middle = 0.5 * (trail.start + trail.end)[:6]
+            on.append(ground.height(*middle.T))
+        heights = np.concatenate(heights)
+        self.assertAlmostEqual(heights.std(), 1.5, delta=0.3)
+        self.assertAlmostEqual(heights.mean(), -1, delta=0.5)
+        np.testing.assert_array_equal(np.concatenate(on), 0)
+
+    def test_painted_within_half_the_width(self):
+        ground = make('trail3d1', 3)
+        i = vertices(-4, 12)
+        grid = ground.layout.grid(i, i)
+        trail = ground.layout.trail
+        x, y = np.meshgrid(i * 0.2, i * 0.2, indexing='ij')
+        inside = np.zeros(grid.shape, bool)
+        for start, end, width in zip(trail.start, trail.end, trail.width, strict=True):
+            way = end - start
+            t = np.clip(((x - start[0]) * way[0] + (y - start[1]) * way[1]) / 4, 0, 1)
+            inside |= np.hypot(x - start[0] - t * way[0], y - start[1] - t * way[1]) <= width / 2
+        np.testing.assert_array_equal(grid == 0, inside)
+
+    def test_does_not_depend_on_requests(self):
+        one, other = make('trail3d2', 8), make('trail3d2', 8)
+        i, j = vertices(8, 16), vertices(-8, 8)
+        other.layout.grid(vertices(60, 80), vertices(-10, 10))
+        np.testing.assert_array_equal(one.layout.grid(i, j), other.layout.grid(i, j))
+
+
+class MovingTest(parameterized.TestCase):
+    def test_moving_boxes(self):
+        movers = [make('dynamic_obstacles3d', seed).layout.movers for seed in range(60)]
+        speed = np.concatenate([m.speed for m in movers])
+        self.assertLen(speed, 3000)
+        self.assertBetween(speed.min(), 0.2, 0.2001)
+        self.assertBetween(speed.max(), 1.2, 1.3)
+        self.assertAlmostEqual(np.median(speed), 0.25, delta=0.01)
+        self.assertAlmostEqual(speed.mean(), 0.38, delta=0.02)
+        self.assertAlmostEqual(np.quantile(speed, 0.9), 0.79, delta=0.05)
+        for name, low, high in (
+            ('start', -20, 20), ('end', -20, 20), ('half_size', 0.25, 0.5), ('height', 0.5, 2),
+            ('phase', 0, 1),
+        ):  # fmt: skip
+            values = np.concatenate([getattr(m, name).ravel() for m in movers])
+            self.assertBetween(values.min(), low, low + 0.02 * (high - low))
+            self.assertBetween(values.max(), high - 0.02 * (high - low), high)
+        direction = np.concatenate([m.direction for m in movers])
+        self.assertAlmostEqual((direction > 0).mean(), 0.5, delta=0.04)
+
+    def test_boxes_go_to_and_fro(self):
+        found = around('dynamic_obstacles3d', [3])
+        movers = found.grounds[0].layout.movers
+        far, dt = np.full((1, 2), 1000.0), 1 / 30
+        ways = [found.way[0].copy()]
+        for _ in range(6000):
+            found.advance(dt, far)
+            ways.append(found.way[0].copy())
+        ways = np.array(ways)
+        step = movers.speed * dt
+        self.assertTrue((ways >= -step - 1e-9).all())
+        self.assertTrue((ways <= movers.length + step + 1e-9).all())
+        np.testing.assert_allclose(np.abs(np.diff(ways, axis=0)) / step, 1, atol=1e-6)
+        # Between turns a triangle wave: after a whole period where they were, but for the steps.
+        period = 2 * movers.length / (movers.speed * dt)
+        k = int(np.argmin(np.abs(period - np.round(period)) + 1e6 * (period > 5000)))
+        self.assertAlmostEqual(ways[round(period[k]), k], ways[0, k], delta=4 * step[k])
+
+    def test_boxes_near_a_character_go_straight_on(self):
+        found = around('dynamic_obstacles3d', [3])
+        movers = found.grounds[0].layout.movers
+        k = int(np.argmax(movers.speed))
+        for _ in range(2000):
+            xy = found.centres()[0, k][None] + 4.9  # beyond 5 m: diagonal
+            found.advance(1 / 30, xy)
+        self.assertBetween(found.way[0, k], 0 - 0.1, movers.length[k] + 0.1)
+        for _ in range(3000):
+            xy = found.centres()[0, k][None] + (4.9, 0)
+            found.advance(1 / 30, xy)
+        self.assertGreater(abs(found.way[0, k] - 0.5 * movers.length[k]), movers.length[k])
+        found.advance(1 / 30, found.centres()[0, k][None] + (5.1, 0))
+        sign = -1 if found.way[0, k] > 0 else 1
+        self.assertEqual(found.direction[0, k], sign)
+
+    def test_conveyors(self):
+        signs = []
+        for seed in range(40):
+            belts = make('conveyor3d', seed).layout.belts
+            middle, half = belts.boxes.position, belts.boxes.half_size
+            np.testing.assert_allclose(middle[:, 0], [4, 9, 14, 19])
+            np.testing.assert_allclose(middle[:, 1], 0)
+            np.testing.assert_allclose(half, [(1, 50)] * 4)
+            np.testing.assert_allclose(belts.boxes.top, 0.01)
+            np.testing.assert_array_equal(belts.velocity[:, 0], 0)
+            np.testing.assert_allclose(np.abs(belts.velocity[:, 1]), 0.4)
+            signs.append(belts.velocity[:, 1] > 0)
+        self.assertAlmostEqual(np.mean(signs), 0.5, delta=0.13)
+        wide = make('conveyor3d_wide', 1).layout.belts
+        np.testing.assert_allclose(wide.boxes.position, [(5.5, 0)])
+        np.testing.assert_allclose(wide.boxes.half_size, [(2.5, 7.5)])
+        np.testing.assert_allclose(np.abs(wide.velocity[0, 1]), 0.6)
+
+    def test_velocity_of_what_is_on_top(self):
+        ground = make('conveyor3d_wide', 1)
+        speed = ground.layout.belts.velocity[0, 1]
+        velocity = ground.velocity([2.9, 3.1, 5.0, 5.0], [0, 0, 7.4, 7.6])
+        np.testing.assert_allclose(velocity, [(0, 0), (0, speed), (0, speed), (0, 0)])
+        np.testing.assert_allclose(ground.height([2.9, 3.1], [0, 0]), [0, 0.01])
+        ground = make('dynamic_obstacles3d', 1)
+        movers = ground.layout.movers
+        middle = movers.start + movers.phase[:, None] * (movers.end - movers.start)
+        heights, velocity = ground.height(*middle.T), ground.velocity(*middle.T)
+        over = np.abs(middle[:, None] - middle) <= movers.half_size
+        top = np.where(over.all(2), movers.height, -1)
+        np.testing.assert_array_equal(heights, top.max(1))
+        best = top.argmax(1)
+        expected = ((movers.end - movers.start) / movers.length[:, None])[best]
+        expected *= (movers.speed * movers.direction)[best][:, None]
+        np.testing.assert_allclose(velocity, expected)
+
+
+class GroundTest(parameterized.TestCase):
+    """Seeds, states, spawn and goals."""
+
+    @parameterized.parameters(*GRIDS, *BOXED, *MOVING)
+    def test_seeds(self, source):
+        x, y = np.random.default_rng(0).uniform(-15, 15, (2, 800))
+        first = make(source, 5).height(x, y)
+        np.testing.assert_array_equal(first, make(source, 5).height(x, y))
+        sequence = np.random.SeedSequence(5)
+        np.testing.assert_array_equal(first, make(source, sequence).height(x, y))
+        self.assertEqual(sequence.n_children_spawned, 0)
+        differs = not np.array_equal(first, make(source, 6).height(x, y))
+        if source in MOVING:
+            flows = [make(source, seed).velocity(x, y) for seed in range(8)]
+            differs = any(not np.array_equal(flow, flows[0]) for flow in flows)
+        drawn = source not in ('cliff3d', 'checkers3d', 'ramp3d', 'path3d', 'path3d_wide')
+        self.assertEqual(differs, drawn)
+
+    @parameterized.parameters(*GRIDS, *BOXED, *MOVING)
+    def test_state(self, source):
+        ground = make(source, np.random.SeedSequence(5).spawn(3)[2])
+        x, y = np.random.default_rng(0).uniform(-15, 15, (2, 400))
+        for other in (
+            terrain.Ground.from_state(pickle.loads(pickle.dumps(ground.state()))),
+            pickle.loads(pickle.dumps(ground)),
+        ):
+            np.testing.assert_array_equal(other.height(x, y), ground.height(x, y))
+            np.testing.assert_array_equal(other.velocity(x, y), ground.velocity(x, y))
+            self.assertEqual(
+                other.spawn(np.random.default_rng(3)), ground.spawn(np.random.default_rng(3))
+            )
+
+    def test_same_ground_in_another_process(self):
+        code = (
+            'from trl_suite import terrain as t; '
+            'print([t.Ground(t.load(n), 7).height([9.1, -9.1], [3.2, 3.2]).tolist() for n in '
+            "('trail3d2', 'steps3d', 'stairs3d', 'pillars3d')])"
+        )
+        root = pathlib.Path(terrain.__file__).parents[2]
+        output = subprocess.run(
+            [sys.executable, '-c', code], cwd=root, capture_output=True, text=True, check=True
+        ).stdout
+        here = [
+            make(name, 7).height([9.1, -9.1], [3.2, 3.2]).tolist()
+            for name in ('trail3d2', 'steps3d', 'stairs3d', 'pillars3d')
+        ]
+        self.assertEqual(json.loads(output), here)
+
+    @parameterized.parameters('blocks3d', 'pillars3d')
+    def test_spawn_among_obstacles(self, source):
+        rng = np.random.RandomState(0)
+        places = []
+        for seed in range(15):
+            ground = make(source, seed)
+            for _ in range(10):
+                x, y, heading = ground.spawn(rng)
+                places.append((x, y, heading))
+                goal = ground.goal(rng, (x, y))
+                self.assertEqual(goal[2], 0)
+                for place in ((x, y), goal[:2]):
+                    self.assertLessEqual(np.abs(place).max(), 24)
+                    inside = place + np.random.default_rng(seed).uniform(-1, 1, (50, 2))
+                    np.testing.assert_array_equal(ground.height(*inside.T), 0)
+        self.assertGreater(np.abs(places).max(0)[0], 20)
+        self.assertBetween(np.max(places, 0)[2], 2.9, np.pi)
+        self.assertBetween(np.min(places, 0)[2], -np.pi, -2.9)
+
+    @parameterized.parameters(*MOVING)
+    def test_spawn_among_moving_things(self, source):
+        rng = np.random.default_rng(0)
+        for seed in range(20):
+            ground = make(source, seed)
+            x, y, _ = ground.spawn(rng)
+            goal = ground.goal(rng, (x, y))
+            for place, room in (((x, y), 1.0), (goal[:2], 0.25)):
+                self.assertLessEqual(np.abs(place).max(), 12)
+                inside = place + rng.uniform(-room, room, (50, 2))
+                np.testing.assert_array_equal(ground.height(*inside.T), 0)
+
+    def test_goal_keeps_clear_of_boxes_as_they_stand(self):
+        ground, rng = make('dynamic_obstacles3d', 2), np.random.default_rng(0)
+        centres = rng.uniform(-3, 3, (50, 2))
+        for _ in range(30):
+            goal = ground.goal(rng, (0, 0), movers=centres)
+            self.assertEqual(ground.height(*goal[:2], centres), 0)
+
+    def test_spawn_on_a_trail(self):
+        rng = np.random.default_rng(0)
+        for seed in range(20):
+            ground = make('trail3d1', seed)
+            x, y, heading = ground.spawn(rng)
+            self.assertLess(max(abs(x), abs(y)), 39)
+            self.assertEqual(ground.height(x, y), 0)
+            trail = ground.layout.trail
+            across = (trail.start - (x, y)) @ (-math.sin(heading), math.cos(heading))
+            same = np.abs(trail.heading - heading) < 1e-12
+            self.assertLess(np.abs(across[same]).min(), 1e-9)
+            nearest = np.linalg.norm(0.5 * (trail.start + trail.end) - (x, y), axis=1).argmin()
+            for rule, most in (('hike', 10), ('step', 1)):
+                goal = ground.goal(rng, (x, y), rule)
+                ahead = [
+                    k
+                    for k in range(nearest + 1, nearest + most + 1)
+                    if self.along(trail, k, goal) and self.aside(trail, k, goal) <= 0.4 + 1e-9
+                ]
+                self.assertNotEmpty(ahead)
+                self.assertEqual(goal[2], ground.height(*goal[:2]))  # at the rim it may be lower
+
+    def along(self, trail, k, goal):
+        way = trail.end[k] - trail.start[k]
+        return -1e-9 <= (goal[:2] - trail.start[k]) @ way / 4 <= 1 + 1e-9
+
+    def aside(self, trail, k, goal):
+        heading = trail.heading[k]
+        offset = (goal[:2] - trail.start[k]) @ (-math.sin(heading), math.cos(heading))
+        return abs(offset) / trail.width[k]
+
+    @parameterized.parameters('plane', 'hills3d', 'ramp3d', 'stairs3d', 'path3d', 'steps3d')
+    def test_spawn_at_the_start(self, source):
+        ground, rng = make(source), np.random.RandomState(1)
+        self.assertEqual(ground.spawn(rng), (0.0, 0.0, 0.0))
+        hikes = np.array([ground.goal(rng, (5.0, 7.0)) for _ in range(200)])
+        self.assertBetween(np.abs(hikes[:, :2] - (5, 7)).max(), 2.9, 3)
+        np.testing.assert_allclose(hikes[:, 2], ground.height(hikes[:, 0], hikes[:, 1]), atol=1e-6)
+        steps = np.array([ground.goal(rng, (5.0, 7.0), 'step', distance=0.5) for _ in range(200)])
+        np.testing.assert_array_equal(steps[:, 1], 0)
+        self.assertBetween(steps[:, 0].min() - 5, 0.5, 0.6)
+        self.assertBetween(steps[:, 0].max() - 5, 2.9, 3)
+        with self.assertRaisesRegex(ValueError, 'rule'):
+            ground.goal(rng, (0, 0), 'walk')
+
+    def test_points_far_apart(self):
+        for source in ('pillars3d', 'hills3d', 'stairs3d', 'trail3d1', 'dynamic_obstacles3d'):
+            ground = make(source)
+            x, y = np.array([(0.0, 3.0, -999_999.0, 5.0), (2.0, 9.0, 8.0, 999_999.0)])
+            heights, velocity = ground.height(x, y), ground.velocity(x, y)
+            for k in range(4):
+                self.assertEqual(heights[k], ground.height(x[k], y[k]))
+                np.testing.assert_array_equal(velocity[k], ground.velocity(x[k], y[k]))
+
+    def test_crowded_ground_does_not_hang(self):
+        crowd = {'Type': 'dynamic_obstacles3d', 'Params': [
+            {'NumObstacles': 100, 'ObstacleWidth0': 30, 'ObstacleWidth1': 30}]}  # fmt: skip
+        self.assertEqual(make(crowd).spawn(np.random.default_rng(0))[:2], (0, 0))
+
+    def test_refuses(self):
+        with self.assertRaisesRegex(ValueError, 'hills3d.*three-dimensional'):
+            terrain.Strip(terrain.load('hills3d'), 0)
+        with self.assertRaisesRegex(ValueError, 'gaps.*planar'):
+            terrain.Ground(terrain.load('gaps'), 0)
+        with self.assertRaisesRegex(TypeError, 'seed'):
+            make('hills3d', 1.5)
+        with self.assertRaisesRegex(ValueError, 'finite'):
+            make('hills3d').height(0.0, math.nan)
+        with self.assertRaisesRegex(ValueError, 'blend'):
+            make('hills3d', blend=math.nan)
+
+
+class FileTest(parameterized.TestCase):
+    @parameterized.parameters(*terrain.PRESETS3D)
+    def test_preset(self, name):
+        ground = terrain.load(name)
+        self.assertTrue(ground.spatial)
+        self.assertEqual(ground.name, name)
+        self.assertEqual(pickle.loads(pickle.dumps(ground)), ground)
+        self.assertTrue(np.isfinite(terrain.Ground(ground, 0).height(3.0, 1.0)))
+
+    def test_presets_that_environments_use(self):
+        self.assertContainsSubset(
+            {'plane', 'obstacles3d', 'pillars3d', 'dynamic_obstacles3d', 'conveyor3d',
+             'conveyor3d_wide', 'trail3d1', 'trail3d2', 'trail3d_wide', 'hills3d', 'ramp3d',
+             'stairs3d', 'steps3d', 'checkers3d', 'checkers_3d'},
+            terrain.PRESETS3D.keys(),
+        )  # fmt: skip
+        self.assertFalse(terrain.load('gaps').spatial)
+        self.assertNoCommonElements(terrain.PRESETS, terrain.PRESETS3D)
+
+    def test_files_of_the_original_with_entries_without_effect(self):
+        belts = {'Type': 'conveyor3d', 'Params': [
+            {'ObstacleWidth0': 2, 'ObstacleWidth1': 2, 'ObstacleSpeed0': 0.4, 'ObstacleSpeed1': 0.4,
+             'ObstacleSpeedLerpPow': 3, 'ConveyorStripLength': 100, 'ConveyorNumStrips': 4,
+             'ConveyorNumSlices': 10, 'ConveyorSpacing': 3}]}  # fmt: skip
+        for key, values in terrain.load('conveyor3d').parameters().items():
+            self.assertEqual(terrain.load(belts).parameters()[key], values)
+        terrain.load({'Type': 'trail3d', 'Params': [{'PathLength': 10, 'PathTurnLength': 5}]})
+        terrain.load({'Type': 'var3d_stairs', 'Params': [{'StepSpacingMin': 1}]})
+        terrain.load({'Type': 'var3d_flat', 'GroundWidth': 20, 'VertSpacingX': 0.2})
+
+    @parameterized.parameters(
+        ({'Type': 'hill3d'}, 'hills3d'),
+        ({'Type': 'hills3d', 'Params': [{'Height': 2}]}, 'has none'),
+        ({'Type': 'var3d_ramp', 'Params': [{'Slop': 2}]}, "'Slope'"),
+        ({'Type': 'var3d_ramp', 'Params': [{'PathLength': 2}]}, 'no effect in var3d_ramp'),
+        ({'Type': 'obstacles3d', 'Params': [{'ObstacleDensity': 100}]}, 'from 0 to 2'),
+        ({'Type': 'obstacles3d', 'Params': [{'ObstacleWidth0': -1}]}, 'from 0'),
+        ({'Type': 'conveyor3d', 'Params': [{'ObstacleSpeed0': 0}]}, 'ObstacleSpeed0'),
+        ({'Type': 'trail3d', 'Params': [{'PathMaxTurnDelta': 3}]}, 'from 0 to 2'),
+        ({'Type': 'trail3d', 'Params': [{'StepHeightMin': 3}]}, 'above StepHeightMax'),
+        ({'Type': 'hills3d', 'VertSpacingX': 0.1}, 'VertSpacingX must be 0.2'),
+    )  # fmt: skip
+    def test_refused(self, content, message):
+        with self.assertRaisesRegex(ValueError, message):
+            terrain.load(content)
+
+    def test_unknown_name(self):
+        with self.assertRaisesRegex(ValueError, "'pillars3d'"):
+            terrain.load('pilars3d')
+
+    def test_blend(self):
+        mixed = {
+            'Type': 'conveyor3d',
+            'Params': [{'ConveyorNumStrips': 1}, {'ConveyorNumStrips': 4}],
+        }
+        counts = [
+            len(make(mixed, 0, blend=blend).layout.belts.velocity) for blend in (0, 0.5, 0.7, 1)
+        ]
+        self.assertEqual(counts, [1, 2, 3, 4])
+        self.assertEqual(terrain.capacity(terrain.load(mixed)).belts, 4)
+
+
+class RegisterTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        before = dict(spatial._generators)
+        self.addCleanup(spatial._generators.update, before)
+        self.addCleanup(spatial._generators.clear)
+
+    def test_new_type(self):
+        @terrain.register3d('turned3d', {'YawMin': 0.2, 'YawMax': 0.4})
+        def turned(parameters, rng):
+            yaw = rng.uniform(parameters['YawMin'], parameters['YawMax'])
+            blocks = terrain.boxes(
+                [(3, 0), (-4, 2)], (2, 1), top=(0.5, 0.4), yaw=yaw, slope=(0.1, 0)
+            )
+            belts = terrain.Belts(
+                terrain.boxes([(0, 6)], (3, 1), 0.2, yaw=0.3), np.array([(0.5, 0.2)])
+            )
+            return terrain.Layout(boxes=blocks, belts=belts)
+
+        source = {'Type': 'turned3d', 'Params': [{'YawMax': 0.5}]}
+        found = around(source, range(4))
+        rng = np.random.default_rng(0)
+        x, y = rng.uniform(-8, 8, (2, 4, 2000))
+        heights, velocity = found.height(x, y), found.velocity(x, y)
+        for row, ground in enumerate(found.grounds):
+            np.testing.assert_allclose(heights[row], ground.height(x[row], y[row]), atol=1e-12)
+            np.testing.assert_array_equal(velocity[row], ground.velocity(x[row], y[row]))
+            self.assertGreater(np.ptp(heights[row][heights[row] > 0.41]), 0.2)  # the slope
+            area = (heights[row] > 0.45).mean() * 256
+            self.assertBetween(area, 3, 6)
+            self.assertAlmostEqual(velocity[row].any(1).mean() * 256, 12, delta=3)
+        self.assertFalse(
+            np.array_equal(found.height(x[:1].repeat(4, 0), y[:1].repeat(4, 0))[0], heights[1])
+        )
+
+    def test_taken_name(self):
+        with self.assertRaisesRegex(ValueError, 'hills3d'):
+            terrain.register3d('hills3d')
+
+    @parameterized.parameters(
+        (lambda: np.zeros(3), 'must return a Layout'),
+        (lambda: terrain.Layout(level=None), 'a level, a grid or boxes'),
+        (lambda: terrain.Layout(level=math.nan), 'level is not finite'),
+        (lambda: terrain.Layout(place='top'), 'place'),
+        (lambda: terrain.Layout(place='trail'), 'no trail'),
+        (lambda: terrain.Layout(boxes=terrain.boxes([(0, math.inf)], 1, 1)), 'boxes.position'),
+        (lambda: terrain.Layout(grid=terrain.Grid((0, 0), np.full((2, 2), np.nan))), 'grid'),
+    )
+    def test_bad_generator(self, generate, message):
+        terrain.register3d('mine3d')(lambda parameters, rng: generate())
+        with self.assertRaisesRegex(ValueError, f"'mine3d'.*{message}"):
+            make({'Type': 'mine3d'})
+
+    @parameterized.parameters(
+        ({'grid': lambda i, j: np.zeros(3)}, r'finite heights of shape .* \(3,\)'),
+        ({'grid': lambda i, j: np.full((len(i), len(j)), np.nan)}, 'finite heights'),
+        ({'boxes': lambda low, high: None}, 'finite Boxes'),
+        ({'boxes': lambda low, high: terrain.boxes([(0, 0)], 1, math.nan)}, 'finite Boxes'),
+    )
+    def test_bad_functions(self, parts, message):
+        terrain.register3d('mine3d')(lambda parameters, rng: terrain.Layout(**parts))
+        ground = make({'Type': 'mine3d'})
+        with self.assertRaisesRegex(ValueError, message):
+            ground.height(0, 0)
+
+    def test_kinds_that_come_and_go(self):
+        @terrain.register3d('moody3d')
+        def moody(parameters, rng):
+            return terrain.Layout(level=None, grid=lambda i, j: np.zeros((len(i), len(j))))
+
+        ground = terrain.load({'Type': 'moody3d'})
+        holds = terrain.capacity(ground)
+        terrain.register3d('moody3d', replace=True)(lambda parameters, rng: terrain.Layout())
+        with self.assertRaisesRegex(ValueError, 'moody3d.*same kinds'):
+            terrain.Surroundings(1, holds).begin(0, terrain.Ground(ground, 0))
+
+
+class SurroundingsTest(parameterized.TestCase):
+    """Windows over a batch axis."""
+
+    @parameterized.parameters(*GRIDS, *BOXED, *MOVING, 'plane')
+    def test_equals_the_grounds(self, source):
+        rng = np.random.default_rng(0)
+        xy = rng.uniform(-30, 30, (5, 2))
+        found = around(source, range(5), xy)
+        x, y = (
+            xy[:, :1] + rng.uniform(-12, 12, (5, 600)),
+            xy[:, 1:] + rng.uniform(-12, 12, (5, 600)),
+        )
+        heights, velocity = found.height(x, y), found.velocity(x, y)
+        for row, ground in enumerate(found.grounds):
+            np.testing.assert_allclose(heights[row], ground.height(x[row], y[row]), atol=2e-6)
+            np.testing.assert_array_equal(velocity[row], ground.velocity(x[row], y[row]))
+        rows = np.array([1, 4])
+        np.testing.assert_array_equal(found.height(x[rows], y[rows], rows), heights[rows])
+        np.testing.assert_array_equal(found.height(x[2:3], y[2:3], slice(2, 3)), heights[2:3])
+        np.testing.assert_array_equal(found.velocity(x[rows], y[rows], rows), velocity[rows])
+
+    def samples(self, xy, heading):
+        """Points of maps, one by one, in the order of the original."""
+        points = np.zeros((len(xy), 1024, 2))
+        for row, (root, psi) in enumerate(zip(xy, heading, strict=True)):
+            for v in range(32):
+                for u in range(32):
+                    forward, right = -1 + 11 * u / 31, -5.5 + 11 * v / 31
+                    points[row, 32 * v + u] = (
+                        root
+                        + forward * np.array([np.cos(psi), np.sin(psi)])
+                        + right * np.array([np.sin(psi), -np.cos(psi)])
+                    )
+        return points
+
+    @parameterized.parameters(*GRIDS, *BOXED, *MOVING, 'plane')
+    def test_maps_equal_direct_queries(self, source):
+        rng = np.random.default_rng(2)
+        count = 19  # more than are handled at once
+        xy = np.add(rng.uniform(-10, 10, (count, 2)), (4, 0))
+        found = around(source, range(count), xy)
+        if source == 'dynamic_obstacles3d':
+            for _ in range(100):
+                found.advance(0.2, xy)
+        heading = rng.uniform(-np.pi, np.pi, count)
+        points = self.samples(xy, heading)
+        heights = found.height_map(xy, heading)
+        velocities = found.velocity_map(xy, heading)
+        self.assertEqual((heights.shape, velocities.shape), ((count, 1024), (count, 2048)))
+        differing = 0
+        for row, ground in enumerate(found.grounds):
+            centres = found.centres()[row] if found.capacity.movers else None
+            direction = found.direction[row] if found.capacity.movers else None
+            under = ground.height(*xy[row], centres)
+            expected = ground.height(*points[row].T, centres) - under
+            # Within rounding of an edge of a box either side may be taken.
+            off = np.abs(heights[row] - expected) > 3e-6
+            differing += off.sum()
+            flow = ground.velocity(*points[row].T, centres, direction)
+            flow = flow - ground.velocity(*xy[row], centres, direction)
+            cosine, sine = np.cos(heading[row]), np.sin(heading[row])
+            forward = flow @ (cosine, sine)
+            right = flow @ (sine, -cosine)
+            np.testing.assert_allclose(velocities[row, :1024][~off], forward[~off], atol=1e-12)
+            np.testing.assert_allclose(velocities[row, 1024:][~off], right[~off], atol=1e-12)
+        self.assertLessEqual(differing, 2)
+        self.assertEqual(bool(velocities.any()), source in MOVING)
+        rows = np.array([0, 7, 18])
+        np.testing.assert_array_equal(
+            found.height_map(xy[rows], heading[rows], rows), heights[rows]
+        )
+        np.testing.assert_array_equal(
+            found.velocity_map(xy[rows], heading[rows], rows), velocities[rows]
+        )
+        out = np.zeros((count, 3072))
+        found.height_map(xy, heading, out=out[:, :1024])
+        found.velocity_map(xy, heading, out=out[:, 1024:])
+        np.testing.assert_array_equal(out[:, :1024], heights)
+        np.testing.assert_array_equal(out[:, 1024:], velocities)
+
+    def test_order_of_the_map(self):
+        # On a ramp the height tells how far ahead a sample lies.
+        found = around('ramp3d', [0], np.array([(20.0, 0.0)]))
+        heights = found.height_map(np.array([(20.0, 0.0)]), np.zeros(1))[0].reshape(32, 32)
+        np.testing.assert_allclose(heights[0], 0.1 * np.linspace(-1, 10, 32), atol=1e-12)
+        np.testing.assert_allclose(heights, heights[:1].repeat(32, 0), atol=1e-12)
+        # Looking along +y: ahead is level, the first line of samples lies to the left, down the slope.
+        heights = found.height_map(np.array([(20.0, 0.0)]), np.full(1, np.pi / 2))[0].reshape(
+            32, 32
+        )
+        np.testing.assert_allclose(heights[:, 5], 0.1 * np.linspace(-5.5, 5.5, 32), atol=1e-12)
+
+    def test_belt_in_a_map(self):
+        found = around('conveyor3d_wide', [1], np.array([(2.0, 0.0)]))
+        speed = found.grounds[0].layout.belts.velocity[0, 1]  # to the left
+        velocities = found.velocity_map(np.array([(2.0, 0.0)]), np.zeros(1))[0].reshape(2, 32, 32)
+        on = (np.linspace(-1, 10, 32) + 2 >= 3) & (np.linspace(-1, 10, 32) + 2 <= 8)
+        np.testing.assert_array_equal(velocities[0], 0)
+        np.testing.assert_allclose(velocities[1], np.where(on, -speed, 0)[None].repeat(32, 0))
+        # Standing on the belt, the ground beside it runs the other way.
+        found.follow(np.array([(4.0, 0.0)]))
+        velocities = found.velocity_map(np.array([(4.0, 0.0)]), np.zeros(1))[0].reshape(2, 32, 32)
+        on = (np.linspace(-1, 10, 32) + 4 >= 3) & (np.linspace(-1, 10, 32) + 4 <= 8)
+        np.testing.assert_allclose(velocities[1], np.where(on, 0, speed)[None].repeat(32, 0))
+
+    @parameterized.parameters(
+        'hills3d', 'pillars3d', 'stairs3d', 'trail3d1', 'path3d', 'conveyor3d'
+    )
+    def test_windows_follow(self, source):
+        found = around(source, [0, 1])
+        rng = np.random.default_rng(0)
+        xy = np.zeros((2, 2))
+        laid = []
+        for _ in range(120):
+            xy = xy + rng.uniform(-0.5, 1.5, (2, 2)) * (1, 0.4)
+            laid += found.follow(xy)
+            self.assertLessEqual(np.abs(found.centre - xy).max(), 4)
+            x, y = (
+                xy[:, :1] + rng.uniform(-11.4, 11.4, (2, 9)),
+                xy[:, 1:] + rng.uniform(-11.4, 11.4, (2, 9)),
+            )
+            for row, ground in enumerate(found.grounds):
+                np.testing.assert_allclose(
+                    found.height(x, y)[row], ground.height(x[row], y[row]), atol=2e-6
+                )
+        self.assertBetween(len(laid), 20, 60)
+        # Only the rows that are given, and a jump.
+        self.assertEqual(found.follow(np.array([(999.0, -3.0)]), np.array([1])), [1])
+        self.assertEqual(
+            found.height(np.array([[999.0]]), np.array([[-3.0]]), np.array([1])).shape, (1, 1)
+        )
+
+    def test_nothing_to_follow_on_a_plane(self):
+        found = around('plane', [0])
+        self.assertFalse(found.windowed)
+        self.assertEqual(found.follow(np.full((1, 2), 1e5)), [])
+        self.assertEqual(found.height(np.full((1, 1), 1e5), np.zeros((1, 1))), 0)
+
+    def test_beyond_the_window_the_rim(self):
+        for source in ('hills3d', 'pillars3d'):
+            found = around(source, [0])
+            heights = found.height(np.array([[1e12, -1e12, 1e300]]), np.zeros((1, 3)))
+            self.assertTrue(np.isfinite(heights).all())
+
+    @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d', 'trail3d2')
+    def test_state(self, source):
+        found = around(source, [0, 1])
+        xy = np.array([(9.0, 3.0), (-7.0, 1.0)])
+        found.follow(xy)
+        for _ in range(50):
+            found.advance(0.1, xy)
+        state = pickle.loads(pickle.dumps(found.state(1)))
+        other = around(source, [5, 6, 7])
+        other.restore(2, state)
+        for part in ('way', 'direction', 'centre'):
+            np.testing.assert_array_equal(getattr(other, part)[2], getattr(found, part)[1])
+        x, y = xy[1:, :1] + np.linspace(-8, 8, 50), xy[1:, 1:] + np.linspace(-8, 8, 50)
+        rows = np.array([1])
+        np.testing.assert_array_equal(other.height(x, y, rows + 1), found.height(x, y, rows))
+        empty = terrain.Surroundings(1, found.capacity)
+        empty.restore(0, empty.state(0))
+        self.assertIsNone(empty.grounds[0])
+
+    @parameterized.parameters('blocks3d', 'pillars3d', 'stairs3d', 'path3d', 'path3d_straight')
+    def test_capacity(self, source):
+        ground = terrain.load(source)
+        holds = terrain.capacity(ground)
+        most = 0
+        for seed in range(100, 160):
+            layout = terrain.Ground(ground, seed).layout
+            for centre in ((0, 0), (24, -20), (400, 8)):
+                low = np.array(centre) - 16.0
+                most = max(most, len(layout.boxes_in(low, low + 32).top))
+        self.assertLessEqual(most, holds.boxes)
+        self.assertLess(holds.boxes, 1.6 * most + 10)
+
+    def test_a_window_that_is_too_full_keeps_what_is_near(self):
+        ground = terrain.load('pillars3d')
+        holds = terrain.capacity(ground)._replace(boxes=40)
+        found = terrain.Surroundings(1, holds)
+        found.begin(0, terrain.Ground(ground, 0))
+        x, y = np.random.default_rng(0).uniform(-5, 5, (2, 1, 500))
+        np.testing.assert_array_equal(found.height(x, y)[0], found.grounds[0].height(x[0], y[0]))
+        self.assertLen(found.boxes[0].top, 40)
+
+
+if __name__ == '__main__':
+    absltest.main()

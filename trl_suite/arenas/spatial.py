@@ -1,0 +1,371 @@
+"""An arena whose three-dimensional terrain is drawn anew every episode and never ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from dm_control import composer, mjcf
+
+from trl_suite.arenas import stage
+from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
+from trl_suite.terrain.ground import Random
+from trl_suite.terrain.surroundings import ALL, HALF, VERTICES, Rows
+from trl_suite.world import World
+
+ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
+BASE = 1.0  # m; of height fields, below their lowest point
+FOOT = 0.5  # m; how deep boxes are let into a plane
+THICKNESS = 2.0  # m; of boxes without a plane under them
+DRIVE = 1e6  # kg; inertia of moving boxes along their way: nothing that they meet stops them
+SPEED_ERROR = 0.005  # m/s; deviation after which moving boxes are given their speed again
+SIZE = 0.1  # m; half sides of unused boxes
+SHADES = np.array([[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]])  # of boxes, by turns of 0.5 m along x
+
+
+class SpatialTerrain(composer.Arena):
+    """Three-dimensional terrain realised by geoms that are posed anew, never recompiled.
+
+    A plane, a height field of 32 m x 32 m, pools of static boxes and of belts, and boxes that slide
+    along straight ways: those of them that the terrain calls for. After compiling, `bind` ties the
+    arena to a world of n simulations, each with a ground of its own. Queries answer from the
+    `Surroundings`, never from the collision geometry.
+
+    Moving boxes are children of the ground's body, on sliding joints with a huge inertia, so that
+    they move in every substep and push and carry with the velocity they have. Contact sensors that
+    are to notice them too name the ground as `subtree2`, not as `body2`.
+    """
+
+    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+        super()._build(name=name)
+        self.terrain = terrain
+        self.capacity = holds = capacity(terrain)
+        root = self._mjcf_root
+        stage.prepare(root)
+        _paint(root)
+        # The ground may be hit but hits nothing itself: moving boxes pass through it and each other.
+        common = {
+            'friction': FRICTION, 'solref': SOLREF, 'solimp': SOLIMP, 'condim': 3, 'contype': 1,
+            'conaffinity': 0,
+        }  # fmt: skip
+        ground = root.worldbody.add('body', name='terrain')
+        self.plane = self.field = None
+        if holds.level:
+            self.plane = ground.add(
+                'geom', name='plane', type='plane', size=(0, 0, 1), material='ground', **common
+            )
+        if holds.grid:
+            root.asset.add(
+                'hfield', name='field', nrow=VERTICES, ncol=VERTICES,
+                size=(HALF, HALF, ELEVATION, BASE),
+            )  # fmt: skip
+            self.field = ground.add(
+                # Turned by a right angle, so that cells are cut into triangles from the back left to
+                # the front right, as in the queries; a row then runs along y, the first one ahead.
+                'geom', name='field', type='hfield', hfield='field', material='ground',
+                quat=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)), **common,
+            )  # fmt: skip
+        # Laid out along x, so that the bounding volumes made by the compiler fit.
+        self.boxes = [
+            ground.add(
+                'geom', name=f'box_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 0, PARKED),
+                material='block' if holds.level else 'ground', **common,
+            )
+            for i in range(holds.boxes)
+        ]  # fmt: skip
+        self.belts = [
+            ground.add(
+                # Unless one belt runs when it is compiled, none ever will.
+                'geom', name=f'belt_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 1, PARKED),
+                surfacevel=(1, 0, 0, 0, 0, 0), material='belt', **common,
+            )
+            for i in range(holds.belts)
+        ]  # fmt: skip
+        self.movers = []
+        for i in range(holds.movers):
+            body = ground.add('body', name=f'mover_{i}', pos=(SIZE * i, 2, PARKED))
+            body.add(
+                'joint', name=f'mover_{i}', type='slide', axis=(1, 0, 0), limited=False,
+                armature=DRIVE,
+            )  # fmt: skip
+            body.add(
+                'geom', name=f'mover_{i}', type='box', size=(SIZE,) * 3, mass=1, material='mover',
+                **common,
+            )  # fmt: skip
+            self.movers.append(body)
+        self._physics: Any = None
+
+    @property
+    def ground_body(self) -> str:
+        """Name of the body that carries the ground, for contact sensors; see `subtree2` above."""
+        return 'terrain'
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        self._physics = physics  # to show new height fields to whoever draws
+
+    def bind(self, world: World) -> None:
+        """Resolves the arena's geoms in a world and makes room for its n grounds."""
+        self._world = world
+        self.surroundings = Surroundings(world.n, self.capacity)
+        # The boxes of one body are neighbours in the model.
+        self._pool = _range(world, self.boxes)
+        self._belts = _range(world, self.belts)
+        self._plane, self._field = (
+            int(world.geom_ids([geom.full_identifier])[0]) if geom is not None else -1
+            for geom in (self.plane, self.field)
+        )
+        names = [body.full_identifier for body in self.movers]
+        self._bodies, self._mover_geoms = world.body_ids(names), world.geom_ids(names)
+        self._qpos, self._dof = world.joint_addresses(names)
+        self._joints = world.models[0].body_jntadr[self._bodies]
+        self._begin = np.zeros((world.n, len(names)))  # m; of the ways, where qpos is 0
+        # The solver's tolerance is relative to the mean inertia, that of the drives left out.
+        own = np.ones(world.models[0].nv, bool)
+        own[self._dof] = False
+        self._own = np.flatnonzero(own)
+        for model in world.models:
+            self._set_inertia(model)
+
+    @property
+    def grounds(self) -> list[Ground | None]:
+        """The ground of each simulation."""
+        return self.surroundings.grounds
+
+    def begin_episode(self, row: int, ground: Ground, xy: npt.ArrayLike = (0.0, 0.0)) -> None:
+        """Replaces the ground of one simulation; the caller forwards the world afterwards.
+
+        Args:
+          row: which simulation; it may be reset before or after.
+          ground: the new ground.
+          xy: where its character is put, m.
+        """
+        self.surroundings.begin(row, ground, xy)
+        self._begin[row] = self.surroundings.way[row]
+        self._world.qpos[row, self._qpos] = 0.0
+        self._place(row)
+        self._realise(row)
+
+    def follow(self, xy: np.ndarray, rows: np.ndarray | None = None) -> None:
+        """Keeps ground around characters and boxes moving; called before every control step.
+
+        Args:
+          xy: where their roots are, m, (n, 2), or of the given rows only, (m, 2).
+          rows: sorted numbers of simulations; None for all.
+        """
+        changed = self.surroundings.follow(xy, rows)
+        for row in changed:
+            self._realise(row)
+        if len(self._dof):
+            chosen = ALL if rows is None else rows
+            self._look()
+            self.surroundings.turn(xy, chosen)
+            speed = self.surroundings.direction[chosen] * self.surroundings.speed[chosen]
+            wrong = np.abs(self._world.qvel[chosen][:, self._dof] - speed).max(1) > SPEED_ERROR
+            if wrong.any():
+                numbers = np.flatnonzero(wrong) if rows is None else rows[wrong]
+                self._world.qvel[numbers[:, None], self._dof] = speed[wrong]
+                changed = sorted({*changed, *numbers.tolist()})
+        if changed:  # contacts of the open step name boxes that now lie elsewhere
+            self._world.forward(np.array(changed))
+
+    def height(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
+        """Heights of the surface in m at points (rows, k) m, within 12 m of the characters."""
+        self._look()
+        return self.surroundings.height(x, y, rows)
+
+    def surface_velocity(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
+        """Horizontal velocities of the surface in m/s at points (rows, k) m, (rows, k, 2)."""
+        self._look()
+        return self.surroundings.velocity(x, y, rows)
+
+    def height_map(
+        self,
+        xy: np.ndarray,
+        heading: np.ndarray,
+        rows: Rows = ALL,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Heights around characters, (rows, 1024) m; see `Surroundings.height_map`."""
+        self._look()
+        return self.surroundings.height_map(xy, heading, rows, out)
+
+    def velocity_map(
+        self,
+        xy: np.ndarray,
+        heading: np.ndarray,
+        rows: Rows = ALL,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Velocities of the surface, (rows, 2048) m/s; see `Surroundings.velocity_map`."""
+        self._look()
+        return self.surroundings.velocity_map(xy, heading, rows, out)
+
+    def goal(
+        self,
+        row: int,
+        random: Random,
+        root: npt.ArrayLike,
+        rule: str = 'hike',
+        distance: float = 1.0,
+    ) -> np.ndarray:
+        """Draws a goal for one simulation, clear of boxes as they now stand; see `Ground.goal`."""
+        self._look()
+        ground = self.grounds[row]
+        assert ground is not None
+        movers = None
+        if ground.layout.movers is not None:
+            movers = self.surroundings.centres(ALL)[row, : len(ground.layout.movers.speed)]
+        return ground.goal(random, root, rule, distance=distance, movers=movers)
+
+    def state(self, row: int) -> dict[str, Any]:
+        """What is needed to restore the ground of one simulation exactly."""
+        self._look()
+        return {**self.surroundings.state(row), 'begin': self._begin[row].copy()}
+
+    def restore(self, row: int, state: Mapping[str, Any]) -> None:
+        """Restores the ground of one simulation; the caller restores the world afterwards."""
+        if state['ground'] is not None:
+            self.surroundings.restore(row, state)
+            self._begin[row] = state['begin']
+            self._world.qpos[row, self._qpos] = state['way'] - state['begin']
+            self._place(row)
+            self._realise(row)
+
+    def _look(self) -> None:
+        """Sees where the physics has taken moving boxes."""
+        if len(self._qpos):
+            np.add(self._begin, self._world.qpos[:, self._qpos], out=self.surroundings.way)
+
+    def _realise(self, row: int) -> None:
+        """Poses geoms as the window says."""
+        model, around = self._world.models[row], self.surroundings
+        ground, (x, y) = around.grounds[row], around.centre[row]
+        assert ground is not None
+        level, floor = ground.layout.level, 0.0
+        if self._plane >= 0:
+            floor = PARKED if level is None else level
+            model.geom_pos[self._plane] = x, y, floor
+        if self._field >= 0:
+            heights = around.grid(row)
+            lowest, highest = float(heights.min()), float(heights.max())
+            if not highest - lowest <= ELEVATION:
+                raise ValueError(
+                    f'terrain {self.terrain.name!r} rises from {lowest:g} to {highest:g} m within '
+                    f'{2 * HALF:g} m; a height grid may rise by {ELEVATION:g} m'
+                )
+            floor = min(floor, lowest)
+            model.geom_pos[self._field] = x, y, lowest
+            data = model.hfield_data.reshape(VERTICES, VERTICES)
+            np.subtract(heights[::-1], np.float32(lowest), out=data)
+            data *= np.float32(1 / ELEVATION)
+        boxes, belts = around.boxes[row], ground.layout.belts
+        if len(boxes.top):
+            floor = min(floor, float(boxes.top.min()))
+        for pool, used in ((self._pool, boxes), (self._belts, belts and belts.boxes)):
+            count = 0
+            if used is not None:
+                count = len(used.top)
+                part = slice(pool.start, pool.start + count)
+                _pose(model, part, used, level)
+            unused = slice(pool.start + count, pool.stop)
+            model.geom_pos[unused] = x + HALF, y, floor + PARKED
+            model.geom_size[unused] = SIZE
+        if belts is not None:
+            run = model.geom_surfacevel[self._belts.start :][: len(belts.velocity)]
+            cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
+            east, north = belts.velocity.T
+            run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
+        self._world.set_const(row)
+        self._set_inertia(model)
+        if self._field >= 0:
+            self._show(model)
+
+    def _place(self, row: int) -> None:
+        """Puts moving boxes where their ways begin for the physics."""
+        if not len(self._bodies):
+            return
+        model, around, ground = self._world.models[row], self.surroundings, self.grounds[row]
+        assert ground is not None and ground.layout.level is not None
+        movers, level = ground.layout.movers, ground.layout.level
+        count = 0 if movers is None else len(movers.speed)
+        position = np.full((len(self._bodies), 3), PARKED)
+        size = np.full((len(self._bodies), 3), SIZE)
+        if movers is not None:
+            way = self._begin[row, :count, None]
+            position[:count, :2] = around.start[row, :count] + way * around.axis[row, :count]
+            position[:count, 2] = level + 0.5 * movers.height
+            size[:count, :2], size[:count, 2] = movers.half_size, 0.5 * movers.height
+            model.jnt_axis[self._joints[:count], :2] = around.axis[row, :count]
+        model.body_pos[self._bodies], model.geom_size[self._mover_geoms] = position, size
+        self._world.qvel[row, self._dof] = around.direction[row] * around.speed[row]
+
+    def _set_inertia(self, model: mujoco.MjModel) -> None:
+        if len(self._dof) and len(self._own):
+            model.stat.meaninertia = model.dof_M0[self._own].mean()
+
+    def _show(self, model: mujoco.MjModel) -> None:
+        """Gives a new height field to the pictures of a physics that has drawn before."""
+        try:
+            contexts = self._physics and self._physics._contexts
+            if not contexts or self._physics.model.ptr is not model:
+                return
+            with contexts.gl.make_current() as gl:
+                gl.call(mujoco.mjr_uploadHField, model, contexts.mujoco.ptr, 0)
+        except ReferenceError:  # the physics was freed
+            self._physics = None
+
+
+def _range(world: World, geoms: list[mjcf.Element]) -> slice:
+    if not geoms:
+        return slice(0, 0)
+    first = int(world.geom_ids([geoms[0].full_identifier])[0])
+    return slice(first, first + len(geoms))
+
+
+def _pose(model: mujoco.MjModel, part: slice, boxes: Boxes, level: float | None) -> None:
+    """Gives geoms the upper faces of boxes, and sides that reach below them."""
+    angle = np.arctan(boxes.slope)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    thickness = np.full(len(angle), THICKNESS)
+    if level is not None:
+        thickness = np.maximum((boxes.top - level + FOOT) / cosine, FOOT)
+    # A tilted box lies below its upper face along the normal of it.
+    aside, yaw = 0.5 * thickness * sine, boxes.yaw
+    position = model.geom_pos[part]
+    position[:, 0] = boxes.position[:, 0] + aside * np.cos(yaw)
+    position[:, 1] = boxes.position[:, 1] + aside * np.sin(yaw)
+    position[:, 2] = boxes.top - 0.5 * thickness * cosine
+    size = model.geom_size[part]
+    size[:, 0], size[:, 1] = boxes.half_size[:, 0] / cosine, boxes.half_size[:, 1]
+    size[:, 2] = 0.5 * thickness
+    model.geom_rgba[part] = SHADES[np.floor(2 * boxes.position[:, 0]).astype(int) % 2]
+    # Turned about z by the yaw after it was turned about y by minus the angle.
+    half_yaw, half_angle = 0.5 * yaw, 0.5 * angle
+    quaternion = model.geom_quat[part]
+    quaternion[:, 0] = np.cos(half_yaw) * np.cos(half_angle)
+    quaternion[:, 1] = np.sin(half_yaw) * np.sin(half_angle)
+    quaternion[:, 2] = -np.cos(half_yaw) * np.sin(half_angle)
+    quaternion[:, 3] = np.sin(half_yaw) * np.cos(half_angle)
+
+
+def _paint(root: mjcf.RootElement) -> None:
+    """What the ground looks like."""
+    colours = {
+        'ground': ((0.47, 0.52, 0.44), (0.42, 0.47, 0.40)),
+        'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),
+        'belt': ((0.34, 0.38, 0.44), (0.42, 0.46, 0.52)),
+        'mover': ((0.66, 0.50, 0.30), (0.61, 0.46, 0.27)),
+    }
+    for name, (light, dark) in colours.items():
+        root.asset.add(
+            'texture', name=name, type='2d', builtin='checker', width=256, height=256, rgb1=light,
+            rgb2=dark,
+        )  # fmt: skip
+        root.asset.add(
+            'material', name=name, texture=name, texuniform=True, reflectance=0, specular=0,
+            texrepeat=(1, 1),
+        )  # fmt: skip

@@ -1,0 +1,129 @@
+"""Gradient noise of hills: one fixed tile, repeated without end and added up in octaves.
+
+Source: K. Perlin, 'Improving noise', 2002 (the permutation and the gradients are his); the tile and
+the octaves are those of the original Terrain RL Simulator.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+TILE = 256  # points of the tile along each axis; the last equals the first
+PERIOD = 16  # lattice cells over the tile
+_LAYER = 8  # lattice plane at which the noise of three coordinates is cut
+OCTAVES = 2.0 ** -np.arange(6)  # amplitudes of the octaves
+FREQUENCIES = np.array([1, 1.96, 4.03, 7.92, 16.7, 31.12])
+_SCALES = tuple(zip(OCTAVES.tolist(), FREQUENCIES.tolist(), strict=True))
+
+_PERMUTATION = np.array([
+    151, 160, 137, 91, 90, 15, 131, 13, 201, 95, 96, 53, 194, 233, 7, 225, 140, 36, 103, 30, 69,
+    142, 8, 99, 37, 240, 21, 10, 23, 190, 6, 148, 247, 120, 234, 75, 0, 26, 197, 62, 94, 252, 219,
+    203, 117, 35, 11, 32, 57, 177, 33, 88, 237, 149, 56, 87, 174, 20, 125, 136, 171, 168, 68, 175,
+    74, 165, 71, 134, 139, 48, 27, 166, 77, 146, 158, 231, 83, 111, 229, 122, 60, 211, 133, 230,
+    220, 105, 92, 41, 55, 46, 245, 40, 244, 102, 143, 54, 65, 25, 63, 161, 1, 216, 80, 73, 209,
+    76, 132, 187, 208, 89, 18, 169, 200, 196, 135, 130, 116, 188, 159, 86, 164, 100, 109, 198,
+    173, 186, 3, 64, 52, 217, 226, 250, 124, 123, 5, 202, 38, 147, 118, 126, 255, 82, 85, 212,
+    207, 206, 59, 227, 47, 16, 58, 17, 182, 189, 28, 42, 223, 183, 170, 213, 119, 248, 152, 2, 44,
+    154, 163, 70, 221, 153, 101, 155, 167, 43, 172, 9, 129, 22, 39, 253, 19, 98, 108, 110, 79,
+    113, 224, 232, 178, 185, 112, 104, 218, 246, 97, 228, 251, 34, 242, 193, 238, 210, 144, 12,
+    191, 179, 162, 241, 81, 51, 145, 235, 249, 14, 239, 107, 49, 192, 214, 31, 181, 199, 106, 157,
+    184, 84, 204, 176, 115, 121, 50, 45, 127, 4, 150, 254, 138, 236, 205, 93, 222, 114, 67, 29,
+    24, 72, 243, 141, 128, 195, 78, 66, 215, 61, 156, 180,
+])  # fmt: skip
+
+
+@functools.cache
+def tile() -> np.ndarray:
+    """The noise in [0, 1], shape (TILE, TILE): from 0.0005 to 0.906, mean 0.5, deviation 0.128."""
+    lattice = np.linspace(0, PERIOD, TILE)
+    whole = np.floor(lattice).astype(int)
+    fraction = lattice - whole
+    low, high = whole % PERIOD, (whole + 1) % PERIOD
+    hashes = np.concatenate([_PERMUTATION, _PERMUTATION])
+
+    def corner(i: np.ndarray, j: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Slope of the corner's gradient, one of 12, towards a point at (x, y, 0) from it."""
+        kind = hashes[hashes[hashes[i][:, None] + j[None]] + _LAYER] & 15
+        x, y = np.broadcast_arrays(x[:, None], y[None])
+        first = np.where(kind < 8, x, y)
+        second = np.where(kind < 4, y, np.where((kind == 12) | (kind == 14), x, 0.0))
+        return np.where(kind & 1, -first, first) + np.where(kind & 2, -second, second)
+
+    fade = fraction**3 * (fraction * (fraction * 6 - 15) + 10)
+    along = fade[:, None]
+    near = corner(low, low, fraction, fraction)
+    near += along * (corner(high, low, fraction - 1, fraction) - near)
+    far = corner(low, high, fraction, fraction - 1)
+    far += along * (corner(high, high, fraction - 1, fraction - 1) - far)
+    return 0.5 * (near + fade * (far - near) + 1)
+
+
+@functools.cache
+def _single() -> np.ndarray:
+    return tile().astype(np.float32)
+
+
+@functools.cache
+def _padded() -> list[list[float]]:
+    return np.pad(tile(), (0, 1), mode='edge').tolist()
+
+
+def grid(
+    x: np.ndarray, y: np.ndarray, offset: np.ndarray, frequency: float, amplitude: float
+) -> np.ndarray:
+    """Sum of the octaves on a grid.
+
+    Args:
+      x, y: coordinates of its lines, m, shapes (k,) and (m,).
+      offset: where in the tile (0, 0) lies, (2,).
+      frequency: tiles per m of the first octave.
+      amplitude: of the first octave, m.
+
+    Returns:
+      Heights in m, shape (k, m), in single precision.
+    """
+    noise = _single()
+    heights = np.full((len(x), len(y)), -amplitude * OCTAVES.sum(), np.float32)
+    for octave, factor in zip(2 * amplitude * OCTAVES, frequency * FREQUENCIES, strict=True):
+        i, f = _cell(x * factor + offset[0])
+        j, g = _cell(y * factor + offset[1])
+        lines = noise.take(i, 0, mode='clip')
+        rise = noise.take(i + 1, 0, mode='clip')
+        rise -= lines
+        rise *= f[:, None]
+        lines += rise
+        lines *= np.float32(octave)
+        left = lines.take(j, 1, mode='clip')
+        rise = lines.take(j + 1, 1, mode='clip')
+        rise -= left
+        rise *= g
+        heights += left
+        heights += rise
+    return heights
+
+
+def above(x: float, y: float, offset: np.ndarray, frequency: float) -> bool:
+    """Whether the sum of the octaves at one point is above 0; see `grid`."""
+    noise, span, total = _padded(), TILE - 1, 0.0
+    u0, v0 = offset.tolist()
+    x, y = x * frequency, y * frequency
+    for octave, factor in _SCALES:
+        u, v = (x * factor + u0) % 1.0 * span, (y * factor + v0) % 1.0 * span
+        i, j = int(u), int(v)
+        low, high = noise[i], noise[i + 1]
+        u, v = u - i, v - j
+        near = low[j] + u * (high[j] - low[j])
+        far = low[j + 1] + u * (high[j + 1] - low[j + 1])
+        total += octave * (2 * (near + v * (far - near)) - 1)
+        if abs(total) > octave:  # more than all further octaves together
+            break
+    return total > 0
+
+
+def _cell(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the tile's cell at positions in tiles, and where in the cell they lie."""
+    position = position % 1.0 * (TILE - 1)
+    cell = np.minimum(position.astype(int), TILE - 2)
+    return cell, (position - cell).astype(np.float32)
