@@ -29,6 +29,11 @@ OF_ROWS = (
     'flat', 'inclines', 'steps_humanoid', 'slopes_humanoid', 'gaps_humanoid', 'walls_humanoid',
     'mixed_humanoid', 'slopes_mixed_humanoid',
 )  # fmt: skip
+OF_GAITS = (
+    'gaps', 'cliffs_humanoid', 'mixed', 'slopes_mixed', 'slopes', 'cliffs_rugged', 'walls', 'steps',
+    'narrow_gaps', 'tight_gaps', 'slopes_gaps0', 'slopes_steps', 'slopes_walls', 'mixed_raptor',
+    'gaps_hopper', 'mixed_hopper',
+)  # fmt: skip
 
 
 class Ground:
@@ -200,7 +205,7 @@ class QueryTest(parameterized.TestCase):
 class PoolTest(parameterized.TestCase):
     """The pool of boxes holds every window, at full resolution."""
 
-    @parameterized.parameters(*OF_ROWS, 'cliffs_rugged', 'narrow_gaps_raptor', 'slopes_steps_hard')
+    @parameterized.parameters(*OF_ROWS, *OF_GAITS, 'narrow_gaps_raptor', 'slopes_steps_hard')
     def test_pool_is_never_exceeded(self, source):
         ground = PlanarTerrain(terrain.load(source))
         pool, most = len(ground.boxes), 0
@@ -213,7 +218,7 @@ class PoolTest(parameterized.TestCase):
         self.assertLessEqual(most, pool)
 
     def test_rows_use_these_terrains(self):
-        self.assertEqual({suite.find(id_).terrain for id_ in suite.ALL_IDS}, set(OF_ROWS))
+        self.assertEqual({suite.find(id_).terrain for id_ in suite.ALL_IDS}, {*OF_ROWS, *OF_GAITS})
 
     def test_unused_boxes_are_out_of_reach(self):
         ground = Ground('steps_humanoid')

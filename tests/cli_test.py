@@ -16,6 +16,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, suite
+from trl_suite.tasks.gait import GaitTask
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SIZE = ('--size', '160x120')
@@ -57,8 +58,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '42 environments')
-        self.assertLen(lines, 44)
+        self.assertEqual(lines[-1], '85 environments')
+        self.assertLen(lines, 87)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -68,11 +69,15 @@ class ListTest(CommandTest):
     @parameterized.parameters(
         (('--domain', 'imitation'), 14),
         (('--domain', 'plaid'), 28),
+        (('--domain', 'terrainrl'), 43),
+        (('--actuation', 'gait'), 43),
+        (('--character', 'hopper'), 10),
         (('--actuation', 'velocity'), 3),
         (('--actuation', 'muscle'), 4),
-        (('--character', 'raptor'), 13),
+        (('--character', 'raptor'), 23),
         (('--terrain', 'gaps_humanoid'), 3),
-        (('--tag', 'original'), 30),
+        (('--tag', 'original'), 62),
+        (('--tag', 'original', '--domain', 'terrainrl'), 32),
         (('--tag', 'blind'), 4),
         (('--domain', 'plaid', '--character', 'dog', '--tag', 'original'), 6),
         (('--actuation', 'muscle', '--domain', 'plaid'), 0),
@@ -104,9 +109,12 @@ class InfoTest(CommandTest):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
-        for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Clip', 'Reward',
+        gait = suite.find(id_).rules == 'gait'
+        for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
                       'Termination', 'Time', 'Differs'):  # fmt: skip
             self.assertIn(f'\n{title}', out)
+        for title, shown in (('Clip', not gait), ('Gait', gait), ('Parameters', gait)):
+            self.assertEqual(f'\n{title}:' in out, shown, title)
 
     def test_figures(self):
         # Sizes from the original's registry, limits from its character file.
@@ -129,6 +137,49 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  right_VAS +0\.505 +0\.495 +6000\n')
         self.assertRegex(out, r'\n  strain +29 +45 +16 ')
 
+    def test_gaits(self):
+        # Sizes, figures and rules from the original's controllers.
+        out = self.output('info', 'FSM_Dog2D_Terrain_Gaps-v0')
+        self.assertRegex(out, r'\n  hip +\S+ +\S+ to \S+ +300 +130 +13 +the world\n')
+        self.assertRegex(out, r'\n  knee +2 +-3.14 to 0 +300 +50 +5 +its parent\n')
+        self.assertRegex(out, r'\n  Extend +finger touches the ground\n')
+        self.assertIn('Parameters: 30, of which an action sets 29\n', out)
+        self.assertRegex(out, r'\n +1  bound 0.67, slow_bound 0.33\n')
+        self.assertIn('fixed: TransTime 0.125 s\n', out)
+        self.assertIn('Observation: 283 numbers', out)
+        self.assertRegex(out, r'\n  terrain +0 +200 +200 +m .* to 10 m ahead')
+        self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
+        self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = centre', out)
+        self.assertRegex(out, r'\n  BackForceX +378.3 +432.7  N\n')
+        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad\n')
+        self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
+        self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
+        self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+looks')
+        self.assertIn('turned by more than 144 degrees', out)
+        self.assertIn('less than 0.5 m in 5 s', out)
+        self.assertRegex(out, 'one cycle, at most 1.67 s; control 600 Hz, physics 1200 Hz;.*cut\n'
+                         r'  \(discount 1\) after 256 steps')  # fmt: skip
+        self.assertNotRegex(out, 'backwards|negative|stance leg')
+        out = self.output('info', 'FSM_Raptor2D_Terrain_Gaps-v0')
+        self.assertIn('Contact.SpineCurve 0', out)
+        self.assertIn('action 0 is base action 1\n', out)
+        self.assertIn('\n  0 if v is negative\n', out)
+        self.assertEqual(out.count('the stance leg first'), 2)
+        self.assertIn('it moves backwards', self.output('info', 'FSM_Biped2D_Terrain_Gaps-v0'))
+
+    def test_a_prismatic_joint(self):
+        out = self.output('info', 'FSM_Hopper2D_Terrain_Gaps-v0')
+        self.assertRegex(out, r'\n  hip +0.2 +-1.57 to 1.57 +2500 +200 +20 +the world\n')
+        self.assertRegex(
+            out, r'\n  leg +0.2 +-0.2 to 0.2 m +180 N +1000 N/m +20 N s/m +its parent\n'
+        )
+        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad\n')
+        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m\n')
+        self.assertRegex(out, r'\n  MagicGain +0.8405 +0.162  1\n')
+        self.assertIn('\n  exp(-0.5 (v - 3)^2)\n', out)
+        self.assertNotIn('share of the time', out)
+        self.assertRegex(out, r'pose .*; last, pitch of the root \(rad\)\n')
+
     def test_an_alias_is_as_good(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
 
@@ -139,19 +190,33 @@ class InfoTest(CommandTest):
             'rigid tendons': 'muscle',
             'angles to the parent link': 'PD targets of a dog or raptor',
             'exactly vertical': 'terrain',
+            'the clip is our own': 'clip',
+            '300 Hz': 'imitation',
+            'takes physical units': 'imitation',
+            'at 600 Hz': 'gait',
+            'ends with its cycle': 'gait',
+            'taken at touch-down': 'hopper',
+            'base action 1': 'raptor',
+            'tuned anew': 'biped',
         }
+        tracking = {'clip', 'imitation'}
         for id_, expected in (
-            ('PD_Biped2D_LLC_Imitate_Flat-v0', set()),
-            ('Vel_Dog2D_LLC_Imitate_Flat-v0', {'completion'}),
-            ('MTU_Raptor2D_LLC_Imitate_Flat-v0', {'muscle'}),
-            ('PD_Dog2D_Gaps_Terrain-v0', {'PD targets of a dog or raptor', 'terrain'}),
+            ('PD_Biped2D_LLC_Imitate_Flat-v0', tracking),
+            ('Vel_Dog2D_LLC_Imitate_Flat-v0', tracking | {'completion'}),
+            ('MTU_Raptor2D_LLC_Imitate_Flat-v0', tracking | {'muscle'}),
+            ('PD_Dog2D_Gaps_Terrain-v0', tracking | {'PD targets of a dog or raptor', 'terrain'}),
             (
                 'PD_Raptor2D_Mixed_Terrain-v0',
-                {'completion', 'mixed_humanoid', 'PD targets of a dog or raptor', 'terrain'},
+                tracking
+                | {'completion', 'mixed_humanoid', 'PD targets of a dog or raptor', 'terrain'},
             ),
+            ('FSM_Dog2D_Terrain_Mixed-v0', {'gait', 'terrain'}),
+            ('FSM_Raptor2D_Terrain_Narrow_Gaps-v0', {'gait', 'terrain', 'raptor', 'completion'}),
+            ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped'}),
+            ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper'}),
         ):
             with self.subTest(id_):
-                out = self.output('info', id_)
+                out = self.output('info', id_).split('\nDiffers')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
     def test_unknown(self):
@@ -241,6 +306,31 @@ class RolloutTest(CommandTest):
         # The first picture of the strip is the first of the video; compression blurs the latter.
         difference = np.abs(strip[:, :160].astype(int) - frames[0])
         self.assertLess(difference.mean(), 4)
+
+    def test_a_gait_in_real_time(self):
+        out = self.output(
+            'rollout', 'FSM_Raptor2D_Terrain_Slopes-v0', '--steps', '6', '--policy', 'zero', '--video',
+            'a.mp4', '--strip', 'a.png', '--trajectory', 'a.npz', *SIZE,
+        )  # fmt: skip
+        self.assertRegex(out, r'\n6 steps in 1 episode: ')
+        environment = suite.make('FSM_Raptor2D_Terrain_Slopes-v0', {'random': 0})
+        environment.reset()
+        for _ in range(6):
+            environment.step(np.zeros(28))
+        with np.load('a.npz') as trajectory:
+            np.testing.assert_array_equal(trajectory['qpos'][-1], environment.physics.data.qpos)
+        frames = iio.imread('a.mp4', plugin='FFMPEG')
+        self.assertLen(frames, 1 + int(30 * environment.physics.data.time))
+        self.assertEqual(iio.imread('a.png').shape[1], 7 * 160 + 6 * rendering.STRIP_MARGIN)
+
+    def test_how_an_episode_of_a_gait_ends(self):
+        for end in ('fell', 'stuck'):
+            info = {'fell': end == 'fell', 'stuck': end == 'stuck', 'diverged': False}
+            with mock.patch.object(
+                GaitTask, 'infos', lambda task, info=info: {k: np.array([v]) for k, v in info.items()}
+            ), mock.patch.object(GaitTask, 'should_terminate_episode', lambda *_: True):  # fmt: skip
+                out = self.output('rollout', 'terrainrl/hopper_steps', '--steps', '1')
+            self.assertRegex(out, rf'\n +1 +1 +\S+ +0.00  {end}\n')
 
     def test_a_gif_from_another_camera(self):
         self.output('rollout', GAPS, '--steps', '2', '--video', 'a.gif', '--camera', 'front', *SIZE)

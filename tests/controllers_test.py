@@ -279,8 +279,12 @@ def dense_pd(rig, row, off=(), wanted=None):
     """Stable PD of one row, from the formula, with matrices of the engine."""
     model, data, columns = rig.data(row)
     links = rig.character.row.joints.values()
-    kp = np.array([0, 0, 0, *(0 if n in off else j.kp for n, j in zip(rig.joints, links, strict=True))])
-    kd = np.array([0, 0, 0, *(0 if n in off else j.kd for n, j in zip(rig.joints, links, strict=True))])
+    kp = np.array(
+        [0, 0, 0, *(0 if n in off else j.kp for n, j in zip(rig.joints, links, strict=True))]
+    )
+    kd = np.array(
+        [0, 0, 0, *(0 if n in off else j.kd for n, j in zip(rig.joints, links, strict=True))]
+    )
     full_kd = np.array([0, 0, 0, *(joint.kd for joint in links)])  # stays in the matrix
     q, v = data.qpos[columns], data.qvel[columns]
     target = np.zeros(len(q))
@@ -326,7 +330,7 @@ class DynamicsTest(parameterized.TestCase):
         angles = q @ coefficients + constants + q[:, 3:]
         speed = found.com_speed(rig.rows, v)
         for row in rig.rows:
-            model, data, columns = rig.data(row)
+            model, data, _ = rig.data(row)
             root = model.body(f'{name}/root').id
             np.testing.assert_allclose(found.com(rig.rows)[row], data.subtree_com[root], atol=1e-12)
             mujoco.mj_subtreeVel(model, data)
@@ -351,7 +355,7 @@ class DynamicsTest(parameterized.TestCase):
         hinges = rig.dynamics.hinges | (np.arange(rig.dynamics.size) < 3)  # slides of joints: no
         self.assertEqual(int((~hinges).sum()), int(name == 'hopper'))
         for row in rig.rows:
-            model, data, columns = rig.data(row)
+            _, data, columns = rig.data(row)
             weight = -data.qfrc_bias[columns]  # at rest
             np.testing.assert_allclose(found[row, hinges], weight[hinges], atol=1e-9)
 
@@ -359,7 +363,7 @@ class DynamicsTest(parameterized.TestCase):
     def test_rows_do_not_depend_on_each_other(self, name):
         rig = Rig(name, 5, batch=True)
         rig.scatter(4)
-        gait, feet = rig.gait, [foot for foot in rig.gait.feet] or rig.character.row.end_effectors
+        gait, feet = rig.gait, list(rig.gait.feet) or rig.character.row.end_effectors
         rig.touches(feet)
         gait.state[:] = rig.rows % 4
         gait.enter(rig.rows)
@@ -500,7 +504,9 @@ class LawTest(parameterized.TestCase):
             target = gait.targets[0, rig.joints.index(joint)]
             self.assertAlmostEqual(target, expected, places=9)
         expected = dense_pd(rig, 0)
-        of_feet = {foot: jacobian(model, data, columns, *sole(model, data, foot, name)) for foot in feet}
+        of_feet = {
+            foot: jacobian(model, data, columns, *sole(model, data, foot, name)) for foot in feet
+        }
         if name == 'dog' and feet:
             expected += self.weight(model, data, columns, of_feet)[3:]
         foot = 'toe' if state < 2 else 'finger'
@@ -667,7 +673,8 @@ class MachineTest(parameterized.TestCase):
                     self.assertEqual(leave(2, landed, was, now), (2 if landed else 3, False))
                     turned_down = was and not now
                     self.assertEqual(
-                        leave(3, landed, was, now), (2 if landed else 0 if turned_down else 3, False)
+                        leave(3, landed, was, now),
+                        (2 if landed else 0 if turned_down else 3, False),
                     )
                     self.assertEqual(bool(gait.rising[0]), now)
 

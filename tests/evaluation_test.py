@@ -28,11 +28,11 @@ def make(id_, seed=0, scale=0.1):
     )  # fmt: skip
 
 
-def alone(id_, seeds, act):
+def alone(id_, seeds, act, **options):
     """Returns, lengths, distances and falls of single environments, one by one."""
     episodes = []
     for seed in seeds:
-        environment = suite.make(id_, {'random': seed})
+        environment = suite.make(id_, {'random': seed, **options})
         time_step, total, length = environment.reset(), 0.0, 0
         while not time_step.last():
             time_step = environment.step(act(environment, time_step))
@@ -66,6 +66,16 @@ class EvaluateTest(parameterized.TestCase):
             lambda environment, _: np.clip(environment.task.clip_action(0), -1, 1),
         )
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
+
+    def test_gaits(self):
+        """Rows whose steps last differently."""
+        row = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
+        found = evaluation.evaluate(row, evaluation.zero, 3, 5, factory=True)
+        returns, lengths, distances, fell, _ = alone(
+            row.id, found['seeds'], lambda environment, _: np.zeros(28), step_limit=12
+        )
+        self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
+        self.assertEqual((found['distances'], found['fell']), (distances, fell))
 
     def test_threads_and_chunks_do_not_matter(self):
         policy = make(GAPS)

@@ -157,10 +157,14 @@ class WheelTest(absltest.TestCase):
             print(resources.directory('xml').resolve())
             print(resources.directory('mocap').resolve())
             print(len(motion.names()) + len(motion.steps_names()))
-            for id_ in ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0'):
+            for id_, steps in (
+                ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 20),
+                ('MTU_Raptor2D_LLC_Imitate_Flat-v0', 20),
+                ('FSM_Dog2D_Terrain_Mixed-v0', 2),
+            ):
                 environment = suite.make(id_, {'random': 0})
                 environment.reset()
-                for _ in range(20):
+                for _ in range(steps):
                     step = environment.step(np.zeros(environment.action_spec().shape))
                 assert all(np.isfinite(v).all() for v in step.observation.values())
             suite.build('goat', terrain='cliffs_rugged').reset()
@@ -175,6 +179,10 @@ class WheelTest(absltest.TestCase):
         self.assertEqual(int(clips), len(list((CHECKOUT / 'mocap').glob('*.npz'))))
         self.assertTrue((installed / 'py.typed').exists())
         self.assertTrue((installed / 'terrain' / 'presets.json').exists())
+        self.assertEqual(
+            {path.name for path in (installed / 'controllers').glob('*.json')},
+            {path.name for path in (CHECKOUT / 'trl_suite' / 'controllers').glob('*.json')},
+        )
         self.assertEqual(
             {path.name for path in (installed / 'xml').glob('*.xml')},
             {path.name for path in (CHECKOUT / 'xml').glob('*.xml')},

@@ -1,5 +1,6 @@
 """Pictures show what is there, files are whole or absent, and failures say what to do."""
 
+import itertools
 import os
 import pathlib
 import subprocess
@@ -232,6 +233,15 @@ class VideoTest(FolderTest):
         self.assertEqual({image.shape for image in images}, {(120, 160, 3)})
         rendering.video(images, self.folder / 'a.mp4')
         self.assert_only('a.mp4')
+
+    def test_a_gait_is_drawn_30_times_a_second(self):
+        environment = make('FSM_Biped2D_Terrain_Slopes-v0')
+        policy = lambda time_step: np.zeros(28)  # noqa: E731
+        images = list(rendering.frames(environment, policy, steps=3, **SMALL))
+        self.assertLen(images, 1 + int(30 * environment.physics.data.time))
+        self.assertIsNone(environment.task.watch)
+        for before, after in itertools.pairwise(images):
+            self.assertTrue((before != after).any())
 
     @parameterized.parameters(
         ('a.avi', numbered(2), ValueError, "unknown suffix '.avi'; expected .mp4 or .gif"),

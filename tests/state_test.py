@@ -22,6 +22,7 @@ EXAMPLES = (
     'PD_Raptor2D_Slopes_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
     'Torque_Dog2D_LLC_Imitate_Flat-v0', 'Vel_Biped2D_LLC_Imitate_Flat-v0',
 )  # fmt: skip
+GAITS = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0')  # more in gait_test
 DOG = EXAMPLES[1]
 
 
@@ -62,7 +63,7 @@ class DeterminismTest(parameterized.TestCase):
             environment = suite.make(id_, {'random': 5}, {'flat_observation': True})
             environment.reset()
             rng, digest = np.random.default_rng(1), hashlib.sha256()
-            for _ in range(120):
+            for _ in range(8 if id_.startswith('FSM') else 120):
                 step = environment.step(rng.uniform(-1, 1, len(environment.action_map)))
                 digest.update(step.observation['observations'].tobytes())
                 digest.update(repr((step.reward, step.discount)).encode())
@@ -72,12 +73,13 @@ class DeterminismTest(parameterized.TestCase):
     def test_across_processes(self):
         digests = [
             subprocess.run(
-                [sys.executable, '-c', self.SCRIPT, *EXAMPLES], check=True, capture_output=True,
+                [sys.executable, '-c', self.SCRIPT, *EXAMPLES, *GAITS], check=True,
+                capture_output=True,
                 text=True, env={**os.environ, 'PYTHONHASHSEED': seed},
             ).stdout.split()
             for seed in ('1', '2')
         ]  # fmt: skip
-        self.assertLen(set(digests[0]), len(EXAMPLES))
+        self.assertLen(set(digests[0]), len(EXAMPLES) + len(GAITS))
         self.assertEqual(digests[0], digests[1])
         environment = suite.make(EXAMPLES[0], {'random': 5}, {'flat_observation': True})
         environment.reset()

@@ -39,9 +39,43 @@ TERRAINS = {
 MODELS = {'PD': 'position', 'Torque': 'torque', 'MTU': 'muscle', 'Vel': 'velocity'}
 
 
+# Of the gait machines 32 are registered; the others complete what the papers name.
+GAIT_TERRAINS = {
+    'Gaps': 'gaps', 'Cliffs': 'cliffs_humanoid', 'Mixed': 'mixed', 'Slopes_Mixed': 'slopes_mixed',
+    'Slopes': 'slopes', 'Stairs_Rugged': 'cliffs_rugged', 'Walls': 'walls', 'Steps': 'steps',
+}  # fmt: skip
+GAITS = {
+    **{
+        f'FSM_{figure}_Terrain_{ground}-v0': preset
+        for figure in ('Dog2D', 'Raptor2D', 'Biped2D', 'Hopper2D')
+        for ground, preset in GAIT_TERRAINS.items()
+    },
+    'FSM_Dog2D_Terrain_Narrow_Gaps-v0': 'narrow_gaps',
+    'FSM_Dog2D_Terrain_Tight_Gaps-v0': 'tight_gaps',
+    'FSM_Dog2D_Terrain_Slopes_Gaps-v0': 'slopes_gaps0',
+    'FSM_Dog2D_Terrain_Slopes_Steps-v0': 'slopes_steps',
+    'FSM_Dog2D_Terrain_Slopes_Walls-v0': 'slopes_walls',
+    'FSM_Raptor2D_Terrain_Narrow_Gaps-v0': 'narrow_gaps',
+    'FSM_Raptor2D_Terrain_Mixed_Raptor-v0': 'mixed_raptor',
+    'FSM_Goat2D_Terrain_Variable_Steps-v0': 'cliffs_rugged',
+    'FSM_Goat2D_Terrain_Cliffs-v0': 'cliffs_humanoid',
+    'FSM_Hopper2D_Terrain_Gaps_Easy-v0': 'gaps_hopper',
+    'FSM_Hopper2D_Terrain_Mixed_Easy-v0': 'mixed_hopper',
+}
+FIGURES = {
+    'Dog2D': 'dog', 'Goat2D': 'goat', 'Raptor2D': 'raptor', 'Biped2D': 'biped2d_simbicon',
+    'Hopper2D': 'hopper',
+}  # fmt: skip
+
+
+def ids_of(rules):
+    """Rows of one task class."""
+    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == rules]
+
+
 def imitation_ids():
     """Rows of the two planar families of tracking."""
-    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'imitation']
+    return ids_of('imitation')
 
 
 class CatalogueTest(parameterized.TestCase):
@@ -52,12 +86,39 @@ class CatalogueTest(parameterized.TestCase):
         self.assertLen(rows, 42)
         self.assertLen([row for row in rows if 'original' in row.tags], 30)
         self.assertLen(ORIGINAL, 30)
+        gaits = [suite.find(id_) for id_ in ids_of('gait')]
+        self.assertLen(gaits, 43)
+        self.assertLen([row for row in gaits if 'original' in row.tags], 32)
 
     def test_the_originals_are_tagged(self):
         tagged = {id_ for id_ in imitation_ids() if 'original' in suite.find(id_).tags}
         self.assertEqual(tagged, set(ORIGINAL))
         for id_ in imitation_ids():
             self.assertLen(suite.find(id_).tags & {'original', 'completion'}, 1, id_)
+        tagged = [id_ for id_ in ids_of('gait') if 'original' in suite.find(id_).tags]
+        self.assertCountEqual(tagged, list(GAITS)[:32])
+
+    def test_gaits(self):
+        self.assertCountEqual(ids_of('gait'), GAITS)
+        for id_, preset in GAITS.items():
+            row = suite.find(id_)
+            figure = id_.split('_')[1]
+            self.assertEqual((row.terrain, row.character), (preset, FIGURES[figure]))
+            self.assertEqual((row.domain, row.actuation, row.clip), ('terrainrl', 'gait', None))
+            ground = id_.split('_', 3)[3].removesuffix('-v0')
+            self.assertEqual(row.task, f'{figure[:-2]}_{ground}'.lower())
+            self.assertEqual((dict(row.options), row.step_limit), ({}, 256))
+
+    @parameterized.parameters(*list(GAITS)[::4])
+    def test_what_an_id_of_a_gait_says(self, id_):
+        environment = suite.make(id_, {'random': 0})
+        task = environment.task
+        self.assertEqual(task.arena.terrain.name, GAITS[id_])
+        self.assertEqual(task.character.row.name, FIGURES[id_.split('_')[1]])
+        self.assertEqual(task.interface, 'parameters')
+        self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity'])
+        self.assertEqual(environment.step_limit, 256)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
     def test_names_are_unique(self):
         self.assertLen(set(suite.ALL_IDS), len(catalogue.ROWS))
@@ -112,8 +173,8 @@ class CatalogueTest(parameterized.TestCase):
     def test_tables(self):
         self.assertEqual(
             {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()
-             if domain in ('plaid', 'imitation')},
-            {'plaid': 28, 'imitation': 14},
+             if domain in ('plaid', 'imitation', 'terrainrl')},
+            {'plaid': 28, 'imitation': 14, 'terrainrl': 43},
         )  # fmt: skip
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)
@@ -166,6 +227,9 @@ class LoadTest(parameterized.TestCase):
         (lambda: suite.make(GAPS, {'randm': 3}), "unknown option.*'random'"),
         (lambda: suite.make(GAPS, {'actuation_model': 'torque'}), 'unknown option'),
         (lambda: suite.make(GAPS, None, {'flat': 1}), "unknown option.*'flat_observation'"),
+        (lambda: suite.make('FSM_Dog2D_Terrain_Gap-v0'), "'FSM_Dog2D_Terrain_Gaps-v0'"),
+        (lambda: suite.load('terrainrl', 'dog_gap'), "unknown task.*'dog_gaps'"),
+        (lambda: suite.make('terrainrl/dog_gaps', {'start_phase': 0.5}), 'unknown option'),
         (lambda: suite.build('dgo'), "unknown character 'dgo'.*'dog'"),
         (lambda: suite.build('dog', 'torqe'), "unknown actuation 'torqe'.*'torque'"),
         (lambda: suite.build('dog', terrain='gap'), "unknown terrain 'gap'.*'gaps'"),
@@ -210,7 +274,16 @@ class OptionTest(parameterized.TestCase):
         self.assertEqual(suite.make(GAPS, None, {'step_limit': 9}).step_limit, 9)
         self.assertIsNone(suite.make(GAPS, {'step_limit': None}).step_limit)
 
-    @parameterized.parameters(*suite.ALL_IDS)
+    @parameterized.parameters(*ids_of('gait'))
+    def test_common_options_on_every_gait(self, id_):
+        environment = suite.make(id_, {'random': 3, 'step_limit': 1, 'start_noise': 0.01})
+        starts = [environment.reset().observation['pose'] for _ in range(2)]
+        self.assertTrue((starts[0] != starts[1]).any())
+        step = environment.step(np.zeros(environment.action_spec().shape))
+        self.assertTrue(step.last())
+        self.assertBetween(step.reward, 0, 1)
+
+    @parameterized.parameters(*imitation_ids())
     def test_common_options_on_every_row(self, id_):
         environment = suite.make(id_, {'random': 3, 'step_limit': 2, 'start_phase': 0.5})
         step = environment.reset()

@@ -27,7 +27,7 @@ class Row:
       domain: family, for `suite.load`.
       task: name within the family, for `suite.load`.
       character: name in `trl_suite.characters.CHARACTERS`.
-      actuation: one of `trl_suite.actuation.ACTUATIONS`.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`, or 'gait'.
       terrain: preset, file, or mapping that `trl_suite.terrain.load` takes.
       rules: which task class makes it (see `trl_suite.suite`).
       clip: clip in mocap/, or None where the rules need none.
@@ -137,6 +137,50 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> Row:
     )
 
 
+# Name in ids, preset, words; then who crosses it in a completion of ours.
+_GAIT_TERRAINS = (
+    ('Gaps', 'gaps', 'gaps'),
+    ('Cliffs', 'cliffs_humanoid', 'drops'),
+    ('Mixed', 'mixed', 'a mix of gaps, walls and steps'),
+    ('Slopes_Mixed', 'slopes_mixed', 'gaps, walls and steps on rolling slopes'),
+    ('Slopes', 'slopes', 'rolling slopes'),
+    ('Stairs_Rugged', 'cliffs_rugged', 'rugged stairs'),
+    ('Walls', 'walls', 'walls'),
+    ('Steps', 'steps', 'steps up and down'),
+)
+_GAIT_CHARACTERS = {
+    'biped2d_simbicon': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D', 'hopper': 'Hopper2D',
+}  # fmt: skip
+_MORE_GAITS = (
+    ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
+    ('dog', 'Tight_Gaps', 'tight_gaps', 'clusters of gaps with little room between'),
+    ('dog', 'Slopes_Gaps', 'slopes_gaps0', 'gaps on rolling slopes'),
+    ('dog', 'Slopes_Steps', 'slopes_steps', 'steps on rolling slopes'),
+    ('dog', 'Slopes_Walls', 'slopes_walls', 'walls on rolling slopes'),
+    ('raptor', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
+    ('raptor', 'Mixed_Raptor', 'mixed_raptor', 'gaps, walls and steps of its own size'),
+    ('goat', 'Variable_Steps', 'cliffs_rugged', 'rugged stairs'),
+    ('goat', 'Cliffs', 'cliffs_humanoid', 'drops'),
+    ('hopper', 'Gaps_Easy', 'gaps_hopper', 'gaps of its own size'),
+    ('hopper', 'Mixed_Easy', 'mixed_hopper', 'gaps, walls and steps of its own size'),
+)
+
+
+def _gait(character: str, name: str, preset: str, words: str, original: bool) -> Row:
+    figure = {**_GAIT_CHARACTERS, 'goat': 'Goat2D'}[character]
+    return Row(
+        id=f'FSM_{figure}_Terrain_{name}-v0',
+        domain='terrainrl',
+        task=f'{figure[:-2].lower()}_{name.lower()}',
+        character=character,
+        actuation='gait',
+        terrain=preset,
+        rules='gait',
+        description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait of a cycle.',
+        tags=frozenset({'planar', 'original' if original else 'completion'}),
+    )
+
+
 _BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
 
 ROWS: tuple[Row, ...] = (
@@ -161,6 +205,12 @@ ROWS: tuple[Row, ...] = (
     ),
     _imitation('biped2d', 'position', 'biped2d_run', original=False),
     _imitation('biped2d', 'muscle', 'biped2d_run', original=False),
+    *(
+        _gait(character, *terrain, original=True)
+        for character in _GAIT_CHARACTERS
+        for terrain in _GAIT_TERRAINS
+    ),
+    *(_gait(*row, original=False) for row in _MORE_GAITS),
 )  # fmt: skip
 
 BY_ID: dict[str, Row] = {row.id: row for row in ROWS}

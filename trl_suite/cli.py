@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 POLICIES = ('reference', 'clip', 'zero', 'random')  # or a file
 SHOWN_EPISODES = 8  # episodes that a rollout prints one by one
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
+_ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
 _FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
 
 
@@ -209,13 +210,21 @@ def _rollout(arguments: argparse.Namespace) -> None:
     record = _Record(environment)
     with contextlib.ExitStack() as stack:
         video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
+
+        def picture() -> np.ndarray:
+            return rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
+
+        watched = video and stack.enter_context(
+            rendering.watching(environment, lambda: video.add(picture()))
+        )
         for done, time_step, action in _run(environment, policy, arguments.steps):
             record.add(time_step, action)
             into_strip = arguments.strip is not None and done in in_strip
-            if not (video or into_strip):
+            into_video = video and (time_step.first() or not watched)
+            if not (into_video or into_strip):
                 continue
-            image = rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
-            if video:
+            image = picture()
+            if into_video:
                 video.add(image)
             if into_strip:
                 in_strip.discard(done)  # the start that follows an end has the same number
@@ -310,7 +319,7 @@ class _Record:
         episode['distance'] = info.get('distance', 0.0)
         if time_step.last():
             cut = 'was cut' if time_step.discount else 'failed'
-            episode['end'] = next((end for end in ('fell', 'diverged') if info.get(end)), cut)
+            episode['end'] = next((end for end in _ENDS if info.get(end)), cut)
 
     def arrays(self) -> dict[str, Any]:
         """The rows as arrays; actions[i] was taken from observations[i], if step i had any."""

@@ -14,7 +14,7 @@ from trl_suite import catalogue
 if TYPE_CHECKING:
     from trl_suite.environment import Environment
 
-# Unit and meaning of the observation blocks.
+# Unit and meaning of the observation blocks, of the imitation of a clip and of gaits.
 _BLOCKS = {
     'terrain': ('m', 'ground heights from 0.5 m behind to 3 m ahead, above the ground at the root'),
     'pose': ('m', 'root height above ground; then x, z of each link centre from the root'),
@@ -26,15 +26,59 @@ _BLOCKS = {
         "the clip's root height; its link centres from its root; their velocities",
     ),
 }
+_GAIT_BLOCKS = {
+    'terrain': (
+        'm',
+        'ground heights from 0.5 m behind to 10 m ahead, above the ground at the root',
+    ),
+    'pose': ('m', 'root height above ground; then x, z of each other link centre from the root'),
+    'velocity': ('m/s', 'x, z velocity of each link centre'),
+}
+_STANCE_FIRST = '; the stance leg first, then the swing leg'
+_HOPPER_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
+# Units of gait parameters that are no angles, by name without state.
+_GAIT_UNITS = {
+    'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
+    **dict.fromkeys(
+        ('BackForceX', 'BackForceY', 'FrontForceX', 'FrontForceY', 'ForceX', 'ForceY'), 'N'
+    ),
+}  # fmt: skip
 
 # What differs from the original, as (applies to a row?, sentence); docs/differences.md has reasons.
+_ANY, _CLIP, _GAIT = (
+    lambda row: True, lambda row: row.rules == 'imitation', lambda row: row.rules == 'gait',
+)  # fmt: skip
 _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (
         lambda row: 'completion' in row.tags,
         'not in the registry of the original: a combination that its papers name or imply',
     ),
-    (lambda row: True, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
-    (lambda row: True, 'actions are in [-1, 1] and clipped; the original takes physical units'),
+    (_CLIP, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
+    (_GAIT, 'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at which they fall here'),
+    (_CLIP, 'actions are in [-1, 1] and clipped; the original takes physical units'),
+    (
+        _GAIT,
+        'actions are in [-1, 1], clipped, and mapped to the parameters that are learnt; the original takes '
+        'them for the first of all parameters, so that most mean another',
+    ),
+    (_GAIT, 'a step ends with its cycle or a fall, not up to 1/30 s later; the first action of an episode counts'),
+    (_GAIT, 'the reward is of the cycle that the action made, and never NaN'),
+    (
+        lambda row: row.rules == 'gait' and row.character == 'hopper',
+        '9 parameters, taken at touch-down; the original announces 8 and takes them in mid-air',
+    ),
+    (
+        lambda row: row.rules == 'gait' and row.character == 'raptor',
+        "action 0 is the original's base action 1, which is steadier than its base action 0",
+    ),
+    (
+        lambda row: row.rules == 'gait' and row.character == 'biped2d_simbicon',
+        "action 0 is a gait tuned anew: the original's falls here; torque is not rewarded",
+    ),
+    (
+        lambda row: row.rules == 'gait' and row.character == 'goat',
+        'the original has the gait and no environment for it',
+    ),
     (
         lambda row: row.actuation == 'position',
         'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
@@ -69,49 +113,41 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         lambda row: isinstance(row.terrain, str) and row.terrain != 'flat',
         'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
     ),
-    (lambda row: True, f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)'),
+    (_ANY, f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)'),
 )  # fmt: skip
 
 
 def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str, str]]:
     """Yields titles and texts: character, observation, action, rules, time, differences."""
+    from trl_suite.tasks.gait import GaitTask
     from trl_suite.tasks.imitation import Imitation
 
     task: Any = environment.task
-    if isinstance(task, Imitation):
+    gait = isinstance(task, GaitTask)
+    if isinstance(task, (GaitTask, Imitation)):
         yield from _character(environment)
-    action_map = environment.action_map
+    if gait:
+        yield from _gait(task)
+    meanings = _gait_blocks(task) if gait else _BLOCKS
     size = max(part.stop for part in environment.blocks.values())
     yield (
         f'Observation: {size} numbers, in this order',
         table(
             ('block', 'from', 'to', 'size', 'unit', 'meaning'),
             (
-                (name, part.start, part.stop, part.stop - part.start, *_BLOCKS.get(name, ('', '')))
+                (name, part.start, part.stop, part.stop - part.start, *meanings.get(name, ('', '')))
                 for name, part in environment.blocks.items()
             ),
         ),
     )
-    limits = _limits(environment)
-    unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
-    yield (
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = centre + '
-        'half range * action',
-        table(
-            ('drives', 'centre', 'half range', limits[0]),
-            zip(action_map.names, *(_floats(v) for v in (
-                action_map.centre, action_map.half_range, limits[1]
-            )), strict=True),
-        ),
-    )  # fmt: skip
-    if isinstance(task, Imitation):
+    yield _gait_action(task) if gait else _action(environment)
+    if isinstance(task, (GaitTask, Imitation)):
+        yield _terrain(task)
+    if gait:
+        yield from _gait_rules(task)
+    elif isinstance(task, Imitation):
         yield from _rules(environment)
-    control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
-    yield (
-        'Time',
-        f'  control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
-        f'{row.step_limit} steps, {row.step_limit * task.control_timestep:.3g} s',
-    )
+    yield 'Time', _gait_time(row, task) if gait else _time(row, task)
     yield (
         'Differs from the original (reasons in docs/differences.md)',
         '\n'.join(f'  - {text}' for applies, text in _DIFFERENCES if applies(row)),
@@ -134,17 +170,45 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
         f'  {row.description}\n  {figures["mass"]:.4g} kg, stands {figures["standing_height"]:.3g} m '
         f'high at the root, {len(row.links)} links, {len(row.joints)} joints',
     )
+    # The last column: a weight in a reward that has none of a gait, or what a gait tracks.
+    gait = getattr(task, 'gait', None)
     masses = _floats(environment.physics.bind(character.bodies).mass)
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', '')]
-    for (name, joint), mass, (low, high), limit in zip(
-        row.joints.items(), masses[1:], character.joint_ranges, character.torque_limits, strict=True
-    ):
+    for (name, joint), mass, (low, high), limit, slides in zip(
+        row.joints.items(), masses[1:], character.joint_ranges, character.torque_limits,
+        character.prismatic, strict=True,
+    ):  # fmt: skip
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
-        cells.append(
-            (name, mass, reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}', joint.weight)
-        )
-    header = ('link and joint', 'kg', 'range (rad)', 'limit (N m)', 'kp', 'kd', 'reward weight')
+        last: object = joint.weight
+        if gait is not None:
+            last = 'the world' if name in gait.world_joints else 'its parent'
+        units = ('m', 'N', 'N/m', 'N s/m') if slides else ('', '', '', '')
+        figure = (reach, f'{limit:g}', f'{joint.kp:g}', f'{joint.kd:g}')
+        cells.append((
+            name, mass, *(f'{text} {unit}'.rstrip() for text, unit in zip(figure, units, strict=True)),
+            last,
+        ))  # fmt: skip
+    header = (
+        'link and joint', 'kg', 'range (rad)', 'limit (N m)', 'kp (N m/rad)', 'kd (N m s/rad)',
+        'reward weight' if gait is None else 'target to',
+    )  # fmt: skip
     yield 'Links', table(header, cells)
+
+
+def _action(environment: Environment) -> tuple[str, str]:
+    action_map = environment.action_map
+    limits = _limits(environment)
+    unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
+    return (
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = centre + '
+        'half range * action',
+        table(
+            ('drives', 'centre', 'half range', limits[0]),
+            zip(action_map.names, *(_floats(v) for v in (
+                action_map.centre, action_map.half_range, limits[1]
+            )), strict=True),
+        ),
+    )  # fmt: skip
 
 
 def _limits(environment: Environment) -> tuple[str, Any]:
@@ -157,18 +221,32 @@ def _limits(environment: Environment) -> tuple[str, Any]:
     return 'torque limit (N m)', [limits[name] for name in environment.action_map.names]
 
 
+def _terrain(task: Any) -> tuple[str, str]:
+    ground = task.arena.terrain
+    parameters = ', '.join(f'{name} {value:g}' for name, value in ground.parameters().items())
+    sets = len(ground.parameter_sets)
+    more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
+    return f'Terrain: {ground.name} ({ground.type})', _fold(
+        f'{parameters or "no parameters"}{more}'
+    )
+
+
+def _time(row: catalogue.Row, task: Any) -> str:
+    control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
+    return (
+        f'  control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
+        f'{row.step_limit} steps, {row.step_limit * task.control_timestep:.3g} s'
+    )
+
+
+# Imitation of a clip
+
+
 def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
     from trl_suite.tasks import rewards
 
     task: Any = environment.task
-    ground, clip, row = task.arena.terrain, task.clip, task.character.row
-    parameters = ', '.join(f'{name} {value:g}' for name, value in ground.parameters().items())
-    sets = len(ground.parameter_sets)
-    more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
-    yield (
-        f'Terrain: {ground.name} ({ground.type})',
-        _fold(f'{parameters or "no parameters"}{more}'),
-    )
+    clip, row = task.clip, task.character.row
     yield (
         f'Clip: {clip.name}',
         f'  {clip.description}; period {clip.duration:.4g} s, {clip.speed:.3g} m/s',
@@ -186,6 +264,142 @@ def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
             f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
             'or the physics diverges'
         ),
+    )
+
+
+# Gaits
+
+
+def _gait(task: Any) -> Iterator[tuple[str, str]]:
+    figures = task.gait.parameters
+    yield (
+        f'Gait: {len(figures.states)} states; joints are driven to targets by stable PD',
+        table(('state', 'ends'), zip(figures.states, task.gait.endings, strict=True)),
+    )
+    chosen = [
+        name for name, values in figures.sets.items() if np.array_equal(values, figures.centre)
+    ]
+    chosen += [f'base action {i}' for i in _same(figures.base_actions, figures.centre)]
+    lines = [
+        table(
+            ('base action', 'parameter set'),
+            (
+                (i, f'{a} {1 - share:g}, {b} {share:g}' if 0 < share < 1 else b if share else a)
+                for i, (a, b, share) in enumerate(figures.blends)
+            ),
+        ),
+        _fold(f'action 0 is {" = ".join(chosen)}'),
+        _fold(f'sign does not count: {", ".join(figures.names[i] for i in figures.absolute)}'),
+    ]
+    values = {
+        name: figures.centre[i] for i, name in enumerate(figures.names) if i not in figures.actions
+    }
+    if values:
+        fixed = (
+            f'{name} {value:g} {_gait_unit(task, name)}' if value else f'{name} 0'
+            for name, value in values.items()
+        )
+        lines.append(_fold(f'fixed: {", ".join(fixed)}'))
+    yield (
+        f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
+        '\n'.join(lines),
+    )
+
+
+def _same(rows: np.ndarray, vector: np.ndarray) -> list[int]:
+    return np.flatnonzero((rows == vector).all(1)).tolist()
+
+
+def _gait_blocks(task: Any) -> dict[str, tuple[str, str]]:
+    row = task.character.row
+    ends = _HOPPER_ENDS if row.name == 'hopper' else {}
+    if row.mirror:
+        ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
+    return {
+        name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _GAIT_BLOCKS.items()
+    }
+
+
+def _gait_action(task: Any) -> tuple[str, str]:
+    action_map, count = task.action_map, len(task.action_map)
+    if task.interface == 'base_action':
+        return (
+            f'Action: {count} numbers in [-1, 1]; the largest chooses the base action',
+            _fold('it begins with the next cycle'),
+        )
+    return (
+        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
+        table(
+            ('sets', 'centre', 'half range', 'unit'),
+            zip(
+                action_map.names, _floats(action_map.centre), _floats(action_map.half_range),
+                (_gait_unit(task, name) for name in action_map.names), strict=True,
+            ),
+        ),
+    )  # fmt: skip
+
+
+def _gait_unit(task: Any, parameter: str) -> str:
+    own = parameter.split('.')[-1]
+    slides = own == 'Knee' and task.character.prismatic.any()
+    return 'm' if slides else _GAIT_UNITS.get(own, 'rad')
+
+
+def _gait_rules(task: Any) -> Iterator[tuple[str, str]]:
+    from trl_suite.tasks import gait
+
+    row, weights = task.character.row, task.reward_weights
+    weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
+    lines = [
+        f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {task.gait.parameters.target_speed:g})^2)',
+        'v: mean forward speed of the centre of mass, m/s',
+    ]
+    if weights['stumble']:
+        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait.STUMBLE_SHARPNESS:g} s)'
+        lines.append(
+            's: share of the time in which a link other than '
+            f'{", ".join(row.stumble_exempt)} touches the ground'
+        )
+    if row.name in gait.NO_REWARD_BACKWARDS:
+        lines.append('0 if v is negative')
+    yield (
+        'Reward of a cycle, at most 1; 0 after a fall',
+        '\n'.join(_fold(line) for line in lines),
+    )
+    samples = _samples_until_fall(gait)
+    links = ', '.join(row.fall_links)
+    rules = [
+        f'{"one of " if len(row.fall_links) > 1 else ""}{links} touches the ground in {samples} looks '
+        'in a row, or often enough',
+        f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
+        f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
+        'the physics diverges',
+    ]
+    if row.name in gait.FORWARD_ONLY:
+        rules.insert(2, 'it moves backwards')
+    yield (
+        f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',
+        '\n'.join(_fold(f'- {rule}') for rule in rules),
+    )
+
+
+def _samples_until_fall(gait: Any) -> int:
+    down, count = 0.0, 0
+    while down <= gait.FALLEN:
+        down, count = gait.FADING * down + gait.SHARE, count + 1
+    return count
+
+
+def _gait_time(row: catalogue.Row, task: Any) -> str:
+    from trl_suite.tasks import gait
+
+    control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
+    step = f'one cycle, at most {gait.LONGEST_CYCLE * gait.FRAME:.3g} s'
+    if task.interface == 'base_action':
+        step = f'{gait.FRAME:.3g} s'
+    return (
+        f'  a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
+        f'  (discount 1) after {row.step_limit} steps'
     )
 
 

@@ -97,6 +97,8 @@ def frames(
 ) -> Iterator[np.ndarray]:
     """Runs a policy from a reset on, over ends of episodes, and draws every state.
 
+    Where a step lasts longer than 1/30 s (gaits), every 1/30 s is drawn instead of every state.
+
     Args:
       environment: is reset and stepped.
       policy: time step -> action; not asked at the end of an episode.
@@ -106,14 +108,37 @@ def frames(
     Yields:
       One picture per state: steps of them, one more for every reset.
     """
+    within: list[np.ndarray] = []
+
+    def look() -> None:
+        within.append(frame(environment, **options))
+
     time_step = environment.reset()
     yield frame(environment, **options)
     for _ in range(steps):
         if time_step.last():
             time_step = environment.reset()
             yield frame(environment, **options)
-        time_step = environment.step(policy(time_step))
-        yield frame(environment, **options)
+        within.clear()
+        with watching(environment, look) as watched:
+            time_step = environment.step(policy(time_step))
+        if not watched:
+            look()
+        yield from within
+
+
+@contextlib.contextmanager
+def watching(environment: composer.Environment, look: Callable[[], None]) -> Iterator[bool]:
+    """Has `look` called every 1/30 s where steps last longer; yields whether that is so."""
+    task: Any = environment.task
+    watched = hasattr(task, 'watch')
+    if watched:
+        task.watch = look
+    try:
+        yield watched
+    finally:
+        if watched:
+            task.watch = None
 
 
 def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:

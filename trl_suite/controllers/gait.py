@@ -109,6 +109,7 @@ class Gait:
     # What a kind of gait has of its own.
 
     world_joints: tuple[str, ...] = ()  # whose targets are angles in the world
+    endings: tuple[str, ...] = ()  # what ends each state, in words
 
     def enter(self, rows: np.ndarray) -> None:
         """Sets the joint targets of the states that rows are in."""
@@ -223,6 +224,10 @@ class Bound(Gait):
     _spine = ('spine0', 'spine1', 'spine2', 'spine3', 'torso')
     _limbs = ('shoulder', 'elbow', 'hip', 'knee', 'ankle')
     _no_gravity_compensation = ('goat',)
+    endings = (
+        'after TransTime', 'finger touches the ground', 'after TransTime',
+        'toe touches the ground: end of the cycle',
+    )  # fmt: skip
 
     def bind(self, world: World) -> None:
         super().bind(world)
@@ -326,6 +331,11 @@ class Stride(Gait):
         """Name of the link that steps, without side."""
         return 'toe' if 'right_toe' in self.character.row.joints else 'ankle'
 
+    @property
+    def endings(self) -> tuple[str, ...]:  # type: ignore[override]
+        foot = f"the swing leg's {self.foot_link} touches the ground"
+        return *3 * ('after TransTime',), f'{foot}: end of the cycle, the legs change places'
+
     def begin(self, rows: np.ndarray) -> None:
         self.stance[rows] = 0
         super().begin(rows)
@@ -382,6 +392,10 @@ class Hop(Gait):
     """
 
     world_joints = ('hip',)
+    endings = (
+        'leg touches the ground: end of the cycle', 'root turns upwards', 'leg leaves the ground',
+        'root turns downwards; if leg touches the ground first, back to UpStance',
+    )  # fmt: skip
 
     def bind(self, world: World) -> None:
         super().bind(world)

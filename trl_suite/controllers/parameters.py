@@ -45,6 +45,7 @@ class Parameters:
       target_speed: m/s.
       sets: name -> (P,).
       base_actions: (8 or so, P).
+      blends: of each base action: a set, another, and the other's share.
       centre: what action 0 means, (P,).
       half_range: largest deviation of a base action from the first one, (P,); what action 1 adds.
       search_scale: standard deviation for a search, (P,).
@@ -60,6 +61,7 @@ class Parameters:
     target_speed: float
     sets: dict[str, np.ndarray]
     base_actions: np.ndarray
+    blends: tuple[tuple[str, str, float], ...]
     centre: np.ndarray
     half_range: np.ndarray
     search_scale: np.ndarray
@@ -127,6 +129,7 @@ def read(data: dict[str, Any]) -> Parameters:
         target_speed=data['target_speed'],
         sets=sets,
         base_actions=base,
+        blends=tuple((a, b, float(blend)) for a, b, blend in data['base_actions']),
         centre=sets[centre] if isinstance(centre, str) else base[centre],
         half_range=np.abs(base - base[0]).max(0),
         search_scale=np.array([data['search_scale'][name.split('.')[-1]] for name in names]),

@@ -7,7 +7,7 @@ the environment's discount is 0 after a fall and 1 otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,6 +38,7 @@ SAMPLE = 0.1  # s
 FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples with a fall link down
 TURNED = 0.8 * np.pi  # rad
 PATIENCE, PROGRESS = 5.0, 0.5  # s, m; who moves less than that in that time is stuck
+NO_REWARD_BACKWARDS = ('raptor',)
 FORWARD_ONLY = ('biped2d_simbicon',)  # characters whose root may not move backwards
 MAX_JOINT_SPEED = 1000.0  # rad/s; feet whip: there is no damping in these joints
 
@@ -58,9 +59,14 @@ class GaitTask(Task):
     relative to the ground under it; 'pose', height of the root and (x, z) of every other link
     relative to it; 'velocity', (x, z) of every link. Bipeds show the leg that is to swing last; of
     the hopper's last link z becomes the root's pitch in pose and its rate in velocity.
+
+    Attributes:
+      watch: called at every multiple of 1/30 s of the first simulation's episode, within steps too;
+        for pictures.
     """
 
     fields = dynamics.FIELDS
+    watch: Callable[[], None] | None = None
 
     def __init__(
         self,
@@ -124,7 +130,7 @@ class GaitTask(Task):
         self.blocks = consecutive({
             'terrain': SAMPLES, 'pose': 2 * links - 1, 'velocity': 2 * links,
         })  # fmt: skip
-        self._weights = ONLY_SPEED if character.row.name == 'hopper' else WEIGHTS
+        self.reward_weights = ONLY_SPEED if character.row.name == 'hopper' else WEIGHTS
 
     @property
     def root_entity(self) -> PlanarTerrain:
@@ -151,7 +157,7 @@ class GaitTask(Task):
         self._view = self._views()
         self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
         self.reward = np.zeros(n)
-        self.reward_terms = np.zeros((n, len(self._weights)))
+        self.reward_terms = np.zeros((n, len(self.reward_weights)))
         self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
         self._fallen, self._stuck = np.zeros(n, bool), np.zeros(n, bool)
         self._lasted, self._stumbled = np.zeros((2, n), int)  # control steps, of the last step
@@ -256,6 +262,8 @@ class GaitTask(Task):
             self.world.step(self._control_steps, None if len(going) == self.world.n else going)
             ended = self.gait.advance(going)
             self._account(going)
+            if self.watch is not None and self._age[0] % _FRAME_STEPS == 0:
+                self.watch()
             over = self.failed[going]
             if by_cycle:
                 over |= ended
@@ -316,10 +324,12 @@ class GaitTask(Task):
         speed = travelled / (CONTROL_TIMESTEP * lasted)
         target = self.gait.parameters.target_speed
         terms = self.reward_terms
-        terms[rows, 0] = self._weights['speed'] * np.exp(-SPEED_SHARPNESS * (speed - target) ** 2)
+        terms[rows, 0] = self.reward_weights['speed'] * np.exp(
+            -SPEED_SHARPNESS * (speed - target) ** 2
+        )
         share = self._stumbled[rows] / lasted
-        terms[rows, 1] = self._weights['stumble'] / (1 + STUMBLE_SHARPNESS * share)
-        if self.character.row.name == 'raptor':
+        terms[rows, 1] = self.reward_weights['stumble'] / (1 + STUMBLE_SHARPNESS * share)
+        if self.character.row.name in NO_REWARD_BACKWARDS:
             terms[rows[speed < 0]] = 0.0
         terms[self.failed] = 0.0
         self.reward[...] = terms.sum(1)
@@ -346,7 +356,7 @@ class GaitTask(Task):
     def infos(self) -> dict[str, Any]:
         """Reward terms, how it ended, distance in m, duration of the cycle in s, its stumbling."""
         return {
-            'reward_terms': dict(zip(self._weights, self.reward_terms.T.copy(), strict=True)),
+            'reward_terms': dict(zip(self.reward_weights, self.reward_terms.T.copy(), strict=True)),
             'fell': self._fallen & ~self.diverged,
             'stuck': self._stuck & ~self.diverged,
             'diverged': self.diverged.copy(),

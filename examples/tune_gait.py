@@ -1,0 +1,355 @@
+"""Searches the gait that is a character's action 0, or measures how gaits do.
+
+    python examples/tune_gait.py --evaluate                 # of all characters, on flat ground
+    python examples/tune_gait.py goat --evaluate --start climb0_020 --terrain steps --friction 0.6
+    python examples/tune_gait.py goat --start climb0_050 --seed 1
+
+A search writes the gait that it found into `trl_suite/controllers/CHARACTER.json` as set 'tuned',
+with a record of the search, and makes it action 0. It is CMA-ES (Hansen 2016, arXiv:1604.00772) over
+the parameters that an action sets, in units of the gait's search scale. A gait's score in an episode
+is the share of the horizon that it stays up * (0.5 + 0.5 exp(-0.5 (v - target)^2)) + 0.02 for each
+cycle, of up to 15, that was one; it counts with the mean over noisy starts, the same ones for all
+candidates of a generation, on slippery, ordinary and rough ground in turn. A first horizon is short,
+the second one long; last, the distribution's mean and the best candidates of late generations meet on
+new starts. Needs `pip install 'trl_suite[tune]'`; measuring does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import os
+import pathlib
+import re
+import time
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from trl_suite import errors
+from trl_suite.catalogue import Row
+from trl_suite.controllers import CONTROL_TIMESTEP, GAITS, Parameters, load, parameters
+from trl_suite.tasks.gait import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
+from trl_suite.vector import VectorEnvironment
+
+START_NOISE = 0.01  # rad, of the joints; see `GaitTask`
+HORIZONS = (6.0, 20.0)  # s, of the two parts of a search
+FRICTIONS = (0.81, 0.6, 1.0)  # of the starts of a candidate, in turn; the suite's own first
+EPISODES, EVALUATION_SEED = 20, 0  # of published figures
+FINAL_SEED = 2**31  # from which the finalists' starts are drawn, with the seed of the search
+FINALISTS = 7  # the best of so many last generations, and the mean of the distribution
+CYCLE, MOST_CYCLES, BONUS = 0.1, 15, 0.02  # s, of the shortest; how many count; what each is worth
+REACH = 1000.0  # search scales from the centre that an action may be; it never is
+DIGITS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """What became of n episodes; arrays of n rows.
+
+    Attributes:
+      horizon: s that each was to last.
+      upright: whether it did.
+      time: s that it lasted.
+      distance: m that the centre of mass has travelled.
+      cycles: how many were proper: forward, ended by the state machine, and not at once.
+    """
+
+    horizon: float
+    upright: np.ndarray
+    time: np.ndarray
+    distance: np.ndarray
+    cycles: np.ndarray
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Mean over the episode, m/s."""
+        return self.distance / self.time
+
+    def score(self, target: float) -> np.ndarray:
+        share = np.where(self.upright, 1.0, np.minimum(self.time / self.horizon, 1.0))
+        quick = 0.5 + 0.5 * np.exp(-0.5 * (self.speed - target) ** 2)
+        return share * quick + BONUS * np.minimum(self.cycles, MOST_CYCLES)
+
+
+class Bench:
+    """Episodes of one character, each with a gait, a noisy start and a friction of its own."""
+
+    def __init__(
+        self,
+        character: str,
+        rows: int,
+        terrain: str = 'flat',
+        substeps: int = SUBSTEPS,
+        threads: int = 1,
+    ) -> None:
+        """Compiles the model and makes so many rows of it."""
+        row = Row(
+            id=f'{character}/gait/{terrain}/tuning', domain='custom', task='tuning',
+            character=character, actuation='gait', terrain=terrain, rules='gait',
+            options=MappingProxyType({'start_noise': START_NOISE, 'substeps': substeps}),
+            description='Gaits are measured.',
+        )  # fmt: skip
+        self.environments = VectorEnvironment(row, rows, threads, seed=0)
+        task = self.environments.task
+        assert isinstance(task, GaitTask)
+        self.task, gait = task, task.gait
+        self.scale = REACH * gait.parameters.search_scale
+        # So that actions in [-1, 1] reach every candidate.
+        gait.parameters = dataclasses.replace(gait.parameters, half_range=self.scale)
+        self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
+
+    def run(
+        self, vectors: np.ndarray, seeds: np.ndarray, horizon: float, friction: np.ndarray
+    ) -> Runs:
+        """Runs every row until it falls or the horizon is over.
+
+        Args:
+          vectors: parameters of the gait of each row, (n, P).
+          seeds: of the starts, (n,).
+          horizon: s.
+          friction: coefficient of sliding friction of ground and character, (n,).
+        """
+        task, world, count = self.task, self.task.world, len(vectors)
+        for row in np.flatnonzero(friction != self.frictions).tolist():
+            world.models[row].geom_friction[:, 0] = friction[row]
+            world.set_const(row)
+        self.frictions = np.array(friction, float)
+        self.environments.reset(seed=[int(seed) for seed in seeds])
+        task.act(np.array([task.gait.parameters.action(vector) for vector in vectors]))
+        everyone = np.arange(count)
+        start = task.gait.dynamics.com(everyone)[:, 0]
+        elapsed, distance = np.zeros((2, count))
+        cycles, going = np.zeros(count, int), np.ones(count, bool)
+        upright = np.ones(count, bool)
+        while going.any():
+            rows = np.flatnonzero(going)
+            task.simulate(rows)
+            task.finish_step(going)
+            duration, failed = task.infos()['duration'][rows], task.failed[rows]
+            elapsed[rows] += duration
+            now = np.nan_to_num(task.gait.dynamics.com(rows)[:, 0] - start[rows])
+            whole = (duration > CYCLE) & (duration < LONGEST_CYCLE * FRAME - CONTROL_TIMESTEP)
+            cycles[rows] += whole & ~failed & (now > distance[rows])
+            distance[rows] = now
+            in_time = elapsed[rows] < horizon
+            upright[rows] = ~(failed & in_time)
+            going[rows] = ~failed & in_time
+        return Runs(horizon, upright, elapsed, distance, cycles)
+
+
+def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
+    """The parameters of a set by name, a base action by number, or action 0."""
+    if start is None:
+        return gait.centre
+    if start.isdecimal() and int(start) < len(gait.base_actions):
+        return gait.base_actions[int(start)]
+    if start not in gait.sets:
+        known = [*gait.sets, *map(str, range(len(gait.base_actions)))]
+        raise ValueError(errors.unknown('set or base action', start, known))
+    return gait.sets[start]
+
+
+def measure(
+    bench: Bench, vector: np.ndarray, frictions: Sequence[float], seed: int = EVALUATION_SEED
+) -> Runs:
+    """Runs a gait on all rows for the longer horizon, from the same starts for each friction."""
+    rows = bench.environments.num_envs
+    starts = rows // len(frictions)
+    seeds = np.random.SeedSequence(seed).generate_state(starts)
+    return bench.run(
+        np.tile(vector, (rows, 1)),
+        np.tile(seeds, len(frictions)),
+        HORIZONS[1],
+        np.repeat(frictions, starts),
+    )
+
+
+def record(runs: Runs, target: float) -> dict[str, Any]:
+    """The figures that are published of a gait."""
+    speed = runs.speed
+    return {
+        'upright': f'{int(runs.upright.sum())}/{len(speed)}',
+        'speed': round(float(speed.mean()), 2),
+        'speed_range': [round(float(speed.min()), 2), round(float(speed.max()), 2)],
+        'time': round(float(np.minimum(runs.time, runs.horizon).mean()), 1),
+        'distance': round(float(runs.distance.mean()), 1),
+        'score': round(float(runs.score(target).mean()), 3),
+    }
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    choices = itertools.product(arguments.characters or GAITS, arguments.terrain)
+    for character, terrain in choices:
+        bench = Bench(character, arguments.episodes, terrain, arguments.substeps, arguments.threads)
+        gait = load(character)
+        for friction in arguments.friction:
+            runs = measure(bench, vector_of(gait, arguments.start), [friction])
+            found = record(runs, gait.target_speed)
+            slowest, quickest = found['speed_range']
+            print(
+                f'{character:17} {terrain}, friction {friction:4}  '
+                f'upright {found["upright"]:>5}  '
+                f'{found["speed"]:5.2f} m/s ({slowest:5.2f} to {quickest:5.2f})  '
+                f'{found["time"]:4.1f} s  {found["distance"]:5.1f} m  score {found["score"]:.3f}',
+                flush=True,
+            )
+        bench.environments.close()
+
+
+def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
+    """Returns the gait that was found, and a record of the search."""
+    import cma
+
+    (character,) = arguments.characters
+    gait, starts = load(character), arguments.starts
+    start, places, target = vector_of(gait, arguments.start), gait.actions, gait.target_speed
+    rng = np.random.default_rng(arguments.seed)
+    population = arguments.population
+    bench = Bench(character, population * starts, 'flat', arguments.substeps, arguments.threads)
+    frictions = list(dict.fromkeys(arguments.friction))
+
+    def vectors(candidates: np.ndarray) -> np.ndarray:
+        result = np.tile(start, (len(candidates), 1))
+        result[:, places] += np.asarray(candidates) * gait.search_scale[places]
+        result[:, gait.absolute] = np.abs(result[:, gait.absolute])
+        return result
+
+    strategy = cma.CMAEvolutionStrategy(
+        np.zeros(len(places)),
+        arguments.sd,
+        {
+            'popsize': population,
+            'CMA_diagonal': arguments.separable,
+            'seed': int(rng.integers(1, 2**31)),
+            'verbose': -9,
+        },
+    )
+    began, evaluations, simulated = time.monotonic(), 0, 0.0
+    finalists: list[np.ndarray] = []
+    horizons = np.repeat(HORIZONS, arguments.generations).tolist()
+    for number, horizon in enumerate(horizons, 1):
+        candidates = strategy.ask()
+        seeds = rng.integers(2**32, size=starts)
+        runs = bench.run(
+            np.repeat(vectors(candidates), starts, axis=0),
+            np.tile(seeds, population),
+            horizon,
+            np.tile(np.resize(frictions, starts), population),
+        )
+        scores = runs.score(target).reshape(population, starts).mean(1)
+        strategy.tell(candidates, -scores)
+        evaluations += len(runs.time)
+        simulated += float(runs.time.sum())
+        best = scores.argmax()
+        mine = slice(best * starts, (best + 1) * starts)
+        finalists = [*finalists, candidates[best]][-FINALISTS:]
+        print(
+            f'{number:3}/{len(horizons)} {horizon:2.0f} s  best {scores[best]:.3f} '
+            f'({runs.upright[mine].sum()}/{starts} upright, {runs.speed[mine].mean():.2f} m/s)  '
+            f'mean {scores.mean():.3f} ({runs.upright.mean():.0%} upright)  '
+            f'sd {strategy.sigma:.2f}  {time.monotonic() - began:.0f} s',
+            flush=True,
+        )
+    bench.environments.close()
+    rows = EPISODES * len(frictions)
+    bench = Bench(character, rows, 'flat', arguments.substeps, arguments.threads)
+    found, most = start, -np.inf
+    for vector in vectors([strategy.result.xfavorite, *finalists]):
+        vector = vector.round(DIGITS)
+        runs = measure(bench, vector, frictions, FINAL_SEED + arguments.seed)
+        score = float(runs.score(target).mean())
+        print(
+            f'finalist: {score:.3f} ({runs.upright.sum()}/{len(runs.upright)} upright)', flush=True
+        )
+        if score > most:
+            found, most = vector, score
+    bench.environments.close()
+    bench = Bench(character, EPISODES, 'flat', SUBSTEPS, arguments.threads)
+    runs = measure(bench, found, FRICTIONS[:1])
+    bench.environments.close()
+    return found, {
+        'start': arguments.start or 'centre',
+        'seed': arguments.seed,
+        'sd': arguments.sd,
+        'population': population,
+        'starts': starts,
+        'generations': arguments.generations,
+        'evaluations': evaluations,
+        'simulated_seconds': round(simulated),
+        **record(runs, target),
+    }
+
+
+def write(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Path:
+    """Enters a gait as set 'tuned' and as action 0; the rest of the file stays as it is."""
+    path = pathlib.Path(parameters.__file__).parent / f'{character}.json'
+    text = path.read_text()
+    data = json.loads(text)
+    misc, width = len(data['misc']), len(data['state_parameters'])
+    values = [repr(float(value)) for value in vector]
+    rows = [values[:misc], *(values[i : i + width] for i in range(misc, len(values), width))]
+    body = ',\n'.join('      ' + ', '.join(row) for row in rows)
+    entry = f'"tuned": [\n{body}\n    ]'
+    if 'tuned' in data['sets']:
+        text = re.sub(r'"tuned": \[[^\]]*\]', entry, text, count=1)
+    else:
+        text = re.sub(r'\n  \},\n  "base_actions"', f',\n    {entry}\\g<0>', text, count=1)
+    text = re.sub(r'\n  "tuning": \{.*\},(?=\n)', '', text)
+    centre = f'"centre": "tuned",\n  "tuning": {json.dumps(log)},'
+    text = re.sub(r'"centre": [^,]*,', lambda _: centre, text, count=1)
+    data['sets']['tuned'] = [float(value) for value in vector]
+    assert json.loads(text) == {**data, 'centre': 'tuned', 'tuning': log}
+    part = path.with_name(f'.{character}.part')
+    part.write_text(text)
+    os.replace(part, path)
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('characters', nargs='*', metavar='character', help=', '.join(GAITS))
+    parser.add_argument('--evaluate', action='store_true', help='measure; search and write nothing')
+    parser.add_argument('--start', help='a set by name, or a base action by number; else action 0')
+    parser.add_argument('--friction', type=float, nargs='+', help='of ground and character')
+    parser.add_argument('--substeps', type=int, default=SUBSTEPS, help='physics, of 1/600 s')
+    parser.add_argument('--threads', type=int, default=1)
+    measuring = parser.add_argument_group('measuring')
+    measuring.add_argument('--terrain', nargs='+', default=['flat'])
+    measuring.add_argument('--episodes', type=int, default=EPISODES)
+    searching = parser.add_argument_group('searching')
+    searching.add_argument('--seed', type=int, default=1)
+    searching.add_argument('--sd', type=float, default=0.35, help='in search scales, at first')
+    searching.add_argument('--population', type=int, default=16)
+    searching.add_argument('--starts', type=int, default=3, help='noisy ones for each candidate')
+    searching.add_argument(
+        '--generations', type=int, nargs=2, default=[25, 10], help='for 6 s and for 20 s'
+    )
+    searching.add_argument(
+        '--separable', action=argparse.BooleanOptionalAction, default=True,
+        help='adapt variances only, no covariances',
+    )  # fmt: skip
+    arguments = parser.parse_args()
+    try:
+        for character in arguments.characters or GAITS:
+            vector_of(load(character), arguments.start)
+    except ValueError as error:
+        parser.error(str(error))
+    if arguments.evaluate:
+        arguments.friction = arguments.friction or FRICTIONS[:1]
+        return evaluate(arguments)
+    arguments.friction = arguments.friction or FRICTIONS
+    if len(arguments.characters) != 1:
+        parser.error('a search is of one character')
+    vector, log = search(arguments)
+    print(json.dumps(log))
+    print(write(*arguments.characters, vector, log))
+    return None
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,748 @@
+"""Tests of the gait task: observation, reward, falls and cycles, recomputed by other means."""
+
+import dataclasses
+import pickle
+from unittest import mock
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer
+
+from trl_suite import controllers, suite, terrain
+from trl_suite.vector import VectorEnvironment
+
+# One of each character, on ground of which much is seen.
+DOG, GOAT = 'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
+RAPTOR, BIPED = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0'
+HOPPER = 'FSM_Hopper2D_Terrain_Mixed_Easy-v0'
+EXAMPLES = (DOG, GOAT, RAPTOR, BIPED, HOPPER)
+SIZES = {DOG: (283, 29), GOAT: (283, 29), RAPTOR: (275, 28), BIPED: (227, 28), HOPPER: (211, 9)}
+EXEMPT = {  # links that may touch the ground without a stumble
+    DOG: ('toe', 'finger', 'ankle', 'wrist'), HOPPER: ('leg',),
+    RAPTOR: ('right_toe', 'left_toe', 'right_ankle', 'left_ankle'),
+    BIPED: ('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+}  # fmt: skip
+EXEMPT[GOAT] = EXEMPT[DOG]
+TARGETS = {DOG: 4.0, GOAT: 2.0, RAPTOR: 4.0, BIPED: 3.0, HOPPER: 3.0}
+# x, z, pitch rate of the root at the start.
+STARTS = {
+    DOG: (5.49344, -0.45159, 18.182892), RAPTOR: (3.760084, -0.320445, 0.369261),
+    BIPED: (3.0, 0.0, 0.0), HOPPER: (2.813878, -1.714547, 0.100682),
+}  # fmt: skip
+STEP = 1 / 600  # s, of the control
+
+
+def make(id_, seed=0, **options):
+    environment = suite.make(id_, {'random': seed, **options})
+    environment.reset()
+    return environment
+
+
+def idle(environment):
+    return np.zeros(len(environment.action_map))
+
+
+def on_flat(id_):
+    return dataclasses.replace(suite.find(id_), terrain='flat')
+
+
+class Probe:
+    """Reads an environment's state by names, with the engine's own functions."""
+
+    def __init__(self, environment):
+        self.task = environment.task
+        self.model, self.data = environment.physics.model.ptr, environment.physics.data.ptr
+        self.row = self.task.character.row
+        self.name, self.links = self.row.name, self.row.links
+
+    def body(self, link):
+        return self.model.body(f'{self.name}/{link}').id
+
+    def joint(self, name):
+        joint = self.model.joint(f'{self.name}/{name}')
+        return self.data.qpos[joint.qposadr[0]], self.data.qvel[joint.dofadr[0]]
+
+    @property
+    def root(self):
+        return np.array([self.joint('root_x/')[0], self.joint('root_z/')[0]])
+
+    def velocity(self, link):
+        result = np.zeros(6)
+        mujoco.mj_objectVelocity(
+            self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, self.body(link), result, 0
+        )
+        return result[[3, 5]]
+
+    def touching(self):
+        """Links with a contact point on the ground, from the engine's list."""
+        ground = self.model.body('terrain').id
+        pairs = self.model.geom_bodyid[self.data.contact.geom]
+        bodies = set(pairs[(pairs == ground).any(1)].ravel())
+        return {link for link in self.links if self.body(link) in bodies}
+
+    def observation(self, left_stance):
+        x, z = self.root
+        facing = -1.0 if np.cos(self.joint('root_pitch/')[0]) < 0 else 1.0
+        strip = terrain.Strip.from_state(self.task.arena.strips[0].state())
+        under = strip.height([x])
+        heading = np.array([facing, 1.0])
+        order = list(self.links)
+        if left_stance:
+            swap = {'right': 'left', 'left': 'right'}
+            order = ['_'.join([swap.get(part, part) for part in link.split('_')]) for link in order]
+        centres = {n: (self.data.xipos[self.body(n)][[0, 2]] - (x, z)) * heading for n in order}
+        pose = np.concatenate([z - under, *(centres[link] for link in order[1:])])
+        velocity = np.concatenate([self.velocity(link) * heading for link in order])
+        if self.name == 'hopper':
+            pose[-1], velocity[-1] = self.joint('root_pitch/')
+        samples = x + facing * (-0.5 + 10.5 * np.arange(200) / 199)
+        return {'terrain': strip.height(samples) - under, 'pose': pose, 'velocity': velocity}
+
+    def com(self):
+        masses = [self.model.body_mass[self.body(link)] for link in self.links]
+        centres = [self.data.xipos[self.body(link)][0] for link in self.links]
+        return float(np.dot(masses, centres) / sum(masses))
+
+
+class ObservationTest(parameterized.TestCase):
+    """Blocks and their contents."""
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_sizes(self, id_):
+        environment = make(id_)
+        links = len(environment.task.character.row.links)
+        spec = environment.observation_spec()
+        self.assertEqual(
+            {name: each.shape[0] for name, each in spec.items()},
+            {'terrain': 200, 'pose': 2 * links - 1, 'velocity': 2 * links},
+        )
+        self.assertEqual(list(spec), ['terrain', 'pose', 'velocity'])
+        flat = suite.make(id_, None, {'flat_observation': True})
+        self.assertEqual(flat.observation_spec()['observations'].shape, SIZES[id_][:1])
+        self.assertEqual(flat.action_spec().shape, SIZES[id_][1:])
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_contents(self, id_):
+        environment = make(id_, seed=3)
+        probe, left = Probe(environment), False
+        rng = np.random.default_rng(0)
+        step, seen = environment.reset(), set()
+        for _ in range(6):
+            for name, expected in probe.observation(left).items():
+                np.testing.assert_allclose(
+                    step.observation[name], expected, atol=1e-9, err_msg=name
+                )
+            if step.last():
+                break
+            seen.add(left)
+            step = environment.step(0.1 * rng.uniform(-1, 1, len(environment.action_map)))
+            if id_ in (RAPTOR, BIPED) and step.mid():  # a cycle is a step of one leg
+                left = not left
+        self.assertLen(seen, 2 if id_ in (RAPTOR, BIPED) else 1)
+        self.assertGreater(np.ptp(step.observation['terrain']), 0.05)
+
+    def test_the_last_numbers_of_the_hopper(self):
+        environment = make(HOPPER, start_noise=0.0)
+        observation = environment.reset().observation
+        self.assertAlmostEqual(observation['pose'][-1], -0.00686)
+        self.assertAlmostEqual(observation['velocity'][-1], 0.100682)
+        self.assertAlmostEqual(observation['velocity'][0], 2.813878, delta=0.1)
+
+    @parameterized.parameters(1, 3)
+    def test_who_points_backwards_looks_backwards(self, n):
+        """10 m behind is further than the boxes reach, and another row's ground lies there."""
+        rows = VectorEnvironment(DOG, n, 1, seed=range(7, 7 + n))
+        rows.reset()
+        task = rows.task
+        for row in range(n):
+            # As far back from the middle of its boxes as they let it be.
+            task.world.qpos[row, task.figure.pose_qpos[:3]] = -2.9, 3.0, 2.0
+        task.world.forward(np.arange(n))
+        task.observe()
+        for row in range(n):
+            strip = terrain.Strip.from_state(task.arena.strips[row].state())
+            x = -2.9 - np.linspace(-0.5, 10, 200)
+            expected = strip.height(x) - strip.height([-2.9])
+            found = task.observation[row, task.blocks['terrain']]
+            np.testing.assert_allclose(found, expected, atol=1e-9)
+            self.assertGreater(np.ptp(expected[120:]), 0.05)
+
+
+class StartTest(parameterized.TestCase):
+    """The first instant."""
+
+    @parameterized.parameters(*STARTS)
+    def test_velocity_and_place(self, id_):
+        environment = make(id_)
+        probe = Probe(environment)
+        rates = [probe.joint(f'root_{axis}/')[1] for axis in ('x', 'z', 'pitch')]
+        np.testing.assert_allclose(rates, STARTS[id_])
+        figures = controllers.load(probe.name).start
+        x, z = probe.root
+        self.assertEqual(x, 0.0)
+        self.assertGreaterEqual(z, figures['height'] - 1e-12)
+        self.assertLess(z, figures['height'] + 0.05)
+        self.assertEqual(probe.joint('root_pitch/')[0], figures['pitch'])
+        for name, expected in figures['joints'].items():
+            np.testing.assert_allclose(probe.joint(name), expected, err_msg=name)
+        self.assertFalse(probe.touching() - set(EXEMPT[id_]))
+        observation = environment.reset().observation
+        np.testing.assert_array_equal(Probe(environment).root, (x, z))  # without noise, always so
+        flat = np.linspace(-0.5, 10, 200) < 0.95  # the ground up to 1 m ahead
+        np.testing.assert_allclose(observation['terrain'][flat], 0, atol=1e-12)
+
+    def test_noise(self):
+        clean, noisy = make(DOG), make(DOG, start_noise=0.05)
+        found = []
+        for _ in range(40):
+            noisy.reset()
+            a, b = Probe(clean), Probe(noisy)
+            names = clean.task.character.row.joints
+            angles, rates = np.array([np.subtract(b.joint(n), a.joint(n)) for n in names]).T
+            found.append((*angles, *rates / 10, (b.joint('root_x/')[1] - STARTS[DOG][0]) / 10))
+            self.assertEqual(b.joint('root_pitch/'), a.joint('root_pitch/'))
+        self.assertBetween(np.std(found), 0.045, 0.055)
+        self.assertLess(abs(np.mean(found)), 0.01)
+        self.assertBetween(np.std(np.array(found)[:, -1]), 0.03, 0.07)
+
+    def test_where_the_ground_begins(self):
+        x = np.linspace(-0.95, 0.95, 50)
+        for spawn, flat in (('intended', True), ('upstream', False)):
+            strip = make('FSM_Dog2D_Terrain_Slopes-v0', spawn=spawn).task.arena.strips[0]
+            self.assertEqual(np.ptp(strip.height(x)) == 0, flat)
+        self.assertAlmostEqual(strip.height([3.0])[0], 0.0)  # where its first two stretches meet
+
+
+class RewardTest(parameterized.TestCase):
+    """One value per cycle."""
+
+    def worked(self, id_, speed, share):
+        """Reward of a cycle of 0.4 s with a mean speed and a share of stumbling."""
+        environment = make(id_)
+        task = environment.task
+        task._lasted[:] = 240
+        task._stumbled[:] = round(240 * share)
+        task._from[:] = Probe(environment).com() - 0.4 * speed
+        task.finish_step()
+        terms = environment.info['reward_terms']
+        self.assertAlmostEqual(sum(terms.values()), float(task.reward[0]), places=12)
+        return float(task.reward[0])
+
+    @parameterized.parameters(
+        (DOG, 4.0, 0.0, 1.0), (DOG, 3.0, 0.0, 0.6852), (DOG, 4.0, 0.1, 0.9), (DOG, 0.0, 0.0, 0.2003),
+        (DOG, -1.0, 0.0, 0.2), (DOG, 5.0, 0.0, 0.6852), (DOG, 4.0, 1.0, 0.8 + 0.2 / 11),
+        (RAPTOR, 4.0, 0.0, 1.0), (RAPTOR, 3.0, 0.1, 0.5852), (RAPTOR, -0.01, 0.0, 0.0),
+        (RAPTOR, 0.01, 0.0, 0.2003), (GOAT, 2.0, 0.0, 1.0), (GOAT, 1.0, 0.0, 0.6852),
+        (BIPED, 3.0, 0.0, 1.0), (BIPED, -0.5, 0.0, 0.2017), (HOPPER, 3.0, 0.0, 1.0),
+        (HOPPER, 4.0, 0.5, 0.6065), (HOPPER, 3.0, 1.0, 1.0),
+    )  # fmt: skip
+    def test_worked_values(self, id_, speed, share, expected):
+        self.assertAlmostEqual(self.worked(id_, speed, share), expected, places=4)
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_rollout(self, id_):
+        """Speed and stumbling from what the engine did in between."""
+        environment = make(id_, seed=1)
+        probe, task = Probe(environment), environment.task
+        step_world, stumbles = task.world.step, []
+
+        def watched(nstep, rows=None):
+            self.assertEqual(nstep, 2)  # 1200 Hz physics, 600 Hz control
+            step_world(nstep, rows)
+            stumbles.append(bool(probe.touching() - set(EXEMPT[id_])))
+
+        task.world.step = watched
+        rng, stumbled = np.random.default_rng(1), 0
+        for _ in range(8):
+            time, com = environment.physics.data.time, probe.com()
+            stumbles.clear()
+            step = environment.step(0.5 * rng.uniform(-1, 1, len(environment.action_map)))
+            duration = environment.physics.data.time - time
+            info = environment.info
+            self.assertAlmostEqual(info['duration'], duration, places=9)
+            self.assertAlmostEqual(info['duration'], len(stumbles) * STEP, places=9)
+            self.assertAlmostEqual(info['stumbled'], sum(stumbles) * STEP, places=9)
+            self.assertEqual(info['distance'], probe.root[0])
+            stumbled += sum(stumbles)
+            if step.last():
+                self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+                self.assertEqual(set(info['reward_terms'].values()), {0.0})
+                environment.reset()
+                continue
+            speed = (probe.com() - com) / duration
+            near = np.exp(-0.5 * (TARGETS[id_] - speed) ** 2)
+            expected = 0.8 * near + 0.2 / (1 + 10 * sum(stumbles) * STEP / duration)
+            if id_ == HOPPER:
+                expected = near
+            elif id_ == RAPTOR and speed < 0:
+                expected = 0.0
+            self.assertAlmostEqual(step.reward, expected, places=9)
+            self.assertEqual(step.discount, 1.0)
+        if id_ == DOG:
+            self.assertGreater(stumbled, 0)
+
+
+class Adrift:
+    """An environment whose character floats at rest, and feels what contacts a test gives it."""
+
+    def __init__(self, id_, pitch=0.0, velocity=(0, 0, 0), **options):
+        self.environment = make(id_, **options)
+        environment, task = self.environment, self.environment.task
+        self.links = task.character.row.links
+        environment.physics.model.opt.gravity[:] = 0
+        environment.physics.data.qvel[:] = 0
+        data = environment.physics.data
+        data.qpos[task.figure.pose_qpos[1:3]] = 8.0, pitch
+        data.qvel[task.figure.pose_dof[:3]] = velocity
+        task.world.forward(np.zeros(1, int))
+        task._milestone[:] = 0.0, 8.0
+        task.gait.torques = lambda rows: np.zeros((len(rows), len(self.links) - 1))
+        self.time, self.contacts = 0, lambda time: ()
+
+        def touching(rows):
+            return np.isin(self.links, self.contacts(self.time * STEP))[None]
+
+        advance = task.gait.advance
+
+        def advanced(rows):
+            self.time += 1
+            return advance(rows)
+
+        task.gait.touching, task.gait.advance = touching, advanced
+
+    def lasts(self, most=8.0):
+        """Time in s until the episode ends, or None."""
+        while self.time * STEP < most - 1e-9:
+            if self.environment.step(idle(self.environment)).last():
+                return self.time * STEP
+        return None
+
+
+class FallTest(parameterized.TestCase):
+    """What ends an episode."""
+
+    @parameterized.parameters((DOG, 'torso'), (GOAT, 'spine0'), (RAPTOR, 'head'), (BIPED, 'root'),
+                              (HOPPER, 'root'))  # fmt: skip
+    def test_four_samples_on_the_ground(self, id_, link):
+        adrift = Adrift(id_)
+        adrift.contacts = lambda time: (link,)
+        self.assertAlmostEqual(adrift.lasts(), 0.4)
+        info = adrift.environment.info
+        self.assertEqual((info['fell'], info['stuck'], info['diverged']), (True, False, False))
+        self.assertEqual(adrift.environment.task.get_discount(None), 0.0)
+        self.assertAlmostEqual(info['duration'], 0.4)  # in the middle of the cycle
+
+    @parameterized.parameters(
+        (DOG, 'knee'), (GOAT, 'torso'), (RAPTOR, 'tail3'), (BIPED, 'left_hip')
+    )
+    def test_other_links_may_lie_on_the_ground(self, id_, link):
+        adrift = Adrift(id_, velocity=(1, 0, 0))
+        adrift.contacts = lambda time: (link,)
+        self.assertIsNone(adrift.lasts(3.0))
+        self.assertAlmostEqual(adrift.environment.info['stumbled'], 50 / 30)  # the last cycle
+
+    def test_short_touches_are_forgiven(self):
+        adrift = Adrift(DOG, velocity=(1, 0, 0))
+        adrift.contacts = lambda time: ('head',) if 0.05 < time < 0.35 else ()
+        self.assertIsNone(adrift.lasts(3.0))
+        adrift = Adrift(DOG, velocity=(1, 0, 0))
+        # Between two samples nobody looks.
+        adrift.contacts = lambda time: ('head',) if 0.02 < time % 0.1 < 0.08 else ()
+        self.assertIsNone(adrift.lasts(3.0))
+        self.assertGreater(adrift.environment.info['stumbled'], 0.9)
+
+    @parameterized.parameters((3, True), (4, True), (5, False))
+    def test_a_share_of_touches(self, every, falls):
+        adrift = Adrift(DOG, velocity=(1, 0, 0))
+        adrift.contacts = lambda time: () if round(time * 10) % every else ('head',)
+        share, expected = 0.0, None
+        for sample in range(1, 60):
+            share = 0.9 * share + (sample % every == 0) / 11
+            if share > 0.25 and expected is None:
+                expected = sample / 10
+        found = adrift.lasts(5.9)
+        self.assertEqual(expected is not None, falls)
+        if falls:
+            self.assertAlmostEqual(found, expected)
+        else:
+            self.assertIsNone(found)
+
+    @parameterized.product(id_=EXAMPLES, pitch=(2.6, -2.6, 2.4, -2.4, 2 * np.pi))
+    def test_upside_down(self, id_, pitch):
+        adrift = Adrift(id_, pitch=pitch, velocity=(1, 0, 0))
+        ends = adrift.lasts(0.5)
+        if abs(pitch) == 2.6:  # more than 0.8 pi
+            self.assertAlmostEqual(ends, 0.1)
+            self.assertTrue(adrift.environment.info['fell'])
+        else:
+            self.assertIsNone(ends)
+
+    @parameterized.parameters((BIPED, 0.1), (DOG, None), (RAPTOR, None), (HOPPER, None))
+    def test_only_the_biped_may_not_go_back(self, id_, expected):
+        adrift = Adrift(id_, velocity=(-1, 0, 0))
+        found = adrift.lasts(1.0)
+        self.assertEqual(found is None, expected is None)
+        if expected:
+            self.assertAlmostEqual(found, expected)
+            self.assertTrue(adrift.environment.info['fell'])
+
+    def test_stuck(self):
+        for speed, ends in ((0.0, 5.0), (0.09, 5.0), (0.11, None)):
+            adrift = Adrift(RAPTOR, velocity=(speed, 0, 0))
+            found = adrift.lasts(6.0)
+            if ends is None:
+                self.assertIsNone(found)
+                continue
+            self.assertAlmostEqual(found, ends)
+            info = adrift.environment.info
+            self.assertEqual((info['fell'], info['stuck'], info['diverged']), (False, True, False))
+            self.assertEqual(float(adrift.environment.task.reward[0]), 0.0)
+        # Up counts as well, and every 5 s anew.
+        adrift = Adrift(RAPTOR, velocity=(0, 0.2, 0))
+        self.assertIsNone(adrift.lasts(6.0))
+        adrift.environment.physics.data.qvel[:] = 0
+        self.assertAlmostEqual(adrift.lasts(15.1), 10.0)
+
+    def test_a_dog_on_its_back(self):
+        environment = make('FSM_Dog2D_Terrain_Steps-v0')
+        qpos, places = environment.physics.data.qpos, environment.task.figure.pose_qpos
+        qpos[places[1:3]] = 0.5, 2.4
+        environment.physics.data.qvel[:] = 0
+        environment.task.world.forward(np.zeros(1, int))
+        for _ in range(10):
+            step = environment.step(idle(environment))
+            if step.last():
+                break
+        self.assertTrue(step.last())
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['fell'])
+        self.assertTrue(environment.step(idle(environment)).first())
+        self.assertFalse(environment.info['fell'])
+        self.assertTrue(environment.step(idle(environment)).mid())  # all is forgotten
+
+    def test_a_cut_is_no_failure(self):
+        environment = make(DOG, step_limit=2)
+        self.assertTrue(environment.step(idle(environment)).mid())
+        step = environment.step(idle(environment))
+        self.assertEqual((step.last(), step.discount), (True, 1.0))
+        self.assertGreater(step.reward, 0.5)
+
+
+class CycleTest(parameterized.TestCase):
+    """How long a step lasts."""
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_it_ends_with_the_cycle(self, id_):
+        environment = make(id_)
+        probe, gait = Probe(environment), environment.task.gait
+        landing = {DOG: 'toe', GOAT: 'toe', HOPPER: 'leg'}
+        left, durations = True, []
+        for _ in range(5):
+            step = environment.step(idle(environment))
+            if step.last():
+                break
+            steps = environment.info['duration'] * 600
+            self.assertAlmostEqual(steps, round(steps), places=6)
+            self.assertLess(steps, 1000)
+            self.assertEqual(gait.state[0], 0 if id_ == HOPPER else 3)
+            swing_foot = f'{"left" if left else "right"}_{ {RAPTOR: "toe"}.get(id_, "ankle") }'
+            self.assertIn(landing.get(id_, swing_foot), probe.touching())
+            left = not left
+            durations.append(environment.info['duration'])
+        self.assertNotEmpty(durations)
+        time = environment.physics.data.time
+        total = sum(durations) + step.last() * environment.info['duration']
+        self.assertAlmostEqual(time, total, places=9)
+        if id_ == DOG:
+            self.assertBetween(np.mean(durations), 0.35, 0.55)
+        elif id_ in (RAPTOR, BIPED):  # three timed states, and a moment
+            self.assertBetween(np.mean(durations), 3 * 0.0825, 0.3)
+
+    @parameterized.parameters(DOG, RAPTOR)
+    def test_one_that_does_not_end_is_cut(self, id_):
+        adrift = Adrift(id_, velocity=(1, 0, 0))
+        environment = adrift.environment
+        for _ in range(2):
+            step = environment.step(idle(environment))
+            self.assertTrue(step.mid())
+            self.assertAlmostEqual(environment.info['duration'], 50 / 30)
+        stuck_in = {DOG: 1, RAPTOR: 3}[id_]
+        self.assertEqual(environment.task.gait.state[0], stuck_in)
+        # The next action begins a cycle all the same.
+        adrift.contacts = lambda time: ()
+        seen = []
+        advance = environment.task.gait.advance
+        environment.task.gait.advance = lambda rows: (
+            seen.append(int(environment.task.gait.state[0])), advance(rows)
+        )[1]  # fmt: skip
+        environment.step(idle(environment))
+        self.assertEqual(seen[0], 0)
+        if id_ == RAPTOR:  # no step was made
+            self.assertEqual(environment.task.gait.stance[0], 0)
+
+    def test_the_first_action_counts(self):
+        for id_ in EXAMPLES:
+            environment = make(id_)
+            action = np.random.default_rng(0).uniform(-0.3, 0.3, len(environment.action_map))
+            gait, seen = environment.task.gait, []
+            torques = gait.torques
+            with mock.patch.object(
+                gait, 'torques', lambda rows, s=seen, g=gait, t=torques: (s.append(g.vectors.copy()), t(rows))[1]
+            ):  # fmt: skip
+                environment.step(action)
+            expected = gait.parameters.vector(action[None])
+            expected[:, gait.parameters.absolute] = np.abs(expected[:, gait.parameters.absolute])
+            for vectors in (seen[0], seen[-1]):
+                np.testing.assert_array_equal(vectors, expected)
+
+    def test_far_actions_are_clipped(self):
+        found = []
+        for size in (1.0, 7.0):
+            environment = make(RAPTOR)
+            found.append(environment.step(size * np.ones(28)).observation['pose'])
+        np.testing.assert_array_equal(*found)
+
+    def test_action_map(self):
+        for id_ in EXAMPLES:
+            environment = make(id_)
+            figures, action_map = environment.task.gait.parameters, environment.action_map
+            np.testing.assert_array_equal(action_map.centre, figures.centre[figures.actions])
+            np.testing.assert_array_equal(
+                action_map.half_range, figures.half_range[figures.actions]
+            )
+            self.assertEqual(action_map.names, tuple(figures.names[i] for i in figures.actions))
+
+    def test_a_plain_composer_environment_is_refused(self):
+        environment = composer.Environment(suite.build_task(suite.find(DOG)), random_state=0)
+        environment.reset()
+        with self.assertRaisesRegex(RuntimeError, r'trl_suite\.environment\.Environment'):
+            environment.step(np.zeros(29))
+
+
+class BaseActionTest(parameterized.TestCase):
+    """The discrete interface: a preference per base action, at 30 Hz."""
+
+    @parameterized.parameters(*zip(EXAMPLES, (8, 5, 8, 8, 8), strict=True))
+    def test_choices(self, id_, count):
+        environment = make(id_, interface='base_action')
+        self.assertEqual(environment.action_spec().shape, (count,))
+        self.assertEqual(environment.action_map.names[1], 'base_action_1')
+        gait = environment.task.gait
+        preferences = np.linspace(-1, 0.2, count)
+        preferences[2] = 0.5
+        environment.step(preferences)
+        self.assertAlmostEqual(environment.info['duration'], 1 / 30)
+        self.assertAlmostEqual(environment.physics.data.time, 1 / 30)
+        np.testing.assert_array_equal(gait.vectors[0], gait.parameters.base_actions[2])
+        # Another wish waits for the cycle's end.
+        wish = np.zeros(count)
+        wish[1] = 0.01
+        cycle_ends, seen = [], []
+        advance = gait.advance
+
+        def watched(rows):
+            ended = advance(rows)
+            cycle_ends.append(bool(ended[0]))
+            seen.append(gait.vectors[0].copy())
+            return ended
+
+        gait.advance = watched
+        for _ in range(60):
+            step = environment.step(wish)
+            if step.last() or any(cycle_ends):
+                break
+        first = cycle_ends.index(True)
+        for vector in seen[: first + 1]:
+            np.testing.assert_array_equal(vector, gait.parameters.base_actions[2])
+        environment.step(wish)
+        np.testing.assert_array_equal(gait.vectors[0], gait.parameters.base_actions[1])
+
+    def test_rewards_are_of_frames(self):
+        environment = make(DOG, interface='base_action')
+        probe = Probe(environment)
+        for _ in range(20):
+            com = probe.com()
+            step = environment.step(np.eye(8)[0])
+            speed = (probe.com() - com) * 30
+            stumble = 0.2 / (1 + 10 * environment.info['stumbled'] * 30)
+            self.assertAlmostEqual(step.reward, 0.8 * np.exp(-0.5 * (4 - speed) ** 2) + stumble)
+
+
+class OptionTest(parameterized.TestCase):
+    """What makes no sense is refused."""
+
+    @parameterized.parameters(
+        ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
+        ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
+        ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
+        ({'start_noise': np.inf}, 'start_noise is inf'), ({'spawn': 'here'}, "'here'"),
+        ({'terrain_samples': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
+    )  # fmt: skip
+    def test_options(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            make(DOG, **options)
+
+    @parameterized.parameters(
+        (('dog', 'torque'), {}, 'no actuation'),
+        (('dog',), {'clip': 'dog_bound'}, 'no clip'),
+        (('biped2d',), {}, "unknown character with a gait 'biped2d'"),
+        (('dog', 'gait'), {'task': 'imitation'}, "unknown actuation 'gait'"),
+    )
+    def test_combinations(self, arguments, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            suite.build(*arguments, **{'task': 'gait', **options})
+
+    def test_build(self):
+        for actuation in (None, 'gait'):
+            environment = suite.build(
+                'raptor', actuation, 'gaps', task='gait', task_kwargs={'random': 0, 'substeps': 4}
+            )
+            self.assertAlmostEqual(environment.physics.timestep(), 1 / 2400)
+            environment.reset()
+            environment.step(idle(environment))
+            self.assertAlmostEqual(environment.physics.data.time, environment.info['duration'])
+
+
+class GaitTest(parameterized.TestCase):
+    """The gaits themselves, on flat ground: they stay up, at about their speed."""
+
+    @parameterized.parameters((DOG, 3.4, 4.4), (RAPTOR, 3.0, 4.1), (BIPED, 2.6, 3.4),
+                              (HOPPER, 2.5, 4.6))  # fmt: skip
+    def test_they_run(self, id_, slowest, fastest):
+        """Six rows with action 0, and six with random ones of amplitude 0.1, for 6 s."""
+        rows = VectorEnvironment(
+            on_flat(id_), 12, 1, seed=0, autoreset='disabled', step_limit=None,
+            task_kwargs={'start_noise': 0.01},
+        )  # fmt: skip
+        rows.reset()
+        rng = np.random.default_rng(0)
+        amplitude = np.repeat([0.0, 0.1], 6)[:, None]
+        time, up = np.zeros(12), np.ones(12, bool)
+        distance, lasted = np.zeros(12), np.zeros(12)
+        while (up & (time < 6)).any():
+            action = amplitude * rng.uniform(-1, 1, (12, len(rows.action_map)))
+            step = rows.step(action)
+            counts = up & (time < 6)
+            time[counts] += step.info['duration'][counts]
+            distance[counts], lasted[counts] = step.info['distance'][counts], time[counts]
+            up &= ~(step.terminated & counts)
+            if step.terminated.any():
+                rows.reset(step.terminated)
+        self.assertGreaterEqual(up[:6].sum(), 5)
+        self.assertGreaterEqual(up[6:].sum(), 4)
+        speed = (distance[:6] / lasted[:6])[up[:6]].mean()
+        self.assertBetween(speed, slowest, fastest)
+
+
+class StateTest(parameterized.TestCase):
+    """Save anywhere, go on bit for bit."""
+
+    def advance(self, environment, steps, seed):
+        rng, found = np.random.default_rng(seed), []
+        for _ in range(steps):
+            step = environment.step(0.3 * rng.uniform(-1, 1, len(environment.action_map)))
+            blocks = np.concatenate(list(step.observation.values()))
+            found.append([step.reward or 0.0, int(step.step_type), *blocks])
+        return np.array(found)
+
+    @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
+    def test_save_restore_and_pickle(self, id_, interface):
+        steps = 4 if interface == 'parameters' else 17  # in the middle of a cycle
+        environment = make(id_, seed=6, interface=interface, start_noise=0.01)
+        self.advance(environment, steps, 0)
+        twin = pickle.loads(pickle.dumps(environment))
+        state = pickle.loads(pickle.dumps(environment.get_state()))
+        other = make(id_, seed=77, interface=interface, start_noise=0.01)
+        self.advance(other, steps - 1, 5)
+        other.set_state(state)
+        self.assertEqual(other.info, environment.info)
+        expected = self.advance(environment, 2 * steps, 1)
+        following = np.concatenate(list(environment.reset().observation.values()))
+        for each in (twin, other):
+            np.testing.assert_array_equal(self.advance(each, 2 * steps, 1), expected)
+            again = np.concatenate(list(each.reset().observation.values()))
+            np.testing.assert_array_equal(again, following)
+
+    def test_a_state_of_another_gait_is_refused(self):
+        states = [make(DOG), make(RAPTOR), make(DOG, interface='base_action')]
+        for other in states[1:]:
+            with self.assertRaisesRegex(ValueError, 'state'):
+                states[0].set_state(other.get_state())
+
+
+class RowsTest(parameterized.TestCase):
+    """Rows whose cycles end at different times are single environments all the same."""
+
+    @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
+    def test_bit_for_bit(self, id_, interface):
+        limit = 3 if interface == 'parameters' else 15
+        options = {'interface': interface, 'start_noise': 0.02}
+        rows = VectorEnvironment(id_, 4, 2, seed=3, step_limit=limit, task_kwargs=options)
+        alone = [
+            suite.make(
+                id_,
+                {'random': int(seed), 'step_limit': limit, **options},
+                {'flat_observation': True},
+            )
+            for seed in rows.seeds
+        ]
+        first = [one.reset().observation['observations'] for one in alone]
+        np.testing.assert_array_equal(rows.reset(), first)
+        rng, ends, durations = np.random.default_rng(0), 0, set()
+        scale = np.array([0.1, 0.3, 0.7, 1.0])[:, None]  # so that some fall and some do not
+        for _ in range(2 * limit + 2):
+            action = scale * rng.uniform(-1, 1, (4, len(rows.action_map)))
+            step = rows.step(action)
+            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
+            np.testing.assert_array_equal(
+                step.observation, [one.observation['observations'] for one in steps]
+            )
+            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
+            np.testing.assert_array_equal(
+                step.terminated, [one.last() and one.discount == 0 for one in steps]
+            )
+            for name in ('duration', 'stumbled', 'distance', 'fell', 'stuck'):
+                found = [one.info[name] for one in alone]
+                np.testing.assert_array_equal(step.info[name], found, name)
+            ends += sum(one.last() for one in steps)
+            durations |= set(np.round(600 * step.info['duration']).astype(int).tolist())
+        self.assertGreaterEqual(ends, 4)
+        if interface == 'parameters':
+            self.assertGreater(len(durations), 3)
+
+    def test_rows_that_all_begin_cost_no_physics(self):
+        rows = VectorEnvironment(RAPTOR, 2, 1, seed=0, step_limit=1)
+        rows.reset()
+        self.assertTrue(rows.step(np.zeros((2, 28))).truncated.all())
+        with mock.patch.object(rows.task.world, 'step', side_effect=AssertionError):
+            step = rows.step(np.zeros((2, 28)))
+        np.testing.assert_array_equal(step.reward, 0)
+        np.testing.assert_array_equal(step.info['duration'], 0)
+
+    def test_a_row_that_breaks_down(self):
+        """Huge and undefined velocities end their rows, quietly, and no other."""
+        rows = VectorEnvironment(DOG, 3, 1, seed=0)
+        calm = VectorEnvironment(DOG, 3, 1, seed=0)
+        rows.reset()
+        calm.reset()
+        still = np.zeros((3, 29))
+        kept = rows.step(still).observation
+        calm.step(still)
+        rows.task.world.qvel[1] = 1e12
+        rows.task.world.qpos[2, 4] = np.nan
+        step = rows.step(still)
+        np.testing.assert_array_equal(step.terminated, [False, True, True])
+        np.testing.assert_array_equal(step.info['diverged'], [False, True, True])
+        self.assertFalse(step.info['fell'].any())
+        np.testing.assert_array_equal(step.observation[1:], kept[1:])
+        np.testing.assert_array_equal(step.reward[1:], 0)
+        np.testing.assert_array_equal(step.observation[0], calm.step(still).observation[0])
+        self.assertTrue(np.isfinite(rows.step(still).observation).all())
+        step = rows.step(still)
+        self.assertFalse(step.info['diverged'].any())
+        self.assertGreater(step.reward.min(), 0.2)
+
+
+if __name__ == '__main__':
+    absltest.main()
