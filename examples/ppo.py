@@ -72,10 +72,10 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
     ('*_Run_*', {'samples': 1e6, **RUNS}),
-    ('*_Raptor2D_*', {'samples': 1.2e6, **RUNS}),
+    ('*_Raptor2D_*', RUNS),
     ('*_Dog2D_*', {'samples': 1.6e6, **RUNS}),
-    ('PD_Raptor2D_*Flat*', {'samples': 0.8e6}),
     ('PD_Dog2D_*Flat*', {'samples': 1.2e6}),
+    ('PD_Dog2D_*_Terrain-v0', {'samples': 1e6}),
     ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),

@@ -83,11 +83,21 @@ class Bench:
         self,
         character: str,
         rows: int,
+        centre: np.ndarray,
         terrain: str = 'flat',
         substeps: int = SUBSTEPS,
         threads: int = 1,
     ) -> None:
-        """Compiles the model and makes so many rows of it."""
+        """Compiles the model and makes so many rows of it.
+
+        Args:
+          character: one with a gait.
+          rows: number of episodes side by side.
+          centre: parameters that are run without any rounding, (P,); others may lie about them.
+          terrain: what ground all run on.
+          substeps: physics steps per control step.
+          threads: that step the physics.
+        """
         row = Row(
             id=f'{character}/gait/{terrain}/tuning', domain='custom', task='tuning',
             character=character, actuation='gait', terrain=terrain, rules='gait',
@@ -98,9 +108,10 @@ class Bench:
         task = self.environments.task
         assert isinstance(task, GaitTask)
         self.task, gait = task, task.gait
-        self.scale = REACH * gait.parameters.search_scale
         # So that actions in [-1, 1] reach every candidate.
-        gait.parameters = dataclasses.replace(gait.parameters, half_range=self.scale)
+        gait.parameters = dataclasses.replace(
+            gait.parameters, centre=centre, half_range=REACH * gait.parameters.search_scale
+        )
         self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
 
     def run(
@@ -185,10 +196,11 @@ def record(runs: Runs, target: float) -> dict[str, Any]:
 def evaluate(arguments: argparse.Namespace) -> None:
     choices = itertools.product(arguments.characters or GAITS, arguments.terrain)
     for character, terrain in choices:
-        bench = Bench(character, arguments.episodes, terrain, arguments.substeps, arguments.threads)
-        gait = load(character)
+        gait, options = load(character), (terrain, arguments.substeps, arguments.threads)
+        vector = vector_of(gait, arguments.start)
+        bench = Bench(character, arguments.episodes, vector, *options)
         for friction in arguments.friction:
-            runs = measure(bench, vector_of(gait, arguments.start), [friction])
+            runs = measure(bench, vector, [friction])
             found = record(runs, gait.target_speed)
             slowest, quickest = found['speed_range']
             print(
@@ -210,10 +222,11 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
     start, places, target = vector_of(gait, arguments.start), gait.actions, gait.target_speed
     rng = np.random.default_rng(arguments.seed)
     population = arguments.population
-    bench = Bench(character, population * starts, 'flat', arguments.substeps, arguments.threads)
+    options = 'flat', arguments.substeps, arguments.threads
+    bench = Bench(character, population * starts, start, *options)
     frictions = list(dict.fromkeys(arguments.friction))
 
-    def vectors(candidates: np.ndarray) -> np.ndarray:
+    def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
         result = np.tile(start, (len(candidates), 1))
         result[:, places] += np.asarray(candidates) * gait.search_scale[places]
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
@@ -256,8 +269,7 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
             flush=True,
         )
     bench.environments.close()
-    rows = EPISODES * len(frictions)
-    bench = Bench(character, rows, 'flat', arguments.substeps, arguments.threads)
+    bench = Bench(character, EPISODES * len(frictions), start, *options)
     found, most = start, -np.inf
     for vector in vectors([strategy.result.xfavorite, *finalists]):
         vector = vector.round(DIGITS)
@@ -269,7 +281,7 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
         if score > most:
             found, most = vector, score
     bench.environments.close()
-    bench = Bench(character, EPISODES, 'flat', SUBSTEPS, arguments.threads)
+    bench = Bench(character, EPISODES, found)
     runs = measure(bench, found, FRICTIONS[:1])
     bench.environments.close()
     return found, {
@@ -347,7 +359,7 @@ def main() -> None:
         parser.error('a search is of one character')
     vector, log = search(arguments)
     print(json.dumps(log))
-    print(write(*arguments.characters, vector, log))
+    print(write(arguments.characters[0], vector, log))
     return None
 
 
