@@ -28,7 +28,7 @@ import torch
 import tqdm
 from torch import nn
 
-from trl_suite import evaluation, policies, suite
+from trl_suite import characters, evaluation, policies, suite
 from trl_suite.catalogue import Row
 from trl_suite.tasks import rewards
 from trl_suite.vector import VectorEnvironment
@@ -53,8 +53,12 @@ class Settings:
     lambda_: float = 0.95
     clip: float = 0.2
     kl_per_action: float = 0.004  # an update stops at this mean divergence times the actions
+    value_goes_on: bool = False  # the policy's part of the update only; the value uses all epochs
     hidden: tuple[int, ...] = (256, 256)
     initial_std: float = 0.2  # of actions in [-1, 1]
+    # Where a gait acts: how far towards each of its parameter sets an output of 1 leads, besides one
+    # output for each action. Leaps lie in these directions.
+    towards_sets: float = 0.0
     bound_cost: float = 0.1  # times the squared excess of a mean action over 1
     gradient_norm: float = 0.5
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
@@ -62,6 +66,11 @@ class Settings:
     # local optimum. Evaluations are without it.
     least_share: dict[str, float] = dataclasses.field(default_factory=dict)
     patience: float = 0.3
+    # See left stance as right stance in a mirror; for walkers in three dimensions.
+    mirrored: bool = False
+    # Lessons: from which share of the samples on, with which options of the task. Evaluations have
+    # those of the environment.
+    lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
 
@@ -69,6 +78,30 @@ class Settings:
 # What differs from the defaults, by the pattern of an id; a later row wins.
 RUNS = {'least_share': {'com': 0.37}}  # about 1 m/s off the clip's speed
 RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
+# Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
+# them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated.
+VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3}
+LESSONS = (
+    (0.0, {
+        'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
+        'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
+    }),
+    (0.2, {
+        'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6,
+        'plans': {**VARIED, 'sharp': 0.03, 'from_root': 0.3},
+    }),
+    (0.5, {
+        'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 1.0,
+        'plans': {**VARIED, 'sharp': 0.1, 'from_root': 0.3},
+        'pushes': {'force': (50, 200), 'duration': (0.2, 0.3), 'interval': (1, 4)},
+    }),
+)  # fmt: skip
+FOOTSTEPS = {'samples': 4e6, 'gamma': 0.97, 'lessons': LESSONS}
+CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
+    'samples': 6e4, 'horizon': 16, 'epochs': 20, 'minibatch': 128, 'learning_rate': 1e-4,
+    'value_goes_on': True, 'gamma': 0.9, 'initial_std': 0.1, 'towards_sets': 3.0,
+    'least_share': {}, 'evaluate_every': 5e3, 'evaluation_episodes': 32,
+}  # fmt: skip
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
     ('*_Run_*', {'samples': 1e6, **RUNS}),
@@ -79,6 +112,13 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
+    # In three dimensions the planar noise fells the body before it has learnt anything.
+    ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
+    ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
+    ('*_Biped3D_*_Step*', FOOTSTEPS),
+    ('PD_Biped3D_LLC_Symetric_Step-v0', {'mirrored': False}),  # its observation is
+    ('FSM_*', CYCLES),
+    ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
 )
 
 
@@ -168,26 +208,52 @@ class Trainer:
 
     def __init__(self, environment: str | Row, seed: int, settings: Settings, threads: int) -> None:
         torch.manual_seed(seed)
-        self.seed, self.settings, self.threads = seed, settings, threads
+        self.environment, self.seed = environment, seed
+        self.settings, self.threads = settings, threads
         s = settings
-        self.environments = VectorEnvironment(
-            environment, s.num_envs, threads, seed, autoreset='disabled'
-        )
+        self.samples = 0
+        self.begin_lesson()
         self.row = self.environments.row
-        self.observation = self.environments.reset()
+        self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
+        if s.mirrored and self.mirror is None:
+            raise ValueError(f'{self.row.id} has no left and right to mirror')
+        terms = getattr(self.environments.task, 'TERMS', rewards.IMITATION_TERMS)
+        self.largest = {name: weight for name, (weight, _) in terms.items()}
         self.random = np.random.default_rng(seed)
         inputs, outputs = self.observation.shape[1], len(self.environments.action_map)
         self.scales = Scales(self.environments.blocks, inputs)
+        self.mixture = self.find_mixture()
+        if self.mixture is not None:
+            outputs = len(self.mixture)
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
-        self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
-        self.samples, self.curve, self.best = 0, [], -np.inf
+        self.curve, self.best = [], -np.inf
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.recent = np.zeros(3)  # return, steps and number of the episodes ended lately
+
+    @property
+    def lesson(self) -> int:
+        """How many lessons have begun."""
+        s = self.settings
+        return sum(self.samples >= share * s.samples for share, _ in s.lessons)
+
+    def begin_lesson(self) -> None:
+        """Makes the simulations of the present lesson, all at their start."""
+        s, self.current = self.settings, self.lesson
+        seed: int | list[int] = self.seed
+        if self.current > 1:
+            sequence = np.random.SeedSequence((self.seed, self.current))
+            seed = sequence.generate_state(s.num_envs).tolist()
+        self.environments = VectorEnvironment(
+            self.environment, s.num_envs, self.threads, seed, autoreset='disabled',
+            task_kwargs=s.lessons[self.current - 1][1] if self.current else None,
+        )  # fmt: skip
+        self.observation = self.environments.reset()
         self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
+        self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
 
     def collect(self) -> dict[str, torch.Tensor]:
         """Steps all rows `horizon` times; returns the samples, flattened."""
@@ -200,24 +266,26 @@ class Trainer:
         cut: list[tuple[int, np.ndarray, np.ndarray]] = []  # what truncation left unseen
         std = self.log_std.exp().detach().numpy()
         for t in range(s.horizon):
-            observations[t] = self.observation
+            observations[t], left = self.seen(self.observation)
             with torch.no_grad():
-                means[t] = self.policy(self.scales(self.observation)).numpy()
+                means[t] = self.policy(self.scales(observations[t])).numpy()
             actions[t] = means[t] + std * noise[t]
-            step = environments.step(actions[t])
+            step = environments.step(
+                self.mirror.answered(actions[t], left) if self.mirror else self.meant(actions[t])
+            )
             failed[t] = step.terminated | self.strays(step.info['reward_terms'])
             ended[t] = failed[t] | step.truncated
             reward[t] = step.reward
             unseen = np.flatnonzero(ended[t] & ~failed[t])
             if len(unseen):
-                cut.append((t, unseen, step.observation[unseen]))
+                cut.append((t, unseen, self.seen(step.observation[unseen])[0]))
             self.count(reward[t], ended[t])
             self.observation = step.observation
             if ended[t].any():
                 self.observation = environments.reset(ended[t])
                 for share in self.shares.values():
                     share[ended[t]] = 1.0
-        observations[-1] = self.observation
+        observations[-1] = self.seen(self.observation)[0]
         self.samples += s.horizon * s.num_envs
 
         flat = observations.reshape(-1, observations.shape[-1])
@@ -239,14 +307,34 @@ class Trainer:
             'target': torch.from_numpy((advantage + values[:-1]).astype(np.float32)).flatten(),
         }
 
+    def seen(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Observations as the policy sees them, and which of them are reflected."""
+        if self.mirror is None:
+            return observation, np.zeros(len(observation), bool)
+        return self.mirror.canonical(observation)
+
+    def find_mixture(self) -> np.ndarray | None:
+        """What the outputs of the policy mean as actions, (outputs, a), if not the actions."""
+        if not self.settings.towards_sets:
+            return None
+        gait = self.environments.task.gait.parameters
+        others = [vector for vector in gait.sets.values() if (vector != gait.centre).any()]
+        towards = self.settings.towards_sets * gait.action(np.array(others))
+        return np.concatenate([np.eye(len(gait.actions)), towards]).astype(np.float32)
+
+    def meant(self, outputs: Any) -> Any:
+        """Actions of outputs (..., outputs)."""
+        if self.mixture is None:
+            return outputs
+        arrays = isinstance(outputs, np.ndarray)
+        return outputs @ (self.mixture if arrays else torch.from_numpy(self.mixture))
+
     def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
         """Rows whose reward terms have been too low for too long."""
         s, result = self.settings, np.zeros(self.settings.num_envs, bool)
         forget = self.environments.control_timestep / s.patience
         for name, least in s.least_share.items():
-            self.shares[name] += forget * (
-                terms[name] / rewards.IMITATION_TERMS[name][0] - self.shares[name]
-            )
+            self.shares[name] += forget * (terms[name] / self.largest[name] - self.shares[name])
             result |= self.shares[name] < least
         return result
 
@@ -279,15 +367,18 @@ class Trainer:
                 ratio = log_ratio.exp()
                 with torch.no_grad():
                     divergence = float((ratio - 1 - log_ratio).mean())
-                if divergence > s.kl_per_action * mean.shape[1]:
+                far = divergence > s.kl_per_action * mean.shape[1]
+                if far and not s.value_goes_on:
                     return divergence
                 gain = torch.min(
                     ratio * b['advantage'],
                     ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
                 ).mean()
                 value_error = (self.value(b['observation'])[:, 0] - b['target']).square().mean()
-                excess = (mean.abs() - 1).clamp(min=0).square().sum(-1).mean()
-                loss = -gain + 0.5 * value_error + s.bound_cost * excess
+                excess = (self.meant(mean).abs() - 1).clamp(min=0).square().sum(-1).mean()
+                loss = 0.5 * value_error
+                if not far:
+                    loss = -gain + loss + s.bound_cost * excess
                 self.optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.parameters, s.gradient_norm)
@@ -297,6 +388,12 @@ class Trainer:
     def exported(self) -> policies.Policy:
         """The policy of now, without PyTorch."""
         layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
+        weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
+        biases = [layer.bias.detach().numpy().copy() for layer in layers]
+        weights[-1], biases[-1] = self.meant(weights[-1]), self.meant(biases[-1])
+        log_std = self.log_std.detach().numpy().copy()
+        if self.mixture is not None:
+            log_std = np.log(np.exp(2 * log_std) @ self.mixture**2) / 2
         return policies.Policy(
             id=self.row.id,
             blocks=tuple(
@@ -307,11 +404,16 @@ class Trainer:
             mean=self.scales.mean,
             std=self.scales.std,
             clip=OBSERVATION_CLIP,
-            weights=tuple(layer.weight.detach().numpy().T.copy() for layer in layers),
-            biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
+            weights=tuple(weights),
+            biases=tuple(biases),
             activation='tanh',
-            log_std=self.log_std.detach().numpy().copy(),
-            info={'seed': self.seed, 'samples': self.samples},
+            log_std=log_std,
+            info={
+                'seed': self.seed,
+                'samples': self.samples,
+                'character': characters.fingerprint(self.environments.task.character.row),
+            },
+            mirror=self.mirror,
         )
 
     def evaluate(self, folder: pathlib.Path, divergence: float) -> None:
@@ -377,6 +479,12 @@ class Trainer:
         self.optimizer.load_state_dict(state['optimizer'])
         self.scales.count, self.scales.mean, self.scales.square = state['scales']
         self.random.bit_generator.state = state['random']
+        if self.lesson != self.current:
+            kept = {name: getattr(self, name) for name in _STATE}
+            self.environments.close()
+            self.begin_lesson()
+            for name, value in kept.items():
+                setattr(self, name, value)
         self.environments.set_state(state['environments'])
 
 
@@ -405,6 +513,9 @@ def train(
     ) as bar:
         bar.set_description(id_)
         while trainer.samples < total:
+            if trainer.lesson != trainer.current:
+                trainer.environments.close()
+                trainer.begin_lesson()
             begin, before = time.perf_counter(), trainer.samples
             batch = trainer.collect()
             middle = time.perf_counter()

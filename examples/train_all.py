@@ -3,11 +3,13 @@
     python examples/train_all.py                       # all that is missing, two runs side by side
     python examples/train_all.py --only '*Dog2D*' --jobs 8
     python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
+    python examples/train_all.py --only FSM_Goat2D_Terrain_Cliffs-v0
 
 Each run is `examples/ppo.py` on one thread. Stopped runs go on from their checkpoints in RUNS;
 finished ones are evaluated and entered into `trained/ID.json` (settings, learning curve,
 evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
-the same settings is not trained again.
+the same settings is not trained again. Of the rows that gaits drive (FSM_...) five are trained; any
+other has to be named in full.
 """
 
 from __future__ import annotations
@@ -34,11 +36,21 @@ from trl_suite import catalogue, errors, evaluation, policies, resources
 EPISODES, SEED = 50, 0  # of the published evaluation
 SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
+GAITS = (  # that are compared with their default gaits
+    'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Gaps-v0',
+    'FSM_Hopper2D_Terrain_Gaps-v0',
+)  # fmt: skip
 
 
 def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
     """Which runs there are: first one of each environment, then the repetitions."""
-    ids = [id_ for id_ in catalogue.BY_ID if fnmatch.fnmatchcase(id_, pattern)]
+    ids = [
+        id_
+        for id_, row in catalogue.BY_ID.items()
+        if id_ == pattern
+        or (fnmatch.fnmatchcase(id_, pattern) and (row.rules != 'gait' or id_ in GAITS))
+    ]
     if not ids:
         raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
     seeds = {
@@ -54,7 +66,13 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
 def entries(id_: str) -> list[dict[str, Any]]:
     """The runs that have been entered for an environment."""
     path = resources.directory('trained') / f'{id_}.json'
-    return json.loads(path.read_text())['runs'] if path.exists() else []
+    if not path.exists():
+        return []
+    runs = json.loads(path.read_text())['runs']
+    default = json.loads(json.dumps(dataclasses.asdict(ppo.Settings())))
+    for run in runs:  # settings that came later were at their defaults
+        run['settings'] = {**default, **run['settings']}
+    return runs
 
 
 def settings(id_: str) -> dict[str, Any]:

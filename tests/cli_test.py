@@ -58,8 +58,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '85 environments')
-        self.assertLen(lines, 87)
+        self.assertEqual(lines[-1], '99 environments')
+        self.assertLen(lines, 101)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -67,7 +67,8 @@ class ListTest(CommandTest):
             self.assertEndsWith(line, row.description)
 
     @parameterized.parameters(
-        (('--domain', 'imitation'), 14),
+        (('--domain', 'imitation'), 22),
+        (('--domain', 'deeploco'), 6),
         (('--domain', 'plaid'), 28),
         (('--domain', 'terrainrl'), 43),
         (('--actuation', 'gait'), 43),
@@ -76,7 +77,10 @@ class ListTest(CommandTest):
         (('--actuation', 'muscle'), 4),
         (('--character', 'raptor'), 23),
         (('--terrain', 'gaps_humanoid'), 3),
-        (('--tag', 'original'), 62),
+        (('--tag', 'original'), 72),
+        (('--tag', 'spatial'), 14),
+        (('--character', 'biped3d'), 8),
+        (('--terrain', 'plane'), 7),
         (('--tag', 'original', '--domain', 'terrainrl'), 32),
         (('--tag', 'blind'), 4),
         (('--domain', 'plaid', '--character', 'dog', '--tag', 'original'), 6),
@@ -109,11 +113,15 @@ class InfoTest(CommandTest):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
-        gait = suite.find(id_).rules == 'gait'
+        rules = suite.find(id_).rules
+        gait, steps = rules == 'gait', rules == 'footsteps'
         for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
                       'Termination', 'Time', 'Differs'):  # fmt: skip
             self.assertIn(f'\n{title}', out)
-        for title, shown in (('Clip', not gait), ('Gait', gait), ('Parameters', gait)):
+        for title, shown in (
+            ('Clip', not gait and not steps), ('Gait', gait), ('Parameters', gait),
+            ('Steps', steps), ('Plans', steps),
+        ):  # fmt: skip
             self.assertEqual(f'\n{title}:' in out, shown, title)
 
     def test_figures(self):
@@ -180,6 +188,44 @@ class InfoTest(CommandTest):
         self.assertNotIn('share of the time', out)
         self.assertRegex(out, r'pose .*; last, pitch of the root \(rad\)\n')
 
+    def test_three_dimensions(self):
+        # Sizes and figures of the original's character and controller.
+        out = self.output('info', 'PD_Biped3D_LLC_General_Step-v0')
+        self.assertIn('Observation: 125 numbers', out)
+        for name, start, stop in (
+            ('pose', 0, 57), ('velocity', 57, 105), ('phase', 105, 110), ('contact', 110, 112),
+            ('plan', 112, 125),
+        ):  # fmt: skip
+            self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start} ')
+        self.assertRegex(out, r'\n  left_ankle +50 +57 +99 +105\n')
+        self.assertRegex(out, r'\n +115 +118 +3  m +first landing place from the left foot')
+        self.assertRegex(out, r'\n +124 +125 +1  rad +planned heading')
+        self.assertIn('Action: 17 numbers in [-1, 1]; target rotation vector in rad = centre', out)
+        self.assertRegex(out, r'\n  torso_x +0 +1 +200\n')
+        self.assertRegex(out, r'\n  left_knee +-0\.4\d+ +1 +150\n')
+        self.assertRegex(out, r'\n  right_hip +4\.5 +ball, up to 2\.57 +200 +300 +30 +0\.5\n')
+        self.assertIn('42 kg', out)
+        self.assertRegex(out, r'\n  heading +0\.09524\n')
+        self.assertRegex(out, r'\n  end_effector +0\.1905 +5\n')
+        self.assertIn('one of root, torso touches the ground', out)
+        self.assertIn('steps 0.5 m long, feet 0.15 m apart', out)
+        self.assertIn('N(0, 0.25) rad', out)
+        self.assertIn('physics 300 Hz', out)
+        out = self.output('info', 'PD_Biped3D_LLC_Symetric_Step-v0')
+        self.assertIn('Observation: 117 numbers', out)
+        self.assertRegex(out, r'\n +110 +111 +1  rad +planned heading')
+        self.assertIn('\nMirrored: ', out)
+        out = self.output('info', 'PD_Biped3D_Imitate-Stairs-v0')
+        self.assertIn('Observation: 112 numbers', out)
+        self.assertRegex(out, r'\n  goal +110 +112 +2  rad, m +bearing')
+        self.assertIn('\nTerrain: stairs3d (var3d_stairs)\n', out)
+        self.assertIn('StepHeightMax 0.12', out)
+        self.assertIn('period 1 s, 1.2 m/s', out)
+        self.assertNotIn('\nPlan in the observation', out)
+        out = self.output('info', 'PD_Biped3D_FULL_Imitate-Steps-v0')
+        self.assertIn('Action: 35 numbers', out)
+        self.assertRegex(out, r'\n  head +106 +113 +203 +209\n')
+
     def test_an_alias_is_as_good(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
 
@@ -198,8 +244,23 @@ class InfoTest(CommandTest):
             'taken at touch-down': 'hopper',
             'base action 1': 'raptor',
             'tuned anew': 'biped',
+            'z up': 'space',
+            'one cone': 'space',
+            'rotation vectors': 'space',
+            'straight on': 'straight on',
+            'walks at 1.535 m/s': '3D walk',
+            '27 of them': 'steps',
+            'option miss': 'footsteps',
+            'truly mirrored': 'mirrored',
+            'slower than the steps': 'run',
+            'ankles of 0.03': 'run',
+            'captured, 4.4 m/s': 'run',
+            'drawn anew': 'goal',
+            'treads': 'stairs',
         }
         tracking = {'clip', 'imitation'}
+        walking = {'space', 'straight on', 'clip', '3D walk', 'imitation'}
+        stepping = {'space', 'footsteps', 'steps', 'imitation'}
         for id_, expected in (
             ('PD_Biped2D_LLC_Imitate_Flat-v0', tracking),
             ('Vel_Dog2D_LLC_Imitate_Flat-v0', tracking | {'completion'}),
@@ -214,6 +275,14 @@ class InfoTest(CommandTest):
             ('FSM_Raptor2D_Terrain_Narrow_Gaps-v0', {'gait', 'terrain', 'raptor', 'completion'}),
             ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped'}),
             ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper'}),
+            ('PD_Biped3D_Imitate-v0', walking),
+            ('PD_Biped3D_Imitate-Stairs-v0', walking | {'stairs'}),
+            ('PD_Biped3D_Imitate-Rough-v0', walking | {'completion'}),
+            ('PD_Biped3D_Imitate-Run-v0', walking - {'3D walk'} | {'completion'}),
+            ('PD_Biped3D_LLC_General_Step-v0', stepping),
+            ('PD_Biped3D_LLC_Symetric_Step-v0', stepping | {'mirrored'}),
+            ('PD_Biped3D_LLC_Run_FootStep-v0', stepping - {'steps'} | {'run'}),
+            ('PD_Biped3D_LLC_Trail_Step-v0', stepping | {'goal', 'completion'}),
         ):
             with self.subTest(id_):
                 out = self.output('info', id_).split('\nDiffers')[1]
@@ -499,6 +568,16 @@ class TerrainTest(CommandTest):
         self.assert_only('terrain_gaps.png')
         self.output('terrain', 'gaps', '--draws', '1', '--length', '5', '--output', 'b.png')
         self.assertLess(iio.imread('b.png').shape[0], iio.imread('terrain_gaps.png').shape[0])
+
+    def test_maps(self):
+        self.assertEqual(
+            self.output('terrain', 'stairs3d', '--length', '12'), 'terrain_stairs3d.png\n'
+        )
+        self.output('terrain', 'stairs3d', '--draws', '1', '--length', '12', '--output', 'b.png')
+        # Side by side.
+        self.assertLess(iio.imread('b.png').shape[1], iio.imread('terrain_stairs3d.png').shape[1])
+        self.assert_refused('length is 400.0', 'terrain', 'plane', '--length', '400')
+        self.assert_only('terrain_stairs3d.png', 'b.png')
 
     def test_a_file(self):
         (self.folder / 'own').mkdir()

@@ -29,12 +29,18 @@ SIZES = {
     'FSM_Dog2D_Terrain_Gaps-v0': (283, 29), 'FSM_Goat2D_Terrain_Cliffs-v0': (283, 29),
     'FSM_Raptor2D_Terrain_Steps-v0': (275, 28), 'FSM_Biped2D_Terrain_Walls-v0': (227, 28),
     'FSM_Hopper2D_Terrain_Slopes-v0': (211, 9),
+    # Three numbers for the rotation of a ball joint; the original has angle and axis, four.
+    'PD_Biped3D_Imitate-v0': (112, 17), 'PD_Biped3D_Imitate-Stairs-v0': (112, 17),
+    'PD_Biped3D_Imitate-Track-v0': (156, 17), 'PD_Biped3D_Imitate-Run-v0': (112, 17),
+    'PD_Biped3D_LLC_General_Step-v0': (125, 17), 'PD_Biped3D_LLC_Symetric_Step-v0': (117, 17),
+    'PD_Biped3D_LLC_Run_FootStep-v0': (125, 17), 'PD_Biped3D_FULL_Imitate-Steps-v0': (229, 35),
 }  # fmt: skip
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 EXAMPLES = (
     GAPS, 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
     'Torque_Biped2D_LLC_Imitate_Flat-v0', 'Vel_Dog2D_LLC_Imitate_Flat-v0',
-    'FSM_Raptor2D_Terrain_Slopes-v0',
+    'FSM_Raptor2D_Terrain_Slopes-v0', 'PD_Biped3D_Imitate-Hills-v0',
+    'PD_Biped3D_LLC_General_Step-v0',
 )  # fmt: skip
 
 
@@ -44,8 +50,19 @@ def is_gait(id_):
 
 
 def expected_blocks(id_):
-    """Blocks and their sizes by the rules: terrain, pose 2n + 1, velocity 2n, extras."""
+    """Blocks and their sizes by the rules: terrain, pose 2n + 1, velocity 2n, extras.
+
+    In three dimensions pose 7n + 1, velocity 6n.
+    """
     figure = id_.split('_')[1]
+    if figure == 'Biped3D':
+        links = 16 if 'FULL' in id_ else 8
+        sizes = {'pose': 7 * links + 1, 'velocity': 6 * links}
+        if '_Imitate' in id_ and 'FULL' not in id_:
+            track = 'Track' in id_
+            return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
+        mirrored = 'Symetric' in id_
+        return sizes | {'phase': 3 if mirrored else 5, 'contact': 2, 'plan': 7 if mirrored else 13}
     if is_gait(id_):
         links = GAIT_LINKS[figure]
         return {'terrain': 200, 'pose': 2 * links - 1, 'velocity': 2 * links}

@@ -184,7 +184,7 @@ class ObservationTest(parameterized.TestCase):
             step = environment.step(np.zeros(len(environment.action_map)))
             phase = 0.2 if step.first() else phase + 1 / 30 / period
 
-    @parameterized.parameters(*(id_ for id_ in suite.ALL_IDS if 'LLC' in id_))
+    @parameterized.parameters(*(id_ for id_ in IDS if 'LLC' in id_))
     def test_target(self, id_):
         environment, step = started(id_, 4)
         probe = Reference(environment).at(float(environment.task.phase[0]))

@@ -309,6 +309,99 @@ class FilmStripTest(FolderTest):
         self.assert_only()
 
 
+class SpatialTest(FolderTest):
+    """What is drawn in three dimensions; footsteps_test has the markers."""
+
+    def build(self, terrain, **options):
+        environment = suite.build(
+            'biped3d', terrain=terrain,
+            task_kwargs={'random': 1, 'terrain_map': True, 'start_phase': 0.0, **options},
+        )  # fmt: skip
+        environment.reset()
+        return environment
+
+    def test_height_map_is_seen_from_above(self):
+        environment = self.build('plane')
+        level = rendering.height_map(environment)
+        self.assertEqual((level.shape, level.dtype), ((256, 256, 3), np.uint8))
+        dark = np.argwhere((level < 60).all(2))
+        # The character, 1 m of 11 m from behind, in the middle.
+        self.assertBetween(dark[:, 0].mean(), 220, 240)
+        self.assertBetween(dark[:, 1].mean(), 124, 132)
+        self.assertLess(len(dark), 100)
+        light = (level > 200).all(2)
+        self.assertEqual(light.sum() + len(dark), 256 * 256)
+        # A block ahead on the left, a hole on the right: samples 32 v + u, lines v from the left.
+        part = environment.task.blocks['terrain']
+        heights = environment.task.observation[0, part].reshape(32, 32)
+        heights[2:5, 20:25], heights[28:31, 20:25] = 2.0, -2.0
+        image = rendering.height_map(environment).astype(int)
+        brown = np.argwhere(image[..., 0] - image[..., 2] > 100)
+        blue = np.argwhere(image[..., 2] - image[..., 0] > 100)
+        for found, columns in ((brown, (16, 39)), (blue, (224, 247))):
+            self.assertEqual((found[:, 1].min(), found[:, 1].max()), columns)
+            self.assertEqual((found[:, 0].min(), found[:, 0].max()), (8 * 7, 8 * 12 - 1))
+        # Half as high is half as brown where the full colour is for 4 m.
+        half = rendering.height_map(environment, reach=4.0)[60, 20].astype(int)
+        np.testing.assert_allclose(half, (level[0, 0].astype(int) + image[60, 20]) / 2, atol=1)
+
+    def test_height_map_of_stairs(self):
+        image = rendering.height_map(self.build('stairs3d')).astype(int)
+        brown = image[..., 0] - image[..., 2]
+        self.assertGreater(brown[:40].mean(), brown[180:220].mean() + 20)  # they go up ahead
+        path = self.folder / 'a.png'
+        again = rendering.height_map(self.build('stairs3d'), path)
+        np.testing.assert_array_equal(again, image)
+        np.testing.assert_array_equal(iio.imread(path), image)
+
+    def test_height_map_refusals(self):
+        for make, options, message in (
+            (lambda: suite.make(GAPS), {}, 'Imitation task.*no map'),
+            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, 'terrain_map=True'),
+            (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
+            (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                rendering.height_map(make(), **options)
+        self.assert_only()
+
+    def test_moving_boxes_have_no_ghosts(self):
+        environment = suite.build(
+            'biped3d_mocap', terrain='dynamic_obstacles3d', task_kwargs={'random': 1}
+        )
+        environment.reset()
+        colours = []
+        ghost = rendering._ghost(environment.task)
+
+        def look(physics, scene):
+            before = scene.ngeom
+            ghost(physics, scene)
+            model = physics.model.ptr
+            for geom in scene.geoms[before : scene.ngeom]:
+                name = model.body(model.geom_bodyid[geom.objid]).name
+                colours.append((name.startswith('mover'), float(geom.rgba[3])))
+
+        environment.physics.render(48, 64, scene_callback=look)
+        self.assertEqual({alpha for mover, alpha in colours if mover}, {0.0})
+        shown = {round(alpha, 6) for mover, alpha in colours if not mover}
+        self.assertEqual(shown, {rendering.GHOST_COLOUR[3]})
+
+    def test_maps_of_terrain(self):
+        for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
+            rendering.plot_terrain(
+                'steps3d', self.folder / f'{name}.png', **{'length': 10, 'draws': 2, **options}
+            )
+        a, b, c, d = (iio.imread(self.folder / f'{name}.png') for name in 'abcd')
+        np.testing.assert_array_equal(a, b)
+        self.assertFalse(np.array_equal(a, c))
+        self.assertGreater(a.shape[1], d.shape[1])
+        for preset in ('plane', 'conveyor3d'):  # level ground
+            rendering.plot_terrain(preset, self.folder / 'e.png', draws=1, length=8)
+        with self.assertRaisesRegex(ValueError, r'length is 301; expected metres in \(0, 300\]'):
+            rendering.plot_terrain('plane', self.folder / 'f.png', length=301)
+        self.assert_only('a.png', 'b.png', 'c.png', 'd.png', 'e.png')
+
+
 class PlotTerrainTest(FolderTest):
     def test_is_a_picture_that_depends_on_the_seed(self):
         for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 5})):

@@ -22,6 +22,8 @@ EXAMPLES = (
     'PD_Raptor2D_Slopes_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
     'Torque_Dog2D_LLC_Imitate_Flat-v0', 'Vel_Biped2D_LLC_Imitate_Flat-v0',
 )  # fmt: skip
+# In three dimensions; more in imitation3d_test and footsteps_test.
+SPATIAL = ('PD_Biped3D_Imitate-Hills-v0', 'PD_Biped3D_LLC_Trail_Step-v0')
 GAITS = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0')  # more in gait_test
 DOG = EXAMPLES[1]
 
@@ -73,13 +75,13 @@ class DeterminismTest(parameterized.TestCase):
     def test_across_processes(self):
         digests = [
             subprocess.run(
-                [sys.executable, '-c', self.SCRIPT, *EXAMPLES, *GAITS], check=True,
+                [sys.executable, '-c', self.SCRIPT, *EXAMPLES, *SPATIAL, *GAITS], check=True,
                 capture_output=True,
                 text=True, env={**os.environ, 'PYTHONHASHSEED': seed},
             ).stdout.split()
             for seed in ('1', '2')
         ]  # fmt: skip
-        self.assertLen(set(digests[0]), len(EXAMPLES) + len(GAITS))
+        self.assertLen(set(digests[0]), len(EXAMPLES) + len(SPATIAL) + len(GAITS))
         self.assertEqual(digests[0], digests[1])
         environment = suite.make(EXAMPLES[0], {'random': 5}, {'flat_observation': True})
         environment.reset()

@@ -13,7 +13,7 @@ import trl_suite
 from trl_suite import catalogue, characters, motion, resources, suite, terrain
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
-# The ids that the original registers: 21 of PLAiD and 9 of planar Imitation.
+# The planar ids of tracking that the original registers: 21 of PLAiD and 9 of Imitation.
 ORIGINAL = (
     *(
         f'PD_Biped2D_{ground}_Terrain-v0'
@@ -66,6 +66,29 @@ FIGURES = {
     'Dog2D': 'dog', 'Goat2D': 'goat', 'Raptor2D': 'raptor', 'Biped2D': 'biped2d_simbicon',
     'Hopper2D': 'hopper',
 }  # fmt: skip
+# In three dimensions: id -> task, terrain, character, motion, whether the original registers it.
+_WALKS = ('biped3d', 'biped3d_walk')
+SPATIAL = {
+    'PD_Biped3D_Imitate-v0': ('pd_biped3d', 'plane', *_WALKS, True),
+    'PD_Biped3D_Imitate-Track-v0': ('pd_biped3d_track', 'plane', *_WALKS, True),
+    'PD_Biped3D_Imitate-Hills-v0': ('pd_biped3d_hills', 'hills3d', *_WALKS, True),
+    'PD_Biped3D_Imitate-Ramp-v0': ('pd_biped3d_ramp', 'ramp3d', *_WALKS, True),
+    'PD_Biped3D_Imitate-Stairs-v0': ('pd_biped3d_stairs', 'stairs3d', *_WALKS, True),
+    'PD_Biped3D_Imitate-Steps-v0': ('pd_biped3d_steps', 'steps3d', *_WALKS, True),
+    'PD_Biped3D_Imitate-Rough-v0': ('pd_biped3d_rough', 'checkers3d', *_WALKS, False),
+    'PD_Biped3D_Imitate-Run-v0': ('pd_biped3d_run', 'plane', 'biped3d', 'biped3d_run', False),
+    **{
+        f'PD_Biped3D_{name}-v0': (task, ground, character, character, original)
+        for name, task, ground, character, original in (
+            ('LLC_General_Step', 'llc_general_step', 'plane', 'biped3d_mocap', True),
+            ('LLC_Symetric_Step', 'llc_symmetric_step', 'plane', 'biped3d_mocap', True),
+            ('LLC_Run_FootStep', 'llc_run_footstep', 'plane', 'biped3d_mocap_run', True),
+            ('LLC_Bumps_Step', 'llc_bumps_step', 'checkers_3d', 'biped3d_mocap', False),
+            ('LLC_Trail_Step', 'llc_trail_step', 'trail3d2', 'biped3d_mocap', False),
+            ('FULL_Imitate-Steps', 'llc_full_step', 'plane', 'biped3d_full_mocap', True),
+        )
+    },
+}
 
 
 def ids_of(rules):
@@ -120,6 +143,44 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(environment.step_limit, 256)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
+    def test_three_dimensions(self):
+        self.assertCountEqual([*ids_of('imitation3d'), *ids_of('footsteps')], SPATIAL)
+        self.assertCountEqual([row.id for row in catalogue.ROWS if 'spatial' in row.tags], SPATIAL)
+        for id_, (task, ground, character, clip, original) in SPATIAL.items():
+            row = suite.find(id_)
+            self.assertEqual((row.task, row.terrain, row.character, row.clip),
+                             (task, ground, character, clip))  # fmt: skip
+            self.assertEqual(row.actuation, 'position')
+            self.assertEqual(row.domain, 'imitation' if task.startswith('pd_') else 'deeploco')
+            self.assertEqual(row.tags, {'spatial', 'original' if original else 'completion'})
+        self.assertLen([values for values in SPATIAL.values() if values[-1]], 10)
+
+    @parameterized.parameters(*SPATIAL)
+    def test_what_an_id_in_three_dimensions_says(self, id_):
+        _, ground, character, clip, _ = SPATIAL[id_]
+        environment = suite.make(id_, {'random': 0})
+        task = environment.task
+        self.assertEqual(task.arena.terrain.name, ground)
+        self.assertTrue(task.arena.terrain.spatial)
+        self.assertEqual(task.character.row.name, character)
+        self.assertEqual(task.motion.name, clip)
+        self.assertEqual(task.actuation_model, 'position')
+        self.assertEqual(task.mirrored, 'Symetric' in id_)
+        self.assertNotIn('terrain', environment.blocks)  # blind as in the original
+        self.assertEqual('target' in environment.blocks, 'Track' in id_)
+        self.assertEqual(environment.step_limit, 256)
+        self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
+
+    def test_other_names_of_rows_in_three_dimensions(self):
+        for name, id_ in (
+            ('PD_Biped3D_LLC_Symmetric_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'),
+            ('PD_Biped3D_Full_LLC_Step-v0', 'PD_Biped3D_FULL_Imitate-Steps-v0'),
+            ('deeploco/llc_general_step', 'PD_Biped3D_LLC_General_Step-v0'),
+            ('imitation/pd_biped3d', 'PD_Biped3D_Imitate-v0'),
+        ):
+            self.assertEqual(suite.find(name).id, id_)
+
     def test_names_are_unique(self):
         self.assertLen(set(suite.ALL_IDS), len(catalogue.ROWS))
         self.assertLen(set(suite.ALL_TASKS), len(catalogue.ROWS))
@@ -130,7 +191,7 @@ class CatalogueTest(parameterized.TestCase):
     def test_row(self, id_):
         row = suite.find(id_)
         self.assertEqual(row.id, id_)
-        self.assertRegex(id_, r'^\w+-v\d$')
+        self.assertRegex(id_, r'^\w+(-\w+)?-v\d$')  # what Gymnasium takes for a name
         self.assertRegex(row.description, r'^[A-Z].*\.$')
         self.assertNotIn('\n', row.description)
         self.assertLess(len(row.description), 130)
@@ -172,10 +233,10 @@ class CatalogueTest(parameterized.TestCase):
 
     def test_tables(self):
         self.assertEqual(
-            {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()
-             if domain in ('plaid', 'imitation', 'terrainrl')},
-            {'plaid': 28, 'imitation': 14, 'terrainrl': 43},
-        )  # fmt: skip
+            {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()},
+            # Of imitation 14 in the plane and 8 in three dimensions.
+            {'plaid': 28, 'imitation': 22, 'terrainrl': 43, 'deeploco': 6},
+        )
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)
         self.assertEqual(
@@ -283,12 +344,14 @@ class OptionTest(parameterized.TestCase):
         self.assertTrue(step.last())
         self.assertBetween(step.reward, 0, 1)
 
-    @parameterized.parameters(*imitation_ids())
+    @parameterized.parameters(*imitation_ids(), *SPATIAL)
     def test_common_options_on_every_row(self, id_):
         environment = suite.make(id_, {'random': 3, 'step_limit': 2, 'start_phase': 0.5})
         step = environment.reset()
         if 'phase' in step.observation:
-            self.assertAlmostEqual(step.observation['phase'][0], 0.5)
+            # Mirrored, it is the phase of a single step, and the second one begins at one half.
+            phase = 0.0 if 'Symetric' in id_ else 0.5
+            self.assertAlmostEqual(step.observation['phase'][0], phase)
         self.assertAlmostEqual(float(environment.task.phase[0]), 0.5)
         environment.step(np.zeros(environment.action_spec().shape))
         self.assertTrue(environment.step(np.zeros(environment.action_spec().shape)).last())
@@ -302,6 +365,7 @@ class BuildTest(parameterized.TestCase):
             (name, model)
             for name in suite.DEFAULT_CLIPS
             for model in ('position', 'torque', 'velocity', 'muscle')
+            if model != 'muscle' or not characters.CHARACTERS[name].spatial
         )
     )
     def test_every_character_with_every_model(self, name, model):
@@ -320,6 +384,94 @@ class BuildTest(parameterized.TestCase):
             environment.reset()
             step = environment.step(np.zeros(6))
             self.assertTrue(np.isfinite(step.observation['pose']).all())
+
+    @parameterized.parameters(
+        *(
+            (preset, task)
+            for preset in sorted(terrain.PRESETS3D)
+            for task in ('imitation', 'footsteps')
+        )
+    )
+    def test_every_preset_in_three_dimensions(self, preset, task):
+        environment = suite.build(
+            'biped3d_mocap', terrain=preset, task=task,
+            task_kwargs={'random': 0, 'terrain_map': True},
+        )  # fmt: skip
+        self.assertEqual(environment.task.arena.terrain.name, preset)
+        self.assertEqual(environment.observation_spec()['terrain'].shape, (1024,))
+        for _ in range(2):
+            environment.reset()
+            step = environment.step(np.zeros(17))
+            for value in step.observation.values():
+                self.assertTrue(np.isfinite(value).all())
+
+    @parameterized.parameters(
+        ('biped3d', 'imitation', 'biped3d_walk', 17), ('biped3d_mocap', 'imitation', 'biped3d_mocap_walk', 17),
+        ('biped3d_mocap_run', 'imitation', 'biped3d_mocap_run', 17),
+        ('biped3d_full_mocap', 'imitation', 'biped3d_full_walk', 35),
+        ('biped3d_mocap', 'footsteps', 'biped3d_mocap', 17),
+        ('biped3d_mocap_run', 'footsteps', 'biped3d_mocap_run', 17),
+        ('biped3d_full_mocap', 'footsteps', 'biped3d_full_mocap', 35),
+    )  # fmt: skip
+    def test_what_three_dimensions_mean(self, character, task, clip, actions):
+        environment = suite.build(character, task=task, task_kwargs={'random': 0})
+        self.assertEqual(environment.task.motion.name, clip)
+        self.assertEqual(environment.task.arena.terrain.name, 'plane')
+        self.assertEqual(environment.action_spec().shape, (actions,))
+        self.assertEqual('plan' in environment.blocks, task == 'footsteps')
+        again = suite.build(character, 'position', 'plane', task, clip, {'random': 0})
+        ours, theirs = environment.reset().observation, again.reset().observation
+        for name, value in ours.items():
+            np.testing.assert_array_equal(theirs[name], value)
+
+    def test_planar_characters_keep_level_ground(self):
+        self.assertEqual(suite.build('dog').task.arena.terrain.name, 'flat')
+        self.assertEqual(suite.build('hopper', task='gait').task.arena.terrain.name, 'flat')
+
+    def test_steps_by_name_path_and_object(self):
+        steps, found = motion.load_steps('biped3d_mocap'), []
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / 'mine.npz'
+            steps.save(path)
+            for clip in ('biped3d_mocap', steps, str(path), None):
+                environment = suite.build(
+                    'biped3d_mocap', task='footsteps', clip=clip, task_kwargs={'random': 0}
+                )
+                found.append(environment.reset().observation['plan'])
+        for plan in found[1:]:
+            np.testing.assert_array_equal(plan, found[0])
+
+    @parameterized.parameters(
+        ({'character': 'dog', 'terrain': 'hills3d'},
+         r"'dog' is planar and terrain 'hills3d' \(hills3d\) three-dimensional; presets that fit: .*flat"),
+        ({'character': 'dog', 'terrain': 'hills3d', 'task': 'gait'}, "'dog' is planar and .*'hills3d'"),
+        ({'character': 'biped3d', 'terrain': 'gaps'},
+         "'biped3d' is three-dimensional and terrain 'gaps'.* planar; presets that fit: .*plane, ramp3d"),
+        ({'character': 'biped3d_mocap', 'terrain': {'Type': 'var2d_gaps'}, 'task': 'footsteps'},
+         "'biped3d_mocap' is three-dimensional and terrain 'var2d_gaps'"),
+        ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
+        ({'character': 'dog', 'task': 'footsteps'}, "'dog' is planar; the task 'footsteps'"),
+        ({'character': 'biped3d', 'task': 'imitation3d'}, "unknown task 'imitation3d'"),
+        ({'character': 'biped3d', 'task': 'footsteps'},
+         'no library of steps of its own; give clip=, one of .*biped3d_mocap'),
+        ({'character': 'biped3d_mocap', 'task': 'footsteps', 'clip': 'biped3d_moca'},
+         "unknown step library 'biped3d_moca'; did you mean 'biped3d_mocap'"),
+        ({'character': 'biped3d_simbicon'}, "'biped3d_simbicon' has no clip of its own"),
+        ({'character': 'biped3d_mocap', 'clip': motion.load_steps('biped3d_mocap')},
+         "'biped3d_mocap' is a library of steps; to be imitated"),
+        ({'character': 'biped3d', 'task': 'footsteps', 'clip': motion.load('biped3d_walk')},
+         "'biped3d_walk' is a clip; for footsteps"),
+    )  # fmt: skip
+    def test_dimensions_that_do_not_fit(self, arguments, message):
+        with self.assertRaisesRegex(ValueError, message):
+            suite.build(**arguments)
+
+    def test_a_row_on_other_ground(self):
+        row = dataclasses.replace(suite.find('PD_Biped3D_Imitate-v0'), terrain='gaps')
+        with self.assertRaisesRegex(
+            ValueError, "'biped3d' is three-dimensional and terrain 'gaps'"
+        ):
+            suite.build_task(row)
 
     def test_terrain_as_mapping_file_and_object(self):
         content = {'Type': 'var2d_steps', 'Params': [{'StepH0Min': 0.3, 'StepH0Max': 0.3}]}

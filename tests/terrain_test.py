@@ -601,6 +601,14 @@ class StripTest(parameterized.TestCase):
             with self.assertRaisesRegex(TypeError, 'seed'):
                 ground(seed)
 
+    def test_streams_of_level_ground(self):
+        # They are made when they are asked for; a state has them all the same.
+        state = terrain.Strip(terrain.load('flat'), 3).state()
+        other = terrain.Strip(terrain.load('slopes'), 3).state()
+        self.assertEqual(state['right'], other['right'])
+        self.assertEqual(state['left'], other['left'])
+        self.assertEqual(state['right'], np.random.PCG64(3).state)
+
     def test_sides_differ(self):
         heights = self.make('slopes').window(-840, 1681)[0]
         self.assertFalse(np.array_equal(heights[:840], heights[:840:-1]))

@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 from absl.testing import parameterized
 
@@ -72,6 +73,24 @@ class IdentityTest(parameterized.TestCase):
                 step = rows.step(random.uniform(-1, 1, (5, 11)))
             found.append(step.observation)
         np.testing.assert_array_equal(*found)
+
+    @parameterized.parameters('MTU_Biped2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Slopes_Terrain-v0')
+    def test_rows_are_reset_as_the_engine_does(self, id_):
+        rows = VectorEnvironment(id_, 4, 1, seed=1)
+        rows.reset()
+        rows.step(np.ones((4, len(rows.action_map))))
+        world, which, found = rows.task.world, np.array([1, 3]), []
+        used = world.batch.state.copy()
+        for reset in (
+            world.reset,
+            lambda r: world.batch.reset(r, stage=mujoco.mjtStage.mjSTAGE_NONE),
+        ):
+            world.batch.state[...], world.batch.warning[...] = used, 5
+            reset(which)
+            found.append((world.batch.state.copy(), world.batch.warning.copy()))
+        for ours, engines in zip(*found, strict=True):
+            np.testing.assert_array_equal(ours, engines)
+            self.assertTrue((ours[which] != ours[[0, 2]]).any())
 
     def test_the_number_of_rows_does_not_matter(self):
         few = VectorEnvironment(GAPS, 2, 1, seed=[7, 8])

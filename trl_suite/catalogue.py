@@ -181,6 +181,97 @@ def _gait(character: str, name: str, preset: str, words: str, original: bool) ->
     )
 
 
+# Name in ids, preset, words. The original tracks a walk over all of them.
+_SPATIAL_TERRAINS = (
+    ('', 'plane', 'flat ground', True),
+    ('Hills', 'hills3d', 'hills', True),
+    ('Ramp', 'ramp3d', 'a ramp', True),
+    ('Stairs', 'stairs3d', 'stairs', True),
+    ('Steps', 'steps3d', 'scattered low boxes', True),
+    ('Rough', 'checkers3d', 'a raised chequerboard', False),
+)
+
+
+def _imitation3d(
+    name: str, preset: str, words: str, original: bool, clip: str = 'biped3d_walk', **options: Any
+) -> Row:
+    gait = 'run' if clip.endswith('run') else 'walk'
+    return Row(
+        id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}-v0',
+        domain='imitation',
+        task=f'pd_biped3d{"_" if name else ""}{name.lower()}',
+        character='biped3d',
+        actuation='position',
+        terrain=preset,
+        rules='imitation3d',
+        clip=clip,
+        options=MappingProxyType(options),
+        description=f'The 3D biped tracks a {gait}'
+        f'{", whose state it sees," if options.get("target") else ""} straight on over {words} by PD '
+        'targets.',
+        tags=frozenset({'spatial', 'original' if original else 'completion'}),
+    )
+
+
+def _step(
+    id_: str,
+    task: str,
+    words: str,
+    *,
+    character: str = 'biped3d_mocap',
+    preset: str = 'plane',
+    original: bool = True,
+    aliases: tuple[str, ...] = (),
+    **options: Any,
+) -> Row:
+    return Row(
+        id=id_,
+        domain='deeploco',
+        task=task,
+        character=character,
+        actuation='position',
+        terrain=preset,
+        rules='footsteps',
+        clip=character,
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}.',
+        tags=frozenset({'spatial', 'original' if original else 'completion'}),
+        aliases=aliases,
+    )
+
+
+_STEPS = (
+    _step(
+        'PD_Biped3D_LLC_General_Step-v0', 'llc_general_step',
+        'walks along planned footsteps, around turns',
+    ),
+    _step(
+        'PD_Biped3D_LLC_Symetric_Step-v0', 'llc_symmetric_step',
+        'walks along planned footsteps; what it sees and does is mirrored in left stance',
+        aliases=('PD_Biped3D_LLC_Symmetric_Step-v0',), mirrored=True,
+    ),
+    _step(
+        'PD_Biped3D_LLC_Run_FootStep-v0', 'llc_run_footstep', 'runs along planned footsteps',
+        character='biped3d_mocap_run',
+        plans={'length': (1.15, 1.15), 'turn': 0.0, 'sharp': 0.0},
+    ),
+    _step(
+        'PD_Biped3D_LLC_Bumps_Step-v0', 'llc_bumps_step',
+        'walks along planned footsteps over a raised chequerboard', preset='checkers_3d',
+        original=False,
+    ),
+    _step(
+        'PD_Biped3D_LLC_Trail_Step-v0', 'llc_trail_step',
+        'walks along footsteps that head for goals on a trail', preset='trail3d2', original=False,
+        goal=True, plans={'length': (0.4, 0.4)},
+    ),
+    _step(
+        'PD_Biped3D_FULL_Imitate-Steps-v0', 'llc_full_step',
+        'with arms and head walks along planned footsteps', character='biped3d_full_mocap',
+        aliases=('PD_Biped3D_Full_LLC_Step-v0',),
+    ),
+)  # fmt: skip
+
 _BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
 
 ROWS: tuple[Row, ...] = (
@@ -211,6 +302,10 @@ ROWS: tuple[Row, ...] = (
         for terrain in _GAIT_TERRAINS
     ),
     *(_gait(*row, original=False) for row in _MORE_GAITS),
+    *(_imitation3d(*terrain) for terrain in _SPATIAL_TERRAINS),
+    _imitation3d('Track', 'plane', 'flat ground', True, target=True),
+    _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
+    *_STEPS,
 )  # fmt: skip
 
 BY_ID: dict[str, Row] = {row.id: row for row in ROWS}

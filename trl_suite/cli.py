@@ -126,7 +126,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
     )
     command.add_argument('--draws', type=_positive, default=3, help='how many')
-    command.add_argument('--length', type=float, default=40.0, help='in metres')
+    command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
     command.add_argument('--seed', type=int, default=0, help='of the draws')
     command.add_argument('--blend', type=float, default=0.0, help='which of the parameter sets')
     command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a .png')

@@ -14,7 +14,7 @@ from trl_suite import catalogue
 if TYPE_CHECKING:
     from trl_suite.environment import Environment
 
-# Unit and meaning of the observation blocks, of the imitation of a clip and of gaits.
+# Unit and meaning of the observation blocks: imitation in the plane, gaits, three dimensions.
 _BLOCKS = {
     'terrain': ('m', 'ground heights from 0.5 m behind to 3 m ahead, above the ground at the root'),
     'pose': ('m', 'root height above ground; then x, z of each link centre from the root'),
@@ -34,6 +34,51 @@ _GAIT_BLOCKS = {
     'pose': ('m', 'root height above ground; then x, z of each other link centre from the root'),
     'velocity': ('m/s', 'x, z velocity of each link centre'),
 }
+_SPATIAL_BLOCKS = {
+    'terrain': (
+        'm',
+        'ground heights above the ground at the root, 32 lines from the left to the right (5.5 m to each '
+        'side), each of 32 from 1 m behind to 10 m ahead',
+    ),
+    'pose': (
+        'm, 1',
+        'root height above ground; then of each link its centre from the root and its orientation (wxyz)',
+    ),
+    'velocity': (
+        'm/s, rad/s',
+        'of each link the velocity of its centre, against the ground under the root, and its angular '
+        'velocity',
+    ),
+    'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
+    'target': (
+        'm, m/s',
+        "the clip's root height; its link centres from its root; their velocities",
+    ),
+    'goal': (
+        'rad, m',
+        'bearing (positive to the left) and distance of the point on the line of the start that is 3 m '
+        'further on',
+    ),
+    'contact': ('1', 'whether the right and the left foot touch the ground'),
+    'plan': ('m, rad', 'see below'),
+}
+_MIRRORED_BLOCKS = {
+    'phase': ('1', 'phase of the step in [0, 1); then the one-hot of its half'),
+    'contact': ('1', 'whether the stance and the swing foot touch the ground'),
+}
+# Size, unit and meaning of the parts of a plan.
+_PLAN = (
+    (3, 'm', 'first landing place from the right foot; 0 while that one stands'),
+    (3, 'm', 'first landing place from the left foot; 0 while that one stands'),
+    (3, 'm', 'second landing place from the right foot; 0 unless that one stands'),
+    (3, 'm', 'second landing place from the left foot; 0 unless that one stands'),
+    (1, 'rad', 'planned heading, to the left of the present one'),
+)
+_MIRRORED_PLAN = (
+    (1, 'rad', 'planned heading, to the swing side of the present one'),
+    (3, 'm', 'first landing place from the swing foot'),
+    (3, 'm', 'second landing place from the stance foot'),
+)
 _STANCE_FIRST = '; the stance leg first, then the swing leg'
 _HOPPER_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
 # Units of gait parameters that are no angles, by name without state.
@@ -45,8 +90,10 @@ _GAIT_UNITS = {
 }  # fmt: skip
 
 # What differs from the original, as (applies to a row?, sentence); docs/differences.md has reasons.
-_ANY, _CLIP, _GAIT = (
+_ANY, _CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS = (
     lambda row: True, lambda row: row.rules == 'imitation', lambda row: row.rules == 'gait',
+    lambda row: row.rules in ('imitation3d', 'footsteps'), lambda row: row.rules == 'imitation3d',
+    lambda row: row.rules == 'footsteps',
 )  # fmt: skip
 _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (
@@ -55,7 +102,45 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     ),
     (_CLIP, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
     (_GAIT, 'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at which they fall here'),
-    (_CLIP, 'actions are in [-1, 1] and clipped; the original takes physical units'),
+    (_CLIP3D, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
+    (_STEPS, 'MuJoCo at 300 Hz instead of Bullet at 1200 Hz; task option substeps'),
+    (_SPATIAL, 'axes are x forward, y left, z up; the original has y up and z to the right'),
+    (
+        lambda row: row.rules in ('imitation', 'imitation3d', 'footsteps'),
+        'actions are in [-1, 1] and clipped; the original takes physical units',
+    ),
+    (
+        _SPATIAL,
+        "targets of ball joints are rotation vectors about the mean pose; option centre='original' for the "
+        "original's angle and axis",
+    ),
+    (
+        _SPATIAL,
+        'a ball joint is limited by one cone, as wide as the widest of its three ranges',
+    ),
+    (
+        _CLIP3D,
+        'the goal is straight on, 3 m ahead on the line of the start; the original observes where the start '
+        'was',
+    ),
+    (
+        _SPATIAL,
+        'rotation errors are those of the shorter way, angular velocities of both sides in one frame',
+    ),
+    (
+        lambda row: row.rules == 'footsteps' and row.options.get('mirrored', False),
+        'truly mirrored; the original runs the same environment as for the general plan',
+    ),
+    (
+        lambda row: row.rules == 'footsteps' and row.character == 'biped3d_mocap_run',
+        'the footstep is rewarded in the second half of every step; in the original that clock is slower than '
+        'the steps',
+    ),
+    (_STEPS, 'a step that misses its place ends the episode only if asked for; option miss'),
+    (
+        lambda row: row.rules == 'footsteps' and row.options.get('goal', False),
+        'a goal is drawn anew when the walker is within 1 m; the original draws one, at the start',
+    ),
     (
         _GAIT,
         'actions are in [-1, 1], clipped, and mapped to the parameters that are learnt; the original takes '
@@ -80,8 +165,12 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         'the original has the gait and no environment for it',
     ),
     (
-        lambda row: row.actuation == 'position',
+        lambda row: row.actuation == 'position' and row.character != 'biped3d_mocap_run',
         'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
+    ),
+    (
+        lambda row: row.actuation == 'position' and row.character == 'biped3d_mocap_run',
+        'damping is split between servo and joint, joints have an armature of 0.01, ankles of 0.03 kg m^2',
     ),
     (
         lambda row: row.actuation == 'position' and row.character in ('dog', 'goat', 'raptor'),
@@ -103,14 +192,35 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         lambda row: row.actuation == 'muscle' and row.character in ('goat', 'biped2d_full'),
         'the original has no muscles for this character; they are borrowed',
     ),
-    (lambda row: row.clip is not None, "the clip is our own, close to the original's in gait and speed"),
+    (_CLIP, "the clip is our own, close to the original's in gait and speed"),
+    (
+        lambda row: row.rules == 'imitation3d' and row.clip == 'biped3d_walk',
+        "the clip is our own, 1.2 m/s; the original's walks at 1.535 m/s",
+    ),
+    (
+        lambda row: row.rules == 'imitation3d' and row.clip != 'biped3d_walk',
+        "the clip is our own, close to the original's in gait and speed",
+    ),
+    (
+        lambda row: row.rules == 'footsteps' and row.character != 'biped3d_mocap_run',
+        'the steps are our own, 27 of them; the original chooses among 14 captured ones',
+    ),
+    (
+        lambda row: row.rules == 'footsteps' and row.character == 'biped3d_mocap_run',
+        "the step is our own, 3.83 m/s; the original's is captured, 4.4 m/s",
+    ),
     (lambda row: row.clip is not None, 'the start phase is drawn uniformly instead of swept'),
+    (
+        lambda row: row.terrain == 'stairs3d',
+        'treads have vertical faces and run on to both sides; those of the original slope over 0.2 m and change '
+        '1 m beside the start',
+    ),
     (
         lambda row: row.terrain == 'mixed_humanoid',
         'the terrain is inferred: slopes_mixed_humanoid without slopes',
     ),
     (
-        lambda row: isinstance(row.terrain, str) and row.terrain != 'flat',
+        lambda row: row.rules in ('imitation', 'gait') and row.terrain != 'flat',
         'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
     ),
     (_ANY, f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)'),
@@ -121,17 +231,20 @@ def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     from trl_suite.tasks.gait import GaitTask
     from trl_suite.tasks.imitation import Imitation
+    from trl_suite.tasks.tracking3d import Tracking
 
     task: Any = environment.task
-    gait = isinstance(task, GaitTask)
-    if isinstance(task, (GaitTask, Imitation)):
+    gait, spatial = isinstance(task, GaitTask), isinstance(task, Tracking)
+    known = gait or spatial or isinstance(task, Imitation)
+    if known:
         yield from _character(environment)
     if gait:
         yield from _gait(task)
-    meanings = _gait_blocks(task) if gait else _BLOCKS
+    meanings = _gait_blocks(task) if gait else _spatial_blocks(task) if spatial else _BLOCKS
     size = max(part.stop for part in environment.blocks.values())
+    axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
     yield (
-        f'Observation: {size} numbers, in this order',
+        f'Observation: {size} numbers, in this order{axes}',
         table(
             ('block', 'from', 'to', 'size', 'unit', 'meaning'),
             (
@@ -140,12 +253,16 @@ def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str
             ),
         ),
     )
+    if spatial:
+        yield from _spatial_parts(task)
     yield _gait_action(task) if gait else _action(environment)
-    if isinstance(task, (GaitTask, Imitation)):
+    if known:
         yield _terrain(task)
     if gait:
         yield from _gait_rules(task)
-    elif isinstance(task, Imitation):
+    elif spatial:
+        yield from _spatial_rules(task)
+    elif known:
         yield from _rules(environment)
     yield 'Time', _gait_time(row, task) if gait else _time(row, task)
     yield (
@@ -174,11 +291,13 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
     gait = getattr(task, 'gait', None)
     masses = _floats(environment.physics.bind(character.bodies).mass)
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', '')]
-    for (name, joint), mass, (low, high), limit, slides in zip(
+    for (name, joint), mass, (low, high), limit, slides, ball in zip(
         row.joints.items(), masses[1:], character.joint_ranges, character.torque_limits,
-        character.prismatic, strict=True,
+        character.prismatic, character.spherical, strict=True,
     ):  # fmt: skip
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
+        if ball:
+            reach = f'ball, up to {high:.3g}'
         last: object = joint.weight
         if gait is not None:
             last = 'the world' if name in gait.world_joints else 'its parent'
@@ -205,7 +324,7 @@ def _action(environment: Environment) -> tuple[str, str]:
         table(
             ('drives', 'centre', 'half range', limits[0]),
             zip(action_map.names, *(_floats(v) for v in (
-                action_map.centre, action_map.half_range, limits[1]
+                np.round(action_map.centre, 9) + 0.0, action_map.half_range, limits[1]
             )), strict=True),
         ),
     )  # fmt: skip
@@ -217,8 +336,16 @@ def _limits(environment: Environment) -> tuple[str, Any]:
     actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
     if environment.action_map.quantity == 'excitation':
         return 'peak force (N)', np.asarray(actuators.gainprm)[:, 2]
-    limits = dict(zip(task.character.row.joints, task.character.torque_limits, strict=True))
-    return 'torque limit (N m)', [limits[name] for name in environment.action_map.names]
+    ball, limits = task.character.spherical, task.character.torque_limits
+    names = environment.action_map.names
+    if not ball.any():
+        return 'torque limit (N m)', limits
+    if task.actuation_model == 'velocity':
+        limits = np.where(ball, limits / np.sqrt(3), limits)
+    # Every ball joint takes as many numbers.
+    each = (len(names) - np.count_nonzero(~ball)) // np.count_nonzero(ball)
+    norm = '' if task.actuation_model == 'velocity' else ', norm'
+    return f'torque limit (N m{norm})', np.repeat(limits, np.where(ball, each, 1))
 
 
 def _terrain(task: Any) -> tuple[str, str]:
@@ -265,6 +392,123 @@ def _rules(environment: Environment) -> Iterator[tuple[str, str]]:
             'or the physics diverges'
         ),
     )
+
+
+# Three dimensions
+
+
+def _spatial_blocks(task: Any) -> dict[str, tuple[str, str]]:
+    return {**_SPATIAL_BLOCKS, **(_MIRRORED_BLOCKS if task.mirrored else {})}
+
+
+def _spatial_parts(task: Any) -> Iterator[tuple[str, str]]:
+    """Yields where links and parts of a plan are in the observation."""
+    links = list(task.character.row.links)
+    pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
+    if task.mirrored:
+        # In right stance; in left stance links change places.
+        yield (
+            'Mirrored: while the left foot stands, all is seen in a mirror, and actions are mirrored back',
+            _fold('then what is called right below is the left side'),
+        )
+    yield (
+        'Links in the observation (centre 3 and orientation 4; velocity 3 and angular velocity 3)',
+        table(
+            ('link', 'pose from', 'to', 'velocity from', 'to'),
+            (
+                (name, *(pose + 7 * i + k for k in (0, 7)), *(velocity + 6 * i + k for k in (0, 6)))
+                for i, name in enumerate(links)
+            ),
+        ),
+    )
+    if 'plan' in task.blocks:
+        parts = _MIRRORED_PLAN if task.mirrored else _PLAN
+        starts = task.blocks['plan'].start + np.cumsum([0, *(size for size, _, _ in parts)])
+        yield (
+            'Plan in the observation (x, y, and z above the ground at the root)',
+            table(
+                ('from', 'to', 'size', 'unit', 'meaning'),
+                (
+                    (int(start), int(start) + size, size, unit, text)
+                    for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
+                ),
+            ),
+        )
+
+
+def _spatial_rules(task: Any) -> Iterator[tuple[str, str]]:
+    row, motion = task.character.row, task.motion
+    steps = hasattr(task, 'plans')
+    if steps:
+        noun = 'step' if len(motion) == 1 else 'steps'
+        yield (
+            f'Steps: {motion.name}',
+            _fold(
+                f'{motion.description}: {len(motion)} {noun} and the mirrored; the nearest to the plan is '
+                f'the reference of a step. Period of two steps {task.period:.4g} s; the right foot '
+                'stands while the phase is below 0.5'
+            ),
+        )
+        yield _plans(task)
+    else:
+        yield (
+            f'Clip: {motion.name}',
+            f'  {motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
+        )
+    lines = [
+        table(
+            ('term', 'weight', 'scale'),
+            (
+                (name, weight, scale if name != 'heading' else '')
+                for name, (weight, scale) in task.TERMS.items()
+            ),
+        )
+    ]
+    if steps:
+        lines += [
+            _fold('heading: weight * ((1 + cos error) / 2)^4, error of the planned heading'),
+            _fold(
+                'end_effector: in the second half of a step, that of the swing foot is the way to its '
+                'landing place'
+            ),
+        ]
+    yield (
+        'Reward: sum of weight * exp(-scale * squared error), at most 1; 0 after a fall',
+        '\n'.join(lines),
+    )
+    miss = ''
+    if steps and task.miss is not None:
+        miss = f'a foot lands more than {task.miss:g} m from its place; '
+    yield (
+        'Termination (discount 0)',
+        _fold(
+            f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
+            f'{miss}or the physics diverges'
+        ),
+    )
+
+
+def _plans(task: Any) -> tuple[str, str]:
+    """What is told of how plans are drawn."""
+    plans = task.plans
+
+    def span(values: tuple[float, float]) -> str:
+        low, high = values
+        return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
+
+    lines = [f'steps {span(plans.length)} long, feet {span(plans.width)} apart']
+    if task.goal_given:
+        lines.append('heads for a goal, drawn anew when it is reached')
+    else:
+        lines.append(f'the heading changes by N(0, {plans.turn:g}) rad from step to step')
+        if plans.sharp:
+            lines.append(f'with probability {plans.sharp:g} by anything up to pi instead')
+    if plans.from_root:
+        lines.append(f'with probability {plans.from_root:g} planned anew from the root')
+    if task.pushes:
+        low, high = task.pushes.force
+        lines.append(f'the torso is pushed now and then by {low:g} to {high:g} N')
+    return 'Plans: at every switch of stance', _fold('; '.join(lines))
 
 
 # Gaits

@@ -28,6 +28,14 @@ of observations, L the number of layers):
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
     info         U ()        a JSON object: how the policy was made
 
+and, if the policy sees left stance as right stance in a mirror (see `trl_suite.symmetry`):
+
+    mirror_phase              int ()    column of the phase
+    mirror_observation_index  int (k,)  what stands where in a reflected observation
+    mirror_observation_sign   float (k,)
+    mirror_action_index       int (a,)
+    mirror_action_sign        float (a,)
+
 Floats are written as float32.
 """
 
@@ -45,6 +53,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite import catalogue, errors, resources
+from trl_suite.symmetry import Mirror
 
 FORMAT = 'trl_suite policy'
 VERSION = 1
@@ -60,6 +69,10 @@ _FIELDS = {
     'block_sizes': ('iu', 1), 'actions': ('U', 1), 'quantity': ('U', 0), 'mean': ('f', 1), 'std': ('f', 1),
     'clip': ('f', 0), 'activation': ('U', 0), 'layers': ('iu', 0), 'log_std': ('f', 1),
     'info': ('U', 0),
+}  # fmt: skip
+_MIRROR = {
+    'phase': ('iu', 0), 'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
+    'action_index': ('iu', 1), 'action_sign': ('f', 1),
 }  # fmt: skip
 
 
@@ -82,6 +95,7 @@ class Policy:
       activation: of all layers but the last, one of `ACTIVATIONS`.
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was made; what JSON can hold.
+      mirror: how it sees left stance as right stance; None if it sees all as it is.
 
     Raises:
       ValueError: a field is malformed, or fields do not fit each other; the message names it.
@@ -99,6 +113,7 @@ class Policy:
     activation: str
     log_std: np.ndarray = dataclasses.field(repr=False)
     info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+    mirror: Mirror | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -141,6 +156,8 @@ class Policy:
             raise ValueError(f'info: JSON cannot hold it ({error})') from None
         if not isinstance(self.info, dict):
             raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
+        if self.mirror is not None:
+            self.mirror.check(k, a)
 
     @property
     def observation_size(self) -> int:
@@ -221,7 +238,10 @@ class Policy:
         return flat
 
     def _output(self, flat: np.ndarray) -> np.ndarray:
-        x = np.clip((np.atleast_2d(flat) - self.mean) / self.std, -self.clip, self.clip)
+        seen, left = np.atleast_2d(flat), None
+        if self.mirror is not None:
+            seen, left = self.mirror.canonical(seen)
+        x = np.clip((seen - self.mean) / self.std, -self.clip, self.clip)
         x = x.astype(np.float32, order='C')
         activation = ACTIVATIONS[self.activation]
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -229,6 +249,8 @@ class Policy:
             x = np.matmul(x[:, None], weight)[:, 0] + bias
             if i < len(self.weights) - 1:
                 x = activation(x)
+        if self.mirror is not None and left is not None:
+            x = self.mirror.answered(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
 
 
@@ -259,6 +281,10 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     }
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         fields[f'weight_{i}'], fields[f'bias_{i}'] = weight, bias
+    if policy.mirror is not None:
+        for name, (kind, _) in _MIRROR.items():
+            value = np.asarray(getattr(policy.mirror, name))
+            fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
     with rendering.replacing(rendering.check_path(path, ('.npz',))) as part:
         np.savez_compressed(part, allow_pickle=False, **fields)
 
@@ -289,12 +315,21 @@ def load(path: str | os.PathLike[str]) -> Policy:
         for i in range(fields['layers']):
             for field, axes, into in ((f'weight_{i}', 2, weights), (f'bias_{i}', 1, biases)):
                 into.append(_read(archive, field, 'f', axes))
+        mirror = None
+        if any(name.startswith('mirror_') for name in archive.files):
+            parts: dict[str, Any] = {}
+            for name, (kind, axes) in _MIRROR.items():
+                field = f'mirror_{name}'
+                parts[name] = _read(archive, field, kind, axes)
+            mirror = Mirror(**{**parts, 'phase': int(parts['phase'])})
         field = 'info'
         fields[field] = json.loads(fields[field])
         for field in archive:
-            if field not in _FIELDS and field.partition('_')[0] not in ('weight', 'bias'):
+            known = field in _FIELDS or field.removeprefix('mirror_') in _MIRROR
+            if not known and field.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
-        if len(archive.files) != len(_FIELDS) + 2 * len(weights):
+        expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) if mirror else 0)
+        if len(archive.files) != expected:
             field = 'layers'
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
     except Exception as error:  # a damaged archive fails in a dozen ways
@@ -308,6 +343,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
             blocks=tuple(zip(names, sizes, strict=True)),
             weights=tuple(weights),
             biases=tuple(biases),
+            mirror=mirror,
             **fields,
         )
     except ValueError as error:

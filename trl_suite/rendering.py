@@ -1,4 +1,4 @@
-"""Pictures without a screen: frames, videos, film strips, and plots of terrain.
+"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps.
 
     from trl_suite import rendering, suite
 
@@ -30,6 +30,7 @@ import numpy as np
 
 from trl_suite import errors
 from trl_suite import terrain as terrains
+from trl_suite.terrain.surroundings import AHEAD, SAMPLES
 
 if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
     import dm_env
@@ -41,6 +42,11 @@ CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
 GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
 GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
+MAP_PIXELS = 8  # of each sample of a height map, along both axes
+HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
+ROOT_COLOUR = (20, 20, 20)  # where the character stands on its height map
+MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
+MAP_POINTS = 400  # at most, along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
 
@@ -54,7 +60,7 @@ def frame(
     camera: str | int = 'side',
     ghost: bool = False,
 ) -> np.ndarray:
-    """Draws the current state.
+    """Draws the current state, and what the task marks: places, goals, directions.
 
     Args:
       environment: any composer environment, after `reset`.
@@ -87,9 +93,16 @@ def frame(
         )
     camera_id = _camera(physics, camera)
     _check_gl(physics)
-    return physics.render(
-        height, width, camera_id, scene_callback=_ghost(environment.task) if ghost else None
-    )
+    task: Any = environment.task
+    additions = [_ghost(task)] if ghost else []
+    if hasattr(task, 'markers'):
+        additions.append(_markers(task))
+
+    def add(physics: Any, scene: Any) -> None:
+        for addition in additions:
+            addition(physics, scene)
+
+    return physics.render(height, width, camera_id, scene_callback=add if additions else None)
 
 
 def frames(
@@ -277,14 +290,16 @@ def plot_terrain(
     seed: int = 0,
     blend: float = 0.0,
 ) -> None:
-    """Plots several draws of a planar terrain below each other.
+    """Plots several draws of a terrain: profiles below each other, or maps side by side.
+
+    Three-dimensional terrain is seen from above, x to the right, y up; an arrow is a start.
 
     Args:
       terrain: what `trl_suite.terrain.load` takes.
       path: where to write; .png.
       draws: how many.
-      length: how far ahead of the start, m.
-      seed: draw i is the strip with the seed sequence (seed, i).
+      length: how far ahead of the start, m; of a map its side, about the origin, at most 300 m.
+      seed: draw i is the strip or ground with the seed sequence (seed, i).
       blend: which of the terrain's parameter sets.
 
     Raises:
@@ -296,14 +311,26 @@ def plot_terrain(
     target = check_path(path, IMAGE_SUFFIXES)
     if draws < 1:
         raise ValueError(f'draws is {draws}; expected at least 1')
-    if not 0 < length <= 10_000:
-        raise ValueError(f'length is {length}; expected metres in (0, 10000]')
+    longest = MAX_SPAN if terrain.spatial else 10_000.0
+    if not 0 < length <= longest:
+        raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
     if seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or more')
     # Figures of their own class draw without a screen and leave the user's pyplot alone.
-    figure = _optional('matplotlib.figure').Figure(
-        figsize=(10, 0.8 + 1.3 * draws), layout='constrained'
-    )
+    make = _optional('matplotlib.figure').Figure
+    if terrain.spatial:
+        figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
+        _plot_maps(figure, terrain, draws, length, seed, blend)
+    else:
+        figure = make(figsize=(10, 0.8 + 1.3 * draws), layout='constrained')
+        _plot_profiles(figure, terrain, draws, length, seed, blend)
+    with replacing(target) as part:
+        figure.savefig(part, dpi=100)
+
+
+def _plot_profiles(
+    figure: Any, terrain: terrains.Terrain, draws: int, length: float, seed: int, blend: float
+) -> None:
     panels = figure.subplots(draws, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     first = round(-2 / terrains.SPACING)
     count = round(length / terrains.SPACING) - first + 1
@@ -323,8 +350,90 @@ def plot_terrain(
         xlim=(x[0], x[-1]), ylim=(low - room, high + room), title=f'{terrain.name} ({terrain.type})'
     )
     panels[-1].set_xlabel('x (m)')
-    with replacing(target) as part:
-        figure.savefig(part, dpi=100)
+
+
+def _plot_maps(
+    figure: Any, terrain: terrains.Terrain, draws: int, length: float, seed: int, blend: float
+) -> None:
+    panels = figure.subplots(1, draws, sharex=True, sharey=True, squeeze=False)[0]
+    count = min(MAP_POINTS, max(2, round(length / (0.25 * terrains.GRID))))
+    # Middles of pixels.
+    places = ((np.arange(count) + 0.5) / count - 0.5) * length
+    maps, starts = [], []
+    for i in range(draws):
+        sequence = np.random.SeedSequence((seed, i))
+        ground = terrains.Ground(terrain, sequence, blend=blend)
+        starts.append(ground.spawn(np.random.default_rng(sequence)))
+        # Line by line, each of which meets few of the boxes.
+        maps.append(np.stack([ground.height(places, y) for y in places]))
+    low, high = float(np.min(maps)), float(np.max(maps))
+    if low == high:
+        low, high = low - 0.5, high + 0.5
+    half = 0.5 * length
+    for panel, heights, (x, y, heading) in zip(panels, maps, starts, strict=True):
+        image = panel.imshow(
+            heights, origin='lower', extent=(-half, half, -half, half), vmin=low, vmax=high,
+            cmap='viridis', interpolation='nearest',
+        )  # fmt: skip
+        panel.annotate(
+            '', xytext=(x, y),
+            xy=(x + 0.06 * length * np.cos(heading), y + 0.06 * length * np.sin(heading)),
+            arrowprops={'arrowstyle': '->', 'color': 'tab:red', 'linewidth': 1.5},
+        )  # fmt: skip
+        panel.set_xlabel('x (m)')
+    panels[0].set_ylabel('y (m)')
+    figure.suptitle(f'{terrain.name} ({terrain.type})')
+    figure.colorbar(image, ax=list(panels), label='z (m)')
+
+
+def height_map(
+    environment: composer.Environment, path: Path | None = None, reach: float = 1.0
+) -> np.ndarray:
+    """Draws the 32 x 32 heights that a character observes, from above.
+
+    Ahead is up, the character's left is left; a dark square is where it stands. Ground as high as
+    that under the character is light; brown is higher, blue lower. What a task mirrors is shown
+    mirrored.
+
+    Args:
+      environment: one whose task observes such a map (`terrain_map=True`), after `reset`.
+      path: where to write it as .png; not written if None.
+      reach: height, up or down, of the full colour, m.
+
+    Returns:
+      The picture, shape (256, 256, 3), uint8.
+
+    Raises:
+      ValueError: the task observes no such map, reach is not positive, or another suffix.
+      ImportError: a path is given and the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    task: Any = environment.task
+    part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
+    if part.stop - part.start != SAMPLES**2 or not getattr(task, 'terrain_map', False):
+        raise ValueError(
+            f'a {type(task).__name__} task that observes no map of {SAMPLES} x {SAMPLES} heights has '
+            'none to draw; those in three dimensions do with the option terrain_map=True'
+        )
+    if not 0 < reach < np.inf:
+        raise ValueError(f'reach is {reach}; expected a positive number of metres')
+    # Lines from the left, each from behind.
+    heights = task.observation[0, part].reshape(SAMPLES, SAMPLES).T[::-1]
+    share = np.clip(heights / reach, -1, 1)[..., None]
+    full = np.where(share < 0, np.array(LOWER, float), np.array(HIGHER, float))
+    colours = np.array(LEVEL) + np.abs(share) * (full - np.array(LEVEL))
+    image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
+    # The middle of a sample's square is where it was taken.
+    behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
+    row = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
+    column = round(0.5 * SAMPLES * MAP_PIXELS)
+    mark = MAP_PIXELS // 2
+    image[row - mark : row + mark, column - mark : column + mark] = ROOT_COLOUR
+    if path is not None:
+        imageio = _optional('imageio.v3')
+        with replacing(check_path(path, IMAGE_SUFFIXES)) as file:
+            imageio.imwrite(file, image)
+    return image
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
@@ -445,16 +554,45 @@ def _ghost(task: Any) -> Callable[[Any, Any], None]:
     def add(physics: Any, scene: Any) -> None:
         # Data of its own on the same model: neither the model nor the simulation is touched.
         model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
-        data.qpos[task.figure.pose_qpos] = task.reference_pose(0)
+        addresses = task.figure.pose_qpos
+        data.qpos[addresses] = task.reference_pose(0)
         mujoco.mj_kinematics(model, data)
         before = scene.ngeom
         mujoco.mjv_addGeoms(
             model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC,
             scene,
         )  # fmt: skip
+        root = model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == addresses[0])[0]]
         for geom in scene.geoms[before : scene.ngeom]:
+            # Moving boxes have no ghosts.
+            own = model.body_rootid[model.geom_bodyid[geom.objid]] == model.body_rootid[root]
             geom.pos[1] += GHOST_BEHIND
-            geom.rgba = GHOST_COLOUR
+            geom.rgba = GHOST_COLOUR if own else np.zeros(4)
             geom.matid = -1
+
+    return add
+
+
+def _markers(task: Any) -> Callable[[Any, Any], None]:
+    """Returns a scene callback that adds a task's markers to what is drawn."""
+    import mujoco
+
+    def add(physics: Any, scene: Any) -> None:
+        for marker in task.markers(0):
+            if scene.ngeom == scene.maxgeom:
+                return
+            scene.ngeom += 1
+            geom = scene.geoms[scene.ngeom - 1]
+            cosine, sine = np.cos(marker.yaw), np.sin(marker.yaw)
+            if marker.shape == 'arrow':  # they point along their z axis
+                axes = np.array([[0, -sine, cosine], [0, cosine, sine], [-1, 0, 0]])
+            else:
+                axes = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            mujoco.mjv_initGeom(
+                geom, getattr(mujoco.mjtGeom, f'mjGEOM_{marker.shape.upper()}'),
+                np.array(marker.size, float), np.array(marker.position, float), axes.ravel(),
+                np.array(marker.colour, np.float32),
+            )  # fmt: skip
+            geom.category = mujoco.mjtCatBit.mjCAT_DECOR
 
     return add

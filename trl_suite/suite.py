@@ -10,11 +10,13 @@ from typing import Any
 from trl_suite import actuation as actuation_models
 from trl_suite import catalogue, characters, errors, motion, policies
 from trl_suite import terrain as terrains
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
+from trl_suite.tasks.footsteps import Footsteps
 from trl_suite.tasks.gait import GaitTask
 from trl_suite.tasks.imitation import Imitation
+from trl_suite.tasks.imitation3d import SpatialImitation
 from trl_suite.tasks.task import Task
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
@@ -28,17 +30,25 @@ TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {
 }
 DEFAULT_CLIPS = {
     'biped2d': 'biped2d_walk', 'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound',
-    'goat': 'dog_bound', 'raptor': 'raptor_run_050',
+    'goat': 'dog_bound', 'raptor': 'raptor_run_050', 'biped3d': 'biped3d_walk',
+    'biped3d_mocap': 'biped3d_mocap_walk', 'biped3d_mocap_run': 'biped3d_mocap_run',
+    'biped3d_full_mocap': 'biped3d_full_walk',
 }  # fmt: skip
 _ENVIRONMENT_OPTIONS = ('random', 'time_limit', 'step_limit')  # also taken from task_kwargs
 
 
+def _clip(row: Row) -> motion.Clip:
+    clip: Any = row.clip
+    if isinstance(clip, motion.Steps):
+        raise ValueError(f'{clip.name!r} is a library of steps; to be imitated, give a clip')
+    return clip if isinstance(clip, motion.Clip) else motion.load(clip or '')
+
+
 def _imitation(row: Row, options: dict[str, Any]) -> Task:
-    clip = row.clip if isinstance(row.clip, motion.Clip) else motion.load(row.clip or '')
     return Imitation(
         characters.make(row.character),
         PlanarTerrain(terrains.load(row.terrain)),
-        clip,
+        _clip(row),
         actuation_model=row.actuation,
         **options,
     )
@@ -49,10 +59,37 @@ def _gait(row: Row, options: dict[str, Any]) -> Task:
     return GaitTask(characters.make(row.character), arena, **options)
 
 
+def _spatial(row: Row) -> SpatialTerrain:
+    return SpatialTerrain(terrains.load(row.terrain))
+
+
+def _imitation3d(row: Row, options: dict[str, Any]) -> Task:
+    return SpatialImitation(
+        characters.make(row.character), _spatial(row), _clip(row), actuation_model=row.actuation,
+        **options,
+    )  # fmt: skip
+
+
+def _footsteps(row: Row, options: dict[str, Any]) -> Task:
+    steps: Any = row.clip
+    if isinstance(steps, motion.Clip):
+        raise ValueError(f'{steps.name!r} is a clip; for footsteps, give a library of steps')
+    if not isinstance(steps, motion.Steps):
+        steps = motion.load_steps(steps or '')
+    return Footsteps(
+        characters.make(row.character), _spatial(row), steps, actuation_model=row.actuation,
+        **options,
+    )  # fmt: skip
+
+
 _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], type[Task]]] = {
     'imitation': (_imitation, Imitation),
     'gait': (_gait, GaitTask),
+    'imitation3d': (_imitation3d, SpatialImitation),
+    'footsteps': (_footsteps, Footsteps),
 }
+TASKS = ('imitation', 'footsteps', 'gait')  # as `build` names rules
+_DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
 def load(
@@ -109,9 +146,9 @@ def reference_policy(id: str) -> policies.Policy:
 def build(
     character: str | characters.CharacterRow,
     actuation: str | None = None,
-    terrain: Any = 'flat',
+    terrain: Any = None,
     task: str = 'imitation',
-    clip: str | motion.Clip | None = None,
+    clip: str | motion.Clip | motion.Steps | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
@@ -121,21 +158,29 @@ def build(
       character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
       actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
         joints by itself and takes none.
-      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping.
-      task: the rules, 'imitation' or 'gait'.
-      clip: name of a clip, path of an .npz, or a `Clip`; by default the character's own. Only to
-        be imitated.
+      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
+        dimensions as the character has. By default level ground.
+      task: the rules: 'imitation', 'footsteps' (in three dimensions) or 'gait' (in the plane).
+      clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
+        footsteps the same of a library of steps, `Steps`. By default the character's own. A gait
+        takes none.
       task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
       environment_kwargs: as for `load`.
 
     Raises:
       ValueError: unknown names, options, or parts that do not fit each other.
     """
-    if task not in _RULES:
-        raise ValueError(errors.unknown('task', task, _RULES))
+    if task not in TASKS:
+        raise ValueError(errors.unknown('task', task, TASKS))
     name = character if isinstance(character, str) else character.name
     if isinstance(character, str) and character not in characters.CHARACTERS:
         raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
+    spatial = _character(character).spatial
+    if spatial is not (task == 'footsteps') and task != 'imitation':
+        raise ValueError(
+            f'character {name!r} is {_DIMENSIONS[spatial]}; the task {task!r} is for '
+            f'{_DIMENSIONS[not spatial]} characters'
+        )
     if task == 'gait':
         if actuation not in (None, 'gait') or clip is not None:
             raise ValueError(
@@ -147,9 +192,9 @@ def build(
         if actuation not in actuation_models.ACTUATIONS:
             raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
         if clip is None:
-            if name not in DEFAULT_CLIPS:
-                raise ValueError(f'character {name!r} has no clip of its own; give clip=')
-            clip = DEFAULT_CLIPS[name]
+            clip = _own_motion(name, task)
+    if terrain is None:
+        terrain = 'plane' if spatial else 'flat'
     row = Row(
         id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{task}',
         domain='custom',
@@ -157,12 +202,47 @@ def build(
         character=character,  # type: ignore[arg-type]
         actuation=actuation,
         terrain=terrain,
-        rules=task,
+        rules='imitation3d' if task == 'imitation' and spatial else task,
         clip=clip,  # type: ignore[arg-type]
         options=MappingProxyType({}),
         description='A combination of the user.',
     )
     return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+
+
+def _character(character: str | characters.CharacterRow) -> characters.CharacterRow:
+    return characters.CHARACTERS[character] if isinstance(character, str) else character
+
+
+def _own_motion(name: str, task: str) -> str:
+    """Returns the name of a character's own clip, or of its library of steps."""
+    if task == 'imitation':
+        if name not in DEFAULT_CLIPS:
+            raise ValueError(f'character {name!r} has no clip of its own; give clip=')
+        return DEFAULT_CLIPS[name]
+    known = motion.steps_names()
+    if name not in known:
+        raise ValueError(
+            f'character {name!r} has no library of steps of its own; give clip=, one of '
+            f'{", ".join(known)}'
+        )
+    return name
+
+
+def _check_dimensions(row: Row) -> None:
+    """Checks that character and terrain have the same number of dimensions.
+
+    Raises:
+      ValueError: they have not; the message names presets that fit.
+    """
+    character, ground = _character(row.character), terrains.load(row.terrain)
+    if ground.spatial == character.spatial:
+        return
+    presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
+    raise ValueError(
+        f'character {character.name!r} is {_DIMENSIONS[character.spatial]} and terrain {ground.name!r} '
+        f'({ground.type}) {_DIMENSIONS[ground.spatial]}; presets that fit: {", ".join(sorted(presets))}'
+    )
 
 
 def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
@@ -173,7 +253,8 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
       options: keyword arguments of the task class that override those of the row.
 
     Raises:
-      ValueError: an unknown option; the message has the closest matches.
+      ValueError: an unknown option; the message has the closest matches. Or a terrain with other
+        dimensions than the character.
     """
     make_task, cls = _RULES[row.rules]
     merged = {**row.options, **(options or {})}
@@ -185,6 +266,7 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
     for name in merged:
         if name not in known:
             raise ValueError(errors.unknown(f'option of {row.id}', name, [*known, 'random']))
+    _check_dimensions(row)
     return make_task(row, merged)
 
 

@@ -219,7 +219,7 @@ class VectorEnvironment:
             raise RuntimeError('step before the first reset')
         action = self._checked(action)
         task, ended = self._task, self._ended
-        resetting = np.flatnonzero(ended)
+        resetting = ended.nonzero()[0]
         stepped = None
         if len(resetting):
             if self.autoreset == 'disabled':
@@ -229,20 +229,19 @@ class VectorEnvironment:
             stepped = ~ended
             self._begin(resetting)
         task.act(action)
-        task.simulate(None if stepped is None else np.flatnonzero(stepped))
+        task.simulate(None if stepped is None else stepped.nonzero()[0])
         self._steps += 1 if stepped is None else stepped
         task.finish_step(stepped)
         if stepped is not None:
             task.reward[resetting] = 0.0
             task.failed[resetting] = task.diverged[resetting] = False
         terminated = task.failed.copy()
-        truncated = np.zeros(self.num_envs, bool)
-        if self.step_limit is not None:
-            truncated |= self._steps >= self.step_limit
+        limit = np.inf if self.step_limit is None else self.step_limit
+        over = self._steps >= limit
         if self._time is not None:
-            truncated |= self._time >= self.time_limit
-        truncated &= ~terminated
-        self._ended = terminated | truncated
+            over |= self._time >= self.time_limit
+        truncated = over > terminated
+        self._ended = over | terminated
         reward, info = task.reward.astype(self.dtype), task.infos()
         if self.autoreset == 'same_step':
             info['ended'] = self._ended.copy()

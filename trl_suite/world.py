@@ -18,6 +18,7 @@ from mujoco import batch
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
 WRITABLE = ('qpos', 'qvel', 'act', 'ctrl', 'qacc_warmstart', 'mocap_pos', 'mocap_quat')
+FORCES = ('xfrc_applied',)  # may be written by tasks that ask for them
 # Only what some task reads: a batch copies out every field for every row at every call.
 READABLE = ('xpos', 'xipos', 'cvel', 'subtree_com', 'sensordata', 'ten_length')
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that continues a trajectory bit for bit
@@ -53,6 +54,8 @@ class World:
     qfrc_bias: np.ndarray
     xanchor: np.ndarray
     site_xpos: np.ndarray
+    xquat: np.ndarray
+    xfrc_applied: np.ndarray
 
     def __init__(self, model: mujoco.MjModel, models: list[mujoco.MjModel]) -> None:
         self.n = len(models)
@@ -136,7 +139,7 @@ class PhysicsWorld(World):
         self._divergence = self._data.warning.number[_DIVERGED]
         for field in _bound(fields):
             view = getattr(self._data, field)[None]
-            if field not in WRITABLE:
+            if field not in (*WRITABLE, *FORCES):
                 view.flags.writeable = False
             setattr(self, field, view)
 
@@ -199,6 +202,8 @@ class BatchWorld(World):
         self._tell()
         # A field is zero until the first call after it was bound.
         self.batch.reset()
+        self._initial = self.batch.state[0].copy()
+        self._divergence = self.batch.warning[:, _DIVERGED, 1]
 
     def _tell(self) -> None:
         if self._edited:
@@ -215,7 +220,9 @@ class BatchWorld(World):
         self.batch.forward(rows, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def reset(self, rows: np.ndarray) -> None:
-        self.batch.reset(rows, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        # What `batch.reset` does, at a tenth of its price; no row's model has another initial state.
+        self.batch.state[rows] = self._initial
+        self.batch.warning[rows] = 0
 
     def set_const(self, row: int) -> None:
         mujoco.mj_setConst(self.models[row], self._scratch)
@@ -229,10 +236,10 @@ class BatchWorld(World):
         self.forward(np.array([row]))
 
     def any_diverged(self) -> bool:
-        return bool(self.batch.warning[:, _DIVERGED, 1].any())
+        return bool(np.count_nonzero(self._divergence))
 
     def diverged(self) -> np.ndarray:
-        return self.batch.warning[:, _DIVERGED, 1].any(1)
+        return self._divergence.any(1)
 
 
 def _bound(fields: Sequence[str]) -> tuple[str, ...]:

@@ -22,7 +22,9 @@ OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
 LEAN = 0.9  # of the way to the next face; how far the lower end of a tilted box may lean out
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
 EPSILON = 1e-9
-_FRACTIONS = {PIECE << i: np.arange(PIECE << i) / (PIECE << i) for i in range(1, DOUBLINGS + 1)}
+_FRACTIONS = {
+    PIECE << i: np.arange(PIECE << i)[:, None] / (PIECE << i) for i in range(1, DOUBLINGS + 1)
+}
 
 
 class Boxes(NamedTuple):
@@ -33,45 +35,49 @@ class Boxes(NamedTuple):
     quaternion: np.ndarray  # (k, 4) w, x, y, z
 
 
-def _cuts(start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float) -> np.ndarray:
-    """Returns a mask over vertices: True where a piece ends and the next begins."""
+def _cuts(start: int, heights: np.ndarray, face: np.ndarray, tolerance: float) -> np.ndarray:
+    """Returns a mask over vertices: True where a piece ends and the next begins.
+
+    Args:
+      face: whether cell i, between vertices i - 1 and i, is a vertical face, shape (m + 1,).
+    """
     count = len(heights)
     level = np.zeros(count + 1, dtype=bool)  # of cell i, between vertices i-1 and i
-    level[1:count] = np.abs(np.diff(heights)) < EPSILON
-    face = np.zeros(count + 1, dtype=bool)
-    face[1:count] = vertical[1:]
+    np.less(np.abs(heights[1:] - heights[:-1]), EPSILON, out=level[1:count])
     level &= ~face
     left, right = level[:count], level[1:]
     cut = (left != right) | face[:count] | face[1:]
-    cut[[0, -1]] = True
-    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
-    sloped = ~level & ~face
-    post = np.zeros(count, dtype=bool)
-    post[1:] |= face[: count - 1] & sloped[1:count]
-    post[:-1] |= face[2:] & sloped[1:count]
-    cut |= post
-    if not sloped[1:count].any():
+    cut[0] = cut[-1] = True
+    sloped = ~(level | face)[1:count]
+    if not sloped.any():
         return cut
-    grid = (np.arange(start, start + count) % PIECE == 0) & ~(left & right)
+    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
+    cut[1:] |= face[: count - 1] & sloped
+    cut[:-1] |= face[2:] & sloped
     mandatory = cut.copy()
-    cut |= grid
+    offset = -start % PIECE
+    cut[offset::PIECE] |= ~(left & right)[offset::PIECE]
+    spans = (count - 1 - offset) // PIECE
+    # Of the spans of one length: whether nothing is cut inside.
+    whole = ~cut[offset : offset + spans * PIECE].reshape(spans, PIECE)[:, 1:].any(1)
     for doubling in range(1, DOUBLINGS + 1):
-        span = PIECE << doubling
-        offset = -start % span
+        half, span = PIECE << doubling - 1, PIECE << doubling
+        first_half, offset = offset, -start % span
         spans = (count - 1 - offset) // span
-        if spans < 1:
+        if spans < 1 or not whole.any():
             break
-        inside = slice(offset, offset + spans * span)
-        height = heights[inside].reshape(spans, span)
-        # A span may be one piece if its halves are, nothing must be cut inside, and the profile
-        # stays close to the chord.
-        cuts = cut[inside].reshape(spans, span)[:, 1:]
-        free = cuts.sum(1) == cuts[:, span // 2 - 1]
-        free &= ~mandatory[inside].reshape(spans, span)[:, 1:].any(1)
-        first = height[:, :1]
-        rise = heights[offset + span :: span][:spans, None] - first
-        free &= np.abs(height - (first + rise * _FRACTIONS[span])).max(1) < tolerance
-        cut[offset + span // 2 : inside.stop : span][free] = False
+        halves = whole[(offset - first_half) // half :][: 2 * spans]
+        whole = halves[::2] & halves[1::2]
+        middle = slice(offset + half, offset + spans * span, span)
+        # A span may be one piece if its halves are, nothing must be cut between them, and the
+        # profile stays close to the chord.
+        joint = (whole & cut[middle] & ~mandatory[middle]).nonzero()[0]
+        height = heights[offset : offset + spans * span].reshape(spans, span)[joint].T
+        first = height[:1]
+        rise = heights[offset + span :: span][joint] - first
+        stray = np.abs(height - (first + rise * _FRACTIONS[span])).max(0)
+        cut[offset + half + span * joint[stray < tolerance]] = False
+        whole &= ~cut[middle]
     return cut
 
 
@@ -91,25 +97,25 @@ def from_profile(
       cells.
     """
     count = len(heights)
-    knots = np.flatnonzero(_cuts(start, heights, vertical, tolerance))
     face = np.zeros(count + 1, dtype=bool)
     face[1:count] = vertical[1:]
-    # Pieces between knots, except those that are a vertical cell; and lone vertices between two
-    # vertical cells, which are pieces of their own.
+    knots = _cuts(start, heights, face, tolerance).nonzero()[0]
     a, b = knots[:-1], knots[1:]
-    keep = ~(face[b] & (b - a == 1))
-    lone = knots[face[knots] & face[knots + 1]]
-    a, b = np.concatenate([a[keep], lone]), np.concatenate([b[keep], lone])
-    order = np.argsort(a + b, kind='stable')
-    a, b = a[order], b[order]
-
+    faces = face.any()
+    if faces:
+        # A vertical cell is no piece, but its left vertex is one if the cell before is vertical too.
+        upright = face[b] & (b - a == 1)
+        lone = face[a] & upright
+        keep = ~upright | lone
+        a, b = a[keep], np.where(lone, a, b)[keep]
     at_left, at_right = face[a], face[b + 1]
     x0 = (start + a - 0.5 * at_left) * SPACING
     x1 = (start + b + 0.5 * at_right) * SPACING
     z0, z1 = heights[a], heights[b]
-    # Posts are level; the height is that of the vertex at the face.
-    post = (b - a <= 1) & (at_left | at_right)
-    z0, z1 = np.where(post & at_right & ~at_left, z1, z0), np.where(post & at_left, z0, z1)
+    if faces:
+        # Posts are level; the height is that of the vertex at the face.
+        post = (b - a <= 1) & (at_left | at_right)
+        z0, z1 = np.where(post & at_right & ~at_left, z1, z0), np.where(post & at_left, z0, z1)
     if np.abs(z1 - z0).max(initial=0) < EPSILON:
         return _level(x0, x1, z0)
     slope = (z1 - z0) / (x1 - x0)
@@ -120,24 +126,24 @@ def from_profile(
     joined = (b[:-1] == a[1:]) & ~at_right[:-1]
     valley = joined & (slope[1:] > slope[:-1] + EPSILON)
     length = x1 - x0
-    run_on_right = np.zeros(len(a))
-    run_on_left = np.zeros(len(a))
-    run_on_right[:-1] = np.where(valley, np.minimum(OVERLAP, length[1:]), 0)
-    run_on_left[1:] = np.where(valley, np.minimum(OVERLAP, length[:-1]), 0)
+    overlap = np.minimum(OVERLAP, length)
+    run_on_right, run_on_left = np.zeros((2, len(a)))
+    run_on_right[:-1] = valley * overlap[1:]
+    run_on_left[1:] = valley * overlap[:-1]
     x0, z0 = x0 - run_on_left, z0 - run_on_left * slope
     x1, z1 = x1 + run_on_right, z1 + run_on_right * slope
 
     angle = np.arctan(slope)
     sine, cosine = np.sin(angle), np.cos(angle)
     thickness = np.where(tilted, TILTED_THICKNESS, LEVEL_THICKNESS)
-    # The lower end of a tilted box leans out: to the right where the ground rises, else to the left.
-    # It must not come out of the next face on that side.
-    right_face = np.minimum.accumulate(np.where(at_right, x1, np.inf)[::-1])[::-1]
-    left_face = np.maximum.accumulate(np.where(at_left, x0, -np.inf))
-    room = LEAN * np.where(slope > 0, right_face - x1, x0 - left_face)
-    thickness = np.where(
-        tilted, np.minimum(thickness, room / np.maximum(np.abs(sine), EPSILON)), thickness
-    )
+    if faces:
+        # The lower end of a tilted box leans out: to the right where the ground rises, else to the
+        # left. It must not come out of the next face on that side.
+        right_face = np.minimum.accumulate(np.where(at_right, x1, np.inf)[::-1])[::-1]
+        left_face = np.maximum.accumulate(np.where(at_left, x0, -np.inf))
+        room = LEAN * np.where(slope > 0, right_face - x1, x0 - left_face)
+        room /= np.maximum(np.abs(sine), EPSILON)
+        thickness = np.where(tilted, np.minimum(thickness, room), thickness)
     position = np.zeros((len(a), 3))
     position[:, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
     position[:, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine

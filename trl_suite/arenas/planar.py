@@ -57,7 +57,12 @@ class PlanarTerrain(composer.Arena):
         """Resolves the arena's geoms in a world and makes room for its n strips."""
         self._world = world
         # The boxes of one body are neighbours in the model.
-        self._first_geom = int(world.geom_ids([self.boxes[0].full_identifier])[0])
+        first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
+        pool = slice(first, first + len(self.boxes))
+        self._placed = [
+            (model.geom_pos[pool], model.geom_size[pool], model.geom_quat[pool])
+            for model in world.models
+        ]
         self.strips: list[Strip | None] = [None] * world.n
         self._start = np.full((world.n, 1), np.nan)  # vertex number of a window's first vertex
         self._offset = np.arange(world.n)[:, None] * _WINDOW
@@ -80,20 +85,20 @@ class PlanarTerrain(composer.Arena):
         """
         moved = x - (self._centre if rows is None else self._centre[rows])
         if np.vdot(moved, moved) > _REACH**2:  # the cheap test; by rows only if it may be so
-            far = np.flatnonzero(np.abs(moved[:, 0]) > _REACH)
+            far = (np.abs(moved) > _REACH).nonzero()[0]
+            if not len(far):
+                return
             leaving = far if rows is None else rows[far]
             for row, root in zip(leaving.tolist(), x[far, 0].tolist(), strict=True):
                 # The window starts at multiples of the advance, however far a row has jumped.
                 self._lay(row, round(root / ADVANCE) * _ADVANCE)
-            if len(leaving):  # contacts of the open step name boxes that now lie elsewhere
-                self._world.forward(leaving)
+            # Contacts of the open step name boxes that now lie elsewhere.
+            self._world.forward(leaving)
 
     def height(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
         u = x * _CELLS_PER_METRE
-        start = np.empty_like(u)
-        start[...] = self._start[rows]  # packed: quicker than broadcasting
-        u -= start
+        u -= self._start[rows]
         whole = np.floor(u)
         u -= whole
         cell = whole.astype(np.int64)
@@ -113,7 +118,10 @@ class PlanarTerrain(composer.Arena):
           heights: what it returned, (n, k). True up to the length of a window beyond the boxes;
             further away is only who has broken down.
         """
-        u = x * _CELLS_PER_METRE - self._start
+        u = x * _CELLS_PER_METRE
+        u -= self._start
+        if u.min() >= 0 and u.max() < _WINDOW - 1:
+            return
         for row in np.flatnonzero((u.min(1) < 0) | (u.max(1) >= _WINDOW - 1)).tolist():
             strip, start = self.strips[row], self._start[row, 0]
             assert strip is not None
@@ -164,15 +172,14 @@ class PlanarTerrain(composer.Arena):
             pieces = boxes.from_profile(start, heights, vertical, tolerance)
         self._start[row], self._vertical[row] = start, vertical
         self._heights[row] = heights
-        self._rises[row, :-1] = np.diff(heights)
-        first, count = self._first_geom, len(pieces.position)
-        used, unused = slice(first, first + count), slice(first + count, first + len(self.boxes))
-        model = self._world.models[row]
-        model.geom_pos[used] = pieces.position
-        model.geom_size[used] = pieces.half_size
-        model.geom_quat[used] = pieces.quaternion
-        model.geom_pos[unused] = ((centre + _AHEAD) * SPACING, 0, PARKED)
-        model.geom_size[unused] = 0.1
+        np.subtract(heights[1:], heights[:-1], out=self._rises[row, :-1])
+        count = len(pieces.position)
+        position, half_size, quaternion = self._placed[row]
+        position[:count], position[count:] = (
+            pieces.position, ((centre + _AHEAD) * SPACING, 0, PARKED),
+        )  # fmt: skip
+        half_size[:count], half_size[count:] = pieces.half_size, 0.1
+        quaternion[:count] = pieces.quaternion
         self._world.set_const(row)
 
 

@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 from trl_suite import errors
-from trl_suite.characters.character import Character, CharacterRow, Joint, body_figures
+from trl_suite.characters.character import (
+    Character,
+    CharacterRow,
+    Joint,
+    body_figures,
+    fingerprint,
+)
 from trl_suite.characters.rows import CHARACTERS
 
-__all__ = ('CHARACTERS', 'Character', 'CharacterRow', 'Joint', 'body_figures', 'make')
+__all__ = (
+    'CHARACTERS',
+    'Character',
+    'CharacterRow',
+    'Joint',
+    'body_figures',
+    'fingerprint',
+    'make',
+)
 
 
 def make(character: str | CharacterRow) -> Character:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from dm_control.composer.observation import observable
 from trl_suite import resources
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is drawn
+DIGITS = 6  # to which a fingerprint looks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,6 +245,25 @@ class CharacterObservables(composer.Observables):
             return effectors - np.asarray(physics.bind(self._entity.root_body).xpos)
 
         return observable.Generic(relative)
+
+
+def fingerprint(row: CharacterRow) -> str:
+    """Returns name and digest of all that makes a body move as it does, gains included.
+
+    Looks do not count, nor does how the MJCF is written.
+    """
+    model = mjcf.Physics.from_mjcf_model(Character(row).mjcf_model).model
+    solid = model.geom_group == GROUP_COLLISION
+    figures = [
+        model.body_mass, model.body_inertia, model.body_ipos, model.body_pos, model.body_quat,
+        model.jnt_type, model.jnt_pos, model.jnt_axis, model.jnt_range, model.jnt_actfrcrange,
+        model.geom_size[solid], model.geom_pos[solid], model.geom_quat[solid],
+        model.geom_friction[solid], [(j.kp, j.kd, j.armature) for j in row.joints.values()],
+    ]  # fmt: skip
+    digest = hashlib.sha256()
+    for array in figures:
+        digest.update((np.asarray(array, float).round(DIGITS) + 0.0).tobytes())
+    return f'{row.name} {digest.hexdigest()[:16]}'
 
 
 def body_figures(character: Character) -> dict[str, Any]:

@@ -47,6 +47,13 @@ def rotation_vector(q: np.ndarray) -> np.ndarray:
     return q[..., 1:] * np.where(sine < _SMALL, 2, angle / np.maximum(sine, _SMALL))
 
 
+def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Returns vectors (..., 3) after rotations (..., 4); leading axes broadcast."""
+    w, axis = q[..., :1], q[..., 1:]
+    across = 2 * np.cross(axis, v)
+    return v + w * across + np.cross(axis, across)
+
+
 def reflect(q: np.ndarray) -> np.ndarray:
     """Returns the mirror image in the x-z plane (left and right exchanged), shape (..., 4)."""
     return q * np.array([1, -1, 1, -1])

@@ -134,7 +134,6 @@ class PlanarFigure:
             sample_x=self._ground_x[:, :samples],
             effector_ground_x=self._ground_x[:, samples:],
             offsets=np.tile(self._samples, (n, 1)),
-            under=np.empty((n, samples - 1)),
             effectors=effectors,
             effector_x=effectors[:, :effector_count],
             effector_z=effectors[:, effector_count:],
@@ -143,9 +142,10 @@ class PlanarFigure:
 
     def measure(self, v: SimpleNamespace) -> None:
         """Writes terrain, pose and velocity blocks, end effectors and com velocity."""
-        # A trunk that points backwards looks backwards. A sum of squares is the cheapest test.
+        # A trunk that points backwards looks backwards. A sum of squares is the cheapest test, but of
+        # many rows it says little.
         v.facing = None
-        if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2:
+        if np.vdot(v.pitch, v.pitch) > _UPRIGHT**2 and np.square(v.pitch).max() > _UPRIGHT**2:
             v.facing = np.where(np.cos(v.pitch) < 0, -1.0, 1.0)
         v.xipos.take(self._xz, 1, v.position, 'clip')
         v.position -= v.qpos.take(self._root_xz, 1)
@@ -161,8 +161,8 @@ class PlanarFigure:
 
         samples = len(self._samples) - 1
         v.xpos.take(self._effector_xz, 1, v.effectors, 'clip')
-        v.sample_x[...] = v.x
-        v.sample_x += v.offsets if v.facing is None else v.offsets * v.facing
+        offsets = v.offsets if v.facing is None else v.offsets * v.facing
+        np.add(v.x, offsets, out=v.sample_x)
         v.effector_ground_x[...] = v.effector_x
         ground = self.arena.height(self._ground_x)
         if v.facing is not None:  # ahead is behind, where the boxes do not reach as far
@@ -170,8 +170,7 @@ class PlanarFigure:
         under_root = ground[:, samples : samples + 1]
         np.subtract(v.z, under_root, v.height)
         if samples:
-            v.under[...] = under_root
-            np.subtract(ground[:, :samples], v.under, out=v.terrain)
+            np.subtract(ground[:, :samples], under_root, out=v.terrain)
         v.effector_x -= v.com.take(self._com_x, 1)
         v.effector_z -= ground[:, samples + 1 :]
 
@@ -189,7 +188,8 @@ class PlanarFigure:
 
         Args:
           rows: which simulations; they are reset.
-          poses: x (ignored), z above the ground, pitch and joints in link order, (rows, 3 + J).
+          poses: x (ignored), z above the ground, pitch and joints in link order, (rows, 3 + J);
+            they come back with x and z as placed.
           rates: their velocities, (rows, 3 + J).
           extents: of the collision geoms in these poses, relative to the root, (rows, 3, G); see
             `trl_suite.tasks.reference.link_extents`.
@@ -201,10 +201,9 @@ class PlanarFigure:
         height = poses[:, 1] + ground[:, 0]
         depth = ground[:, 1:].reshape(len(rows), 3, -1).max(1) - (height[:, None] + lowest)
         height += np.maximum(depth.max(1) + CLEARANCE, 0)
+        poses[:, 0], poses[:, 1] = 0.0, height
         world.reset(rows)
         world.qpos[rows[:, None], self.pose_qpos] = poses
-        world.qpos[rows, self.pose_qpos[0]] = 0.0
-        world.qpos[rows, self.pose_qpos[1]] = height
         world.qvel[rows[:, None], self.pose_dof] = rates
         world.forward(rows)
 

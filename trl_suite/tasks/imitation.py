@@ -204,26 +204,20 @@ class Imitation(Task):
     def begin_episodes(
         self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> None:
-        for row, random_state in zip(rows.tolist(), random_states, strict=True):
+        terrain, centre = self.arena.terrain, 0.0
+        phases = np.empty(len(rows))
+        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
-            phase = drawn if self._start_phase is None else self._start_phase
-            self.phase[row] = phase
-            upstream = {}
+            phases[i] = drawn if self._start_phase is None else self._start_phase
             if self._spawn == 'upstream':
                 # Where the original's segments meet: it builds them before it moves the root to 0.
-                start = self.clip.pose(np.array([phase * self.reference.period]))[0]
-                upstream['centre'] = start[0] - 0.5
-            strip = Strip(
-                self.arena.terrain,
-                drawn_seed(random_state),
-                blend=self._blend,
-                spawn=self._spawn,
-                **upstream,
-            )
+                centre = self.clip.pose(phases[i : i + 1] * self.reference.period)[0, 0] - 0.5
+            seed = drawn_seed(random_state)
+            strip = Strip(terrain, seed, blend=self._blend, spawn=self._spawn, centre=centre)
             self.arena.begin_episode(row, strip)
-        self._cycles[rows] = self._start_cycles[rows] = self.phase[rows]
-        self.figure.place(rows, *self.reference.state(self.phase[rows]))
+        self.phase[rows] = self._cycles[rows] = self._start_cycles[rows] = phases
+        self.figure.place(rows, *self.reference.state(phases))
         self.failed[rows] = self.diverged[rows] = False
         self.reward[rows] = 0.0
 
@@ -239,22 +233,24 @@ class Imitation(Task):
         self._cycles = self._cycles + step
         np.remainder(self._cycles, self._ones, self.phase)
         # Sums of squares are the cheapest tests for what happens once in many steps.
-        fast = np.vdot(v.rates, v.rates) > MAX_JOINT_SPEED**2
-        if fast or self.world.any_diverged():
+        broken = False
+        self.diverged.fill(False)
+        if np.vdot(v.rates, v.rates) > MAX_JOINT_SPEED**2 or self.world.any_diverged():
             too_fast = np.abs(v.rates).max(1) > MAX_JOINT_SPEED
             np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
+            broken = bool(self.diverged.any())  # sums of many rows say little
+        if broken:
             # The last finite observation stands for what broke down.
             kept = self.observation[self.diverged]
             self.observe()
             self.observation[self.diverged] = kept
         else:
-            self.diverged[:] = False
             self.observe()
-        if np.vdot(v.fall, v.fall) > 0 or self.diverged.any():
+        if broken or np.vdot(v.fall, v.fall) > 0:
             np.logical_or(v.fall.any(1), self.diverged, out=self.failed)
             self.reward_terms[self.failed] = 0.0
         else:
-            self.failed[:] = False
+            self.failed.fill(False)
         np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
     def observe(self) -> None:
@@ -287,7 +283,7 @@ class Imitation(Task):
         terms = self.reward_terms.T * (self.reward != 0)
         return {
             'reward_terms': dict(zip(rewards.IMITATION_TERMS, terms, strict=True)),
-            'fell': self.failed & ~self.diverged,
+            'fell': self.failed > self.diverged,
             'diverged': self.diverged.copy(),
             'distance': self._all.x[:, 0].copy(),
         }

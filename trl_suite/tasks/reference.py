@@ -113,9 +113,7 @@ class Reference:
         u = u - sample  # not in place: slower for a single number
         index = sample.astype(np.int64)
         found = self._steps.take(index, 0)
-        blend = np.empty_like(found)
-        blend[...] = u[:, None]  # packed: quicker than broadcasting
-        found *= blend
+        found *= u[:, None]
         found += self._table.take(index, 0)
         return found
 

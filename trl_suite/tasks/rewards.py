@@ -14,6 +14,17 @@ IMITATION_TERMS: dict[str, tuple[float, float]] = {
     'com': (0.2, 10.0),
     'root': (0.1, 10.0),
 }
+# The footstep controller's, of the same structure; its end-effector error has the footstep in it,
+# and `heading` is a power of a cosine (see `heading`), its scale meaningless.
+# Source: the step scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
+STEP_TERMS: dict[str, tuple[float, float]] = {
+    'pose': (0.5 / 1.05, 2.0),
+    'velocity': (0.05 / 1.05, 0.005),
+    'end_effector': (0.2 / 1.05, 5.0),
+    'com': (0.1 / 1.05, 10.0),
+    'root': (0.1 / 1.05, 10.0),
+    'heading': (0.1 / 1.05, 0.0),
+}
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
 _WEIGHTS = np.array([[weight for weight, _ in IMITATION_TERMS.values()]])
@@ -32,10 +43,22 @@ def imitation(errors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     Returns:
       Shape (n, 5); their sum is the reward, at most 1.
     """
-    terms = np.multiply(errors, _SCALES, out=out)
+    return exponentials(errors, _WEIGHTS, _SCALES, out)
+
+
+def exponentials(
+    errors: np.ndarray, weights: np.ndarray, scales: np.ndarray, out: np.ndarray | None = None
+) -> np.ndarray:
+    """Returns weights * exp(scales * errors), all (n, k) or (1, k); scales are negative."""
+    terms = np.multiply(errors, scales, out=out)
     np.exp(terms, out=terms)
-    terms *= _WEIGHTS
+    terms *= weights
     return terms
+
+
+def heading(error: np.ndarray) -> np.ndarray:
+    """Returns ((1 + cos error) / 2)^4 of errors in rad: 1 where they are 0, 0 where opposite."""
+    return (0.5 + 0.5 * np.cos(error)) ** 4
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import collections
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -17,6 +17,24 @@ from trl_suite.world import PhysicsWorld, World
 
 _ONLY_ROW = np.zeros(1, int)
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
+
+
+class Marker(NamedTuple):
+    """Something that a task points out in pictures; the physics knows nothing of it.
+
+    Attributes:
+      shape: 'box', 'cylinder', 'sphere', 'ellipsoid', or 'arrow', which points along its yaw.
+      position: of its middle, of an arrow its tail, m.
+      size: half sizes as MuJoCo has them; of an arrow radius, radius and length, m.
+      colour: red, green, blue, opacity.
+      yaw: rad.
+    """
+
+    shape: str
+    position: Sequence[float]
+    size: Sequence[float]
+    colour: tuple[float, float, float, float]
+    yaw: float = 0.0
 
 
 class Task(composer.Task):

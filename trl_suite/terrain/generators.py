@@ -28,7 +28,7 @@ import dataclasses
 import math
 import numbers
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -237,8 +237,9 @@ def _integer(low: float, high: float, rng: np.random.Generator) -> int:
 
 
 def _box(parameters: Parameters, name: str, height: str, rng: np.random.Generator) -> Runs:
-    spacing, width = (_uniform(parameters, name + key, rng) for key in ('Spacing', 'W'))
-    return [(cells(spacing), 0.0), (cells(width), _uniform(parameters, height, rng)), (1, 0.0)]
+    spacing = cells(_uniform(parameters, name + 'Spacing', rng))
+    width = cells(_uniform(parameters, name + 'W', rng))
+    return [(spacing, 0.0), (width, _uniform(parameters, height, rng)), (1, 0.0)]
 
 
 def _rise_range(parameters: Parameters, name: str, rng: np.random.Generator) -> str:
@@ -312,9 +313,11 @@ def _repeat(
             levels.append(base + level)
             missing -= count
         base = levels[-1]
-    heights = np.repeat(levels, counts)
-    # Ground of level runs changes its height at vertical faces only.
-    return Profile(heights, np.diff(heights, prepend=0.0) != 0)
+    # Ground of level runs changes its height at vertical faces only, where a run begins.
+    ends = np.cumsum(counts)
+    vertical = np.zeros(ends[-1], dtype=bool)
+    vertical[ends - counts] = np.not_equal(levels, [0.0, *levels[:-1]])
+    return Profile(np.repeat(levels, counts), vertical)
 
 
 # Overlays: added over the vertices of a stretch.
@@ -334,14 +337,16 @@ def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) 
     changes, thresholds = rng.random((2, count))
     changes *= abs(parameters['SlopeDeltaRange'])
     thresholds = low + (high - low) * thresholds
-    slope = 0.0
+    offsets = np.fromiter(_walk(changes.tolist(), thresholds.tolist()), float, count).cumsum()
+    return Profile(profile.heights + offsets * SPACING, profile.vertical)
+
+
+def _walk(changes: list[float], thresholds: list[float]) -> Iterator[float]:
     # Plain floats: a walk that looks at its own last value cannot be vectorised.
-    slopes = [
-        slope := slope - change if slope > threshold else slope + change
-        for change, threshold in zip(changes.tolist(), thresholds.tolist(), strict=True)
-    ]
-    offsets = np.cumsum(slopes) * SPACING
-    return Profile(profile.heights + offsets, profile.vertical)
+    slope = 0.0
+    for change, threshold in zip(changes, thresholds, strict=True):
+        slope = slope - change if slope > threshold else slope + change
+        yield slope
 
 
 @register('var2d_flat')

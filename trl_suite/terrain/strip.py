@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.terrain.generators import LONGEST, SPACING, Profile, cells, draw
+from trl_suite.terrain.generators import GENERATORS, LONGEST, SPACING, Profile, cells, draw, flat
 from trl_suite.terrain.parameters import Terrain
 
 STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
 PAD_END = 1.0  # m; the flat start ends here
 INTENDED_CENTRE = -1.0  # m
+_UNUSED = np.random.default_rng(0)  # for level ground, which draws nothing
 _FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # draws between two parts; 2**128 by the golden ratio
 
 
@@ -79,12 +81,15 @@ class Strip:
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
+        self._sequence = seed_sequence(seed)
+
+    @functools.cached_property
+    def _streams(self) -> tuple[np.random.Generator, np.random.Generator]:
+        """What ground to the right and to the left is drawn from."""
         # Two far parts of one stream; `jumped` would draw a seed from the system for nothing.
-        sequence = seed_sequence(seed)
-        left = np.random.PCG64(sequence)
+        right, left = np.random.PCG64(self._sequence), np.random.PCG64(self._sequence)
         left.advance(_FAR)
-        self._right = np.random.Generator(np.random.PCG64(sequence))
-        self._left = np.random.Generator(left)
+        return np.random.Generator(right), np.random.Generator(left)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -143,8 +148,8 @@ class Strip:
             'low': self._low,
             'heights': self._heights.copy(),
             'vertical': self._vertical.copy(),
-            'right': self._right.bit_generator.state,
-            'left': self._left.bit_generator.state,
+            'right': self._streams[0].bit_generator.state,
+            'left': self._streams[1].bit_generator.state,
         }
 
     @classmethod
@@ -161,7 +166,7 @@ class Strip:
         self.type, self.parameters = state['type'], dict(state['parameters'])
         self._low = state['low']
         self._heights, self._vertical = state['heights'].copy(), state['vertical'].copy()
-        self._right, self._left = right, left
+        self._streams = right, left
 
     def _cell(self, x: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the height left of x, the rise over the cell, and where in the cell x lies."""
@@ -183,14 +188,14 @@ class Strip:
         heights, vertical = [self._heights], [self._vertical]
         end, height = self._low + len(self._heights) - 1, self._heights[-1]
         while end < high:
-            profile = self._stretch(end, self._right)
+            profile = self._stretch(end, 0)
             heights.append(height + profile.heights)
             vertical.append(profile.vertical)
             height = heights[-1][-1]
             end += len(profile.heights)
         start, height = self._low, self._heights[0]
         while start > low:
-            profile = self._stretch(start - cells(STRETCH), self._left)
+            profile = self._stretch(start - cells(STRETCH), 1)
             # The last vertex comes to lie on the first one there is; the ground that the profile is
             # appended to, at height 0, becomes the new first vertex.
             ground = np.concatenate(([0.0], profile.heights))
@@ -202,9 +207,14 @@ class Strip:
             self._low = start
             self._heights, self._vertical = np.concatenate(heights), np.concatenate(vertical)
 
-    def _stretch(self, begin: int, rng: np.random.Generator) -> Profile:
+    def _stretch(self, begin: int, side: int) -> Profile:
         """Draws a stretch that begins at a vertex; if it covers x = 0, after flat ground."""
-        profile = draw(self.type, self.parameters, STRETCH, rng)
+        generator = GENERATORS.get(self.type)
+        if generator is not None and generator.function is flat:
+            # Without the streams, which take longer to make than the ground.
+            profile = flat(self.parameters, STRETCH, _UNUSED)
+        else:
+            profile = draw(self.type, self.parameters, STRETCH, self._streams[side])
         if not begin <= 0 < begin + cells(STRETCH):
             return profile
         pad = min(cells(STRETCH), cells(PAD_END) - begin)

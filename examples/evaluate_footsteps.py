@@ -1,0 +1,142 @@
+"""How well a footstep controller walks where it is told: plans, pushes, slopes, bumps, belts.
+
+    python examples/evaluate_footsteps.py                           # the reference policy
+    python examples/evaluate_footsteps.py mine.npz --only general straight --json mine.json
+
+For every condition, over episodes with the seeds of `evaluation.evaluate`: the share that lasts to
+the end, the mean reward per step (0 after a fall), the distance from planned to actual landing
+places (mean and 90th percentile over all steps of all episodes), and the mean error of the heading
+at these moments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import types
+from typing import Any
+
+import numpy as np
+
+from trl_suite import policies, rendering, suite
+from trl_suite.catalogue import Row
+from trl_suite.vector import VectorEnvironment
+
+ID = 'PD_Biped3D_LLC_General_Step-v0'
+SECONDS = 20.0  # of an episode
+STEADY = {'turn': 0.0, 'sharp': 0.0}
+VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'sharp': 0.0}
+PUSHES = {'force': (150, 150), 'duration': (0.2, 0.2), 'interval': (2.8, 2.8)}  # every 3 s
+BELTS = {
+    'Type': 'conveyor3d',
+    'Params': [{
+        'ObstacleWidth0': 2, 'ObstacleWidth1': 2, 'ObstacleSpeed0': 0.6, 'ObstacleSpeed1': 0.6,
+        'ConveyorStripLength': 200, 'ConveyorNumStrips': 20, 'ConveyorSpacing': 1,
+    }],
+}  # fmt: skip
+
+
+def ramp(slope: float) -> dict[str, Any]:
+    return {'Type': 'var3d_ramp', 'Params': [{'Slope': slope}]}
+
+
+# Options of the task; `terrain` and `along` (start ahead, not anywhere) are of the row.
+CONDITIONS: dict[str, dict[str, Any]] = {
+    'straight': {'plans': STEADY},
+    'straight, 0.3 m': {'plans': {**STEADY, 'length': (0.3, 0.3)}},
+    'straight, 0.7 m': {'plans': {**STEADY, 'length': (0.7, 0.7)}},
+    'general without sharp turns': {'plans': {'sharp': 0.0}},
+    'general': {'plans': {}},
+    'varied lengths and widths': {'plans': VARIED},
+    'made from the root': {'plans': {'from_root': 1.0}},
+    'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
+    'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
+    'ramp down 8 %': {'plans': STEADY, 'terrain': ramp(-0.08)},
+    'bumps of 3 cm': {
+        'plans': {'sharp': 0.0},
+        'terrain': {'Type': 'var3d_checkers', 'Params': [{'Slope': 0.03}]},
+    },
+    'belts of 0.6 m/s': {'plans': {'sharp': 0.0}, 'terrain': BELTS},
+}
+
+
+def row_for(id_: str, terrain: Any) -> Row:
+    row = suite.find(id_)
+    options = {k: v for k, v in row.options.items() if k != 'plans'}
+    return dataclasses.replace(
+        row, terrain=terrain or row.terrain, options=types.MappingProxyType(options)
+    )
+
+
+def run(
+    row: Row, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
+) -> dict[str, Any]:
+    """Runs one episode in every row; returns what became of them."""
+    steps = round(seconds * 30)
+    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
+    environments = VectorEnvironment(
+        row, episodes, 0, seeds, autoreset='disabled', step_limit=steps, task_kwargs=options
+    )
+    policy.check(environments)
+    observation = environments.reset()
+    runs, reward = np.ones(episodes, bool), 0.0
+    full, distance = np.zeros(episodes, bool), np.zeros(episodes)
+    landing, heading = [], []
+    while runs.any():
+        step = environments.step(policy(observation))
+        reward += float(step.reward[runs].sum())
+        landed = step.info['landed'] & runs
+        landing.append(step.info['landing_error'][landed])
+        heading.append(step.info['heading_error'][landed])
+        ended = step.terminated | step.truncated
+        distance[ended & runs] = step.info['distance'][ended & runs]
+        full[ended & runs] = step.truncated[ended & runs]
+        runs &= ~ended
+        observation = step.observation
+        if ended.any() and runs.any():  # every row must go on
+            observation = environments.reset(ended)
+    environments.close()
+    errors, turns = np.concatenate(landing), np.concatenate(heading)
+    return {
+        'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
+        'fraction': reward / (steps * episodes), 'landing': float(errors.mean()),
+        'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
+        'distance': float(distance.mean()),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('policy', nargs='?', help='.npz file; the reference policy by default')
+    parser.add_argument('--id', default=ID)
+    parser.add_argument('--only', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
+    parser.add_argument('--episodes', type=int, default=100)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--seconds', type=float, default=SECONDS)
+    parser.add_argument('--json', type=pathlib.Path)
+    arguments = parser.parse_args()
+    policy = (
+        policies.load(arguments.policy) if arguments.policy else policies.reference(arguments.id)
+    )
+    found = {}
+    for name in arguments.only:
+        options = dict(CONDITIONS[name])
+        row = row_for(arguments.id, options.pop('terrain', None))
+        found[name] = result = run(
+            row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
+        )
+        print(
+            f'{name:28} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
+            f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
+            f'heading {result["heading"]:.3f} rad',
+            flush=True,
+        )
+    if arguments.json:
+        with rendering.replacing(arguments.json) as part:
+            part.write_text(json.dumps({'id': arguments.id, 'conditions': found}, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()

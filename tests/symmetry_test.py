@@ -1,0 +1,348 @@
+"""Left for right: what is reflected, that physics agrees, and policies that see a mirror."""
+
+import dataclasses
+import pathlib
+import tempfile
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import policies, suite
+from trl_suite.symmetry import Mirror, blocks, exchanged
+from trl_suite.tasks.imitation3d import joint_targets
+from trl_suite.vector import VectorEnvironment
+
+# Character, actuation, terrain, rules, options. Stairs and ramp are the same on either side of the
+# line of the start.
+WALK = ('biped3d', 'position', 'plane', 'imitation', {})
+STEP = ('biped3d_mocap', 'position', 'plane', 'footsteps', {})
+CASES = (
+    WALK, STEP,
+    ('biped3d_mocap_run', 'position', 'plane', 'imitation', {}),
+    ('biped3d_mocap_run', 'position', 'plane', 'footsteps', {}),
+    ('biped3d_full_mocap', 'position', 'plane', 'footsteps', {}),
+    ('biped3d_full_mocap', 'position', 'plane', 'imitation', {'centre': 'original'}),
+    ('biped3d', 'position', 'plane', 'imitation', {'centre': 'original', 'terrain_map': True}),
+    ('biped3d', 'position', 'plane', 'imitation', {'centre': 'posture'}),
+    ('biped3d', 'torque', 'plane', 'imitation', {}),
+    ('biped3d_mocap', 'torque', 'plane', 'footsteps', {'terrain_map': True}),
+    ('biped3d', 'velocity', 'plane', 'imitation', {}),
+    ('biped3d_mocap', 'velocity', 'plane', 'footsteps', {}),
+    ('biped3d', 'position', 'stairs3d', 'imitation', {'terrain_map': True}),
+    ('biped3d_mocap', 'position', 'ramp3d', 'footsteps', {'terrain_map': True}),
+)  # fmt: skip
+
+
+def build(case, **options):
+    character, actuation, terrain, rules, own = case
+    environment = suite.build(
+        character, actuation, terrain, rules,
+        task_kwargs={'random': 3, 'step_limit': None, **own, **options},
+        environment_kwargs={'flat_observation': True},
+    )  # fmt: skip
+    return environment, environment.reset().observation['observations']
+
+
+def observed(environment):
+    environment.task.observe()
+    return environment.observation()['observations']
+
+
+def put(environment, pose, rate):
+    task, data = environment.task, environment.physics.data
+    data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
+    environment.physics.forward()
+
+
+def state(environment):
+    task, data = environment.task, environment.physics.data
+    return data.qpos[task.figure.pose_qpos].copy(), data.qvel[task.figure.pose_dof].copy()
+
+
+def disturbed(environment, rng, angle=0.4):
+    """A pose and velocity anywhere about the present ones."""
+    pose, rate = state(environment)
+    pose[:3] += (1.0, 0.7, 0.1) * rng.uniform(-1, 1, 3)
+    layout = environment.task.motion.layout
+    for start, _ in layout.rotations:
+        quaternion = pose[start : start + 4] + angle * rng.uniform(-1, 1, 4)
+        pose[start : start + 4] = quaternion / np.linalg.norm(quaternion)
+    return pose, rate + rng.uniform(-2, 2, len(rate))
+
+
+class TaskTest(parameterized.TestCase):
+    """The mirror of a task against the reflection of its state."""
+
+    @parameterized.parameters(*CASES)
+    def test_twice_is_once_less(self, *case):
+        environment, _ = build(case)
+        mirror = environment.task.mirror
+        mirror.check(environment.observation_spec()['observations'].shape[0],
+                     len(environment.action_map))  # fmt: skip
+        rng = np.random.default_rng(0)
+        observation = rng.normal(size=(40, len(mirror.observation_index)))
+        observation[:, mirror.phase] = rng.integers(0, 30, 40) / 30
+        action = rng.normal(size=(40, len(mirror.action_index)))
+        again = mirror.observation(mirror.observation(observation))
+        np.testing.assert_allclose(again, observation, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
+        self.assertFalse(np.array_equal(mirror.observation(observation), observation))
+
+    @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.0, 0.13, 0.4)))
+    def test_half_a_cycle_later_all_is_reflected(self, case, phase):
+        # Clips are symmetric, and so is ground of which the middle line is a line of symmetry.
+        environment, first = build(case, start_phase=phase)
+        _, second = build(case, start_phase=phase + 0.5)
+        mirror = environment.task.mirror
+        np.testing.assert_allclose(mirror.observation(second[None])[0], first, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(mirror.observation(first[None])[0], second, rtol=0, atol=1e-9)
+
+    @parameterized.parameters(*CASES)
+    def test_any_reflected_state_is_seen_reflected(self, *case):
+        environment, _ = build(case, start_phase=0.2)
+        other, _ = build(case, start_phase=0.7)
+        task, rng = environment.task, np.random.default_rng(5)
+        for _ in range(5):
+            pose, rate = disturbed(environment, rng)
+            put(environment, pose, rate)
+            mirror = task.motion.layout.mirror
+            put(other, mirror.pose(pose), mirror.velocity(rate))
+            if case[3] == 'footsteps':
+                places, heading = rng.uniform(-1, 1, (2, 3)), rng.uniform(-3, 3)
+                task.landing[0], task.heading[0] = places, heading
+                other.task.landing[0] = places * [1, -1, 1]
+                other.task.heading[0] = -heading
+            first, second = observed(environment), observed(other)
+            kept = np.ones(len(first), bool)
+            if case[3] == 'footsteps':  # contacts are of the last substep
+                kept[environment.blocks['contact']] = False
+            reflected = task.mirror.observation(second[None])[0]
+            np.testing.assert_allclose(reflected[kept], first[kept], rtol=0, atol=1e-9)
+            # The reward does not see a difference either, but for the interpolation of its table.
+            np.testing.assert_allclose(
+                other.task.reward_terms, task.reward_terms, rtol=0, atol=1e-6
+            )
+
+    @parameterized.parameters(*CASES[:-2])
+    def test_reflected_actions_move_a_reflected_body(self, *case):
+        # Small moves for a few steps: the solver does not treat left and right alike to the last bit,
+        # and at the clamp of an orientation actuator the last bit decides about its damping.
+        environment, _ = build(case, start_phase=0.1)
+        other, _ = build(case, start_phase=0.6)
+        mirror = environment.task.mirror
+        rng = np.random.default_rng(1)
+        pose, rate = state(environment)
+        for each in (environment, other):
+            put(each, state(each)[0], np.zeros(len(rate)))
+        action = np.zeros(len(environment.action_map))
+        if case[1] == 'position':  # the targets are where the joints are
+            task = environment.task
+            action = task.action_map.action(joint_targets(task.motion, pose))
+        for _ in range(5):
+            given = action + 0.02 * rng.uniform(-1, 1, len(action))
+            environment.step(given)
+            other.step(mirror.action(given[None])[0])
+            pose, rate = state(environment)
+            reflect = environment.task.motion.layout.mirror
+            found = state(other)
+            np.testing.assert_allclose(found[0], reflect.pose(pose), rtol=0, atol=1e-6)
+            np.testing.assert_allclose(found[1], reflect.velocity(rate), rtol=0, atol=1e-4)
+
+    @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.05, 0.45)))
+    def test_a_mirrored_environment_is_the_plain_one_in_a_mirror(self, case, phase):
+        plain, first = build(case, start_phase=phase)
+        mirrored, seen = build(case, start_phase=phase, mirrored=True)
+        mirror, rng = plain.task.mirror, np.random.default_rng(2)
+        self.assertIsNone(mirrored.task.mirror)  # nothing is left to reflect
+        self.assertEqual(mirrored.action_spec(), plain.action_spec())
+        sides = set()
+        for _ in range(6):
+            left = bool(mirror.left(first[None])[0])
+            sides.add(left)
+            self.assertEqual(left, plain.task.phase[0] >= 0.5)
+            canonical = mirror.observation(first[None])[0] if left else first
+            self.check(mirrored, plain, seen, canonical)
+            action = 0.4 * rng.uniform(-1, 1, len(plain.action_map))
+            seen = mirrored.step(action)
+            first = plain.step(mirror.action(action[None])[0] if left else action)
+            self.assertEqual(seen.reward, first.reward)
+            seen, first = (each.observation['observations'] for each in (seen, first))
+            np.testing.assert_array_equal(mirrored.physics.data.qpos, plain.physics.data.qpos)
+            np.testing.assert_array_equal(mirrored.physics.data.qvel, plain.physics.data.qvel)
+        if phase > 0.4:
+            self.assertEqual(sides, {False, True})
+
+    def check(self, mirrored, plain, seen, canonical):
+        """Compares a mirrored observation with the plain one as it is in right stance."""
+        for name, part in mirrored.blocks.items():
+            expected = canonical[plain.blocks[name]]
+            if name == 'phase':  # of the single step, and its half
+                phase = expected[0]
+                self.assertLess(phase, 0.5)
+                expected = [2 * phase, *np.eye(2)[int(4 * phase)]]
+            elif name == 'plan':  # heading, first place from the left, second from the right foot
+                np.testing.assert_array_equal(expected[[0, 1, 2, 9, 10, 11]], 0)
+                expected = np.concatenate([expected[12:], expected[3:6], expected[6:9]])
+            np.testing.assert_array_equal(seen[part], expected, err_msg=name)
+
+    def test_sizes(self):
+        for case, plain, mirrored in ((STEP, 125, 117), (WALK, 112, 110)):
+            self.assertLen(build(case)[1], plain)
+            self.assertLen(build(case, mirrored=True)[1], mirrored)
+
+    def test_rows_of_a_batch_are_reflected_each_by_its_own_phase(self):
+        plain = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0)
+        mirrored = VectorEnvironment(
+            'PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0, task_kwargs={'mirrored': True}
+        )
+        first, _ = plain.reset(), mirrored.reset()
+        mirror, rng, both = plain._task.mirror, np.random.default_rng(0), 0
+        for _ in range(20):
+            left = mirror.left(first)
+            both += 0 < left.sum() < 6
+            action = 0.3 * rng.uniform(-1, 1, (6, 17))
+            a, b = plain.step(mirror.answered(action, left)), mirrored.step(action)
+            np.testing.assert_array_equal(a.reward, b.reward)
+            first = a.observation
+            canonical, left = mirror.canonical(first)
+            np.testing.assert_array_equal(left, plain._task.phase >= 0.5)
+            np.testing.assert_array_equal(b.observation[:, :105], canonical[:, :105])
+        self.assertGreater(both, 5)
+
+    def test_a_target_tells_no_phase(self):
+        self.assertIsNone(suite.make('PD_Biped3D_Imitate-Track-v0').task.mirror)
+
+
+class MirrorTest(parameterized.TestCase):
+    """Mirrors as data."""
+
+    def make(self, **changes):
+        fields = {
+            'observation_index': np.array([0, 2, 1, 3]), 'observation_sign': np.array([1, -1, -1, 1.0]),
+            'action_index': np.array([1, 0]), 'action_sign': np.ones(2), 'phase': 3,
+        }  # fmt: skip
+        return Mirror(**{**fields, **changes})
+
+    def test_by_hand(self):
+        mirror = self.make()
+        observation = np.array([[1.0, 2, 3, 0.25], [1.0, 2, 3, 0.5]])
+        np.testing.assert_array_equal(mirror.left(observation), [False, True])
+        reflected = [[1, -3, -2, 0.75], [1, -3, -2, 0.0]]
+        np.testing.assert_array_equal(mirror.observation(observation), reflected)
+        canonical, left = mirror.canonical(observation)
+        np.testing.assert_array_equal(canonical, [observation[0], reflected[1]])
+        action = np.array([[0.1, 0.2], [0.1, 0.2]])
+        np.testing.assert_array_equal(mirror.answered(action, left), [[0.1, 0.2], [0.2, 0.1]])
+        np.testing.assert_array_equal(action, [[0.1, 0.2], [0.1, 0.2]])
+
+    def test_blocks(self):
+        np.testing.assert_array_equal(exchanged(4, [(1, 3)]), [0, 3, 2, 1])
+        index, sign = blocks(np.array([1, 0]), (1.0, -1.0, 1.0))
+        np.testing.assert_array_equal(index, [3, 4, 5, 0, 1, 2])
+        np.testing.assert_array_equal(sign, [1, -1, 1, 1, -1, 1])
+
+    @parameterized.parameters(
+        ({'observation_index': np.array([0, 1, 1, 3])}, 'mirror_observation_index'),
+        ({'observation_index': np.arange(3)}, 'mirror_observation_index'),
+        ({'observation_sign': np.array([1, -1, 0.5, 1])}, 'mirror_observation_sign'),
+        ({'action_index': np.array([1, 2])}, 'mirror_action_index'),
+        ({'action_sign': np.ones(3)}, 'mirror_action_sign'),
+        ({'phase': 4}, 'mirror_phase'), ({'phase': -1}, 'mirror_phase'),
+    )  # fmt: skip
+    def test_refused(self, changes, message):
+        self.make().check(4, 2)
+        with self.assertRaisesRegex(ValueError, message):
+            self.make(**changes).check(4, 2)
+
+
+def policy_for(environment, **changes):
+    """A random policy that sees what an environment observes, in the mirror of its task."""
+    rng = np.random.default_rng(7)
+    task, k, a = environment.task, environment.observation_spec(), len(environment.action_map)
+    k = k['observations'].shape[0]
+    fields = {
+        'id': 'PD_Biped3D_LLC_General_Step-v0',
+        'blocks': [(name, part.stop - part.start) for name, part in task.blocks.items()],
+        'actions': environment.action_map.names, 'quantity': environment.action_map.quantity,
+        'mean': rng.normal(size=k), 'std': rng.uniform(0.5, 2, k), 'clip': 5.0,
+        'weights': [rng.normal(0, 0.05, (k, 8)), rng.normal(0, 0.05, (8, a))],
+        'biases': [rng.normal(0, 0.1, 8), rng.normal(0, 0.1, a)], 'activation': 'tanh',
+        'log_std': np.zeros(a), 'mirror': task.mirror,
+    }  # fmt: skip
+    return policies.Policy(**{**fields, **changes})
+
+
+class PolicyTest(parameterized.TestCase):
+    """Policies that see left stance as right stance in a mirror."""
+
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.path = pathlib.Path(folder.name) / 'p.npz'
+        self.environment, _ = build(STEP)
+        self.policy = policy_for(self.environment)
+        rows = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 30, 1, seed=4)
+        self.observation = rows.reset()
+
+    def test_reflected_observations_get_reflected_actions(self):
+        mirror = self.environment.task.mirror
+        self.policy.check(self.environment)
+        action = self.policy(self.observation)
+        left = mirror.left(self.observation)
+        self.assertTrue(0 < left.sum() < 30)
+        reflected = self.policy(mirror.observation(self.observation))
+        np.testing.assert_allclose(reflected, mirror.action(action), rtol=0, atol=1e-6)
+        # In right stance the mirror does nothing; in left stance it does.
+        plain = dataclasses.replace(self.policy, mirror=None)
+        np.testing.assert_array_equal(action[~left], plain(self.observation[~left]))
+        self.assertTrue((action[left] != plain(self.observation[left])).any(1).all())
+        # A row does not depend on the others.
+        for i in range(30):
+            np.testing.assert_array_equal(self.policy(self.observation[i]), action[i])
+
+    def test_saved_and_loaded(self):
+        policies.save(self.policy, self.path)
+        with np.load(self.path, allow_pickle=False) as data:
+            names = [name for name in data.files if name.startswith('mirror_')]
+            self.assertLen(names, 5)
+            for name in names:
+                self.assertRegex(policies.__doc__, rf'\n    {name}  ')
+                self.assertIn(data[name].dtype.kind, 'iuf')
+                if data[name].dtype.kind == 'f':
+                    self.assertEqual(data[name].dtype, np.float32)
+        again = policies.load(self.path)
+        for field in dataclasses.fields(Mirror):
+            np.testing.assert_array_equal(
+                getattr(again.mirror, field.name), getattr(self.policy.mirror, field.name)
+            )
+        np.testing.assert_array_equal(again(self.observation), self.policy(self.observation))
+        again.check(self.environment)
+        policies.save(dataclasses.replace(self.policy, mirror=None), self.path)
+        self.assertIsNone(policies.load(self.path).mirror)
+
+    @parameterized.parameters(
+        ({'mirror_phase': None}, 'mirror_phase'),
+        ({'mirror_action_sign': None}, 'mirror_action_sign'),
+        ({'mirror_action_sign': np.zeros(17, np.float32)}, 'mirror_action_sign'),
+        ({'mirror_action_index': np.arange(16)}, 'mirror_action_index'),
+        ({'mirror_observation_index': np.zeros(125, int)}, 'mirror_observation_index'),
+        ({'mirror_observation_sign': np.array(['a'] * 125)}, 'mirror_observation_sign'),
+        ({'mirror_phase': np.array(125)}, 'mirror_phase'),
+        ({'mirror_side': np.array(1)}, 'mirror_'),
+    )
+    def test_broken_files_are_refused(self, changes, message):
+        policies.save(self.policy, self.path)
+        with np.load(self.path) as data:
+            fields = {**data, **changes}
+        np.savez(self.path, **{name: value for name, value in fields.items() if value is not None})
+        with self.assertRaisesRegex(ValueError, f'{self.path.name}.*{message}'):
+            policies.load(self.path)
+
+    def test_a_mirror_that_does_not_fit(self):
+        with self.assertRaisesRegex(ValueError, 'mirror_observation_index'):
+            policy_for(self.environment, mirror=build(WALK)[0].task.mirror)
+
+
+if __name__ == '__main__':
+    absltest.main()

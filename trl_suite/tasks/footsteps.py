@@ -1,0 +1,512 @@
+"""Walking where the feet are told to go: the footstep-tracking low-level controllers.
+
+Source: the step scenario of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from trl_suite import errors
+from trl_suite.arenas import SpatialTerrain
+from trl_suite.characters import Character
+from trl_suite.motion import Steps, quaternion, step_features
+from trl_suite.tasks import rewards
+from trl_suite.tasks.figure3d import turn
+from trl_suite.tasks.reference3d import SpatialReference
+from trl_suite.tasks.task import Marker, drawn_seed
+from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
+from trl_suite.terrain import Ground
+from trl_suite.world import World
+
+RIGHT, LEFT = 0, 1  # of the end effectors, in link order
+SIDE = np.array([-1.0, 1.0])  # of each foot: to the right, to the left
+NEAR_GOAL = 0.1  # m; nearer a goal gives no direction
+GOAL_REACHED = 1.0  # m; a goal is drawn anew there
+TYPICAL_POSES = 31  # of a step, whose mean is the middle of position control
+SOLE, SOLE_AHEAD = (0.0885, 0.045, 0.004), 0.052  # m; of the markers, and how far before the ankle
+SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)  # who lands there
+GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)
+# Plans made from the root, as a high-level controller makes them.
+ROOT_TURN, ROOT_TURN_LIMIT = 0.3, 0.8  # rad; spread of the turn off the present heading, its end
+ROOT_LENGTH, ROOT_WIDTH = (0.2, 0.7), (0.08, 0.28)  # m
+
+
+@dataclasses.dataclass(frozen=True)
+class Plans:
+    """How plans are drawn; a plan says where both feet land next and where the body heads.
+
+    At every switch of stance the second landing place of the old plan becomes the first of the new
+    one, and the second is laid from there: a step's length along the planned heading and its width
+    to the side of the foot.
+
+    Attributes:
+      length: of a step, m: least and most.
+      width: between the feet, m: least and most.
+      change: probability that a step has other length and width than the one before.
+      turn: spread of the change of heading from one step to the next, rad.
+      sharp: probability of a sharp turn instead, anything between -pi and pi.
+      from_root: probability that a plan is made anew from where the body is and heads, with lengths
+        from 0.2 to 0.7 m, widths from 0.08 to 0.28 m and turns up to 0.8 rad, as a high-level
+        controller makes plans.
+    """
+
+    length: tuple[float, float] = (0.5, 0.5)
+    width: tuple[float, float] = (0.15, 0.15)
+    change: float = 0.1
+    turn: float = 0.25
+    sharp: float = 0.1
+    from_root: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, ('length', 'width'), 'm')
+        for name in ('change', 'sharp', 'from_root'):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f'{name} is {getattr(self, name)}; expected a probability')
+        if not 0 <= self.turn < np.inf:
+            raise ValueError(f'turn is {self.turn}; expected radians, 0 or more')
+
+
+@dataclasses.dataclass(frozen=True)
+class Pushes:
+    """Horizontal forces from any side on the middle of the torso, again and again.
+
+    Attributes:
+      force: N: least and most.
+      duration: s of each, in whole control steps.
+      interval: s from the end of one, or the start of the episode, to the next.
+    """
+
+    force: tuple[float, float] = (50.0, 150.0)
+    duration: tuple[float, float] = (0.2, 0.4)
+    interval: tuple[float, float] = (1.0, 2.0)
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, ('force',), 'N')
+        _check_ranges(self, ('duration', 'interval'), 's')
+
+
+def _check_ranges(instance: Any, names: Sequence[str], unit: str) -> None:
+    """Turns fields into pairs of floats, the least and the most."""
+    for name in names:
+        value = getattr(instance, name)
+        try:
+            low, high = map(float, value)
+        except (TypeError, ValueError):
+            low, high = np.nan, np.nan
+        if not 0 <= low <= high < np.inf:
+            raise ValueError(f'{name} is {value}; expected the least and the most, in {unit}')
+        object.__setattr__(instance, name, (low, high))
+
+
+def _options(cls: Any, kind: str, given: Any) -> Any:
+    """Returns options as an instance of their class, made of keyword arguments if need be."""
+    if not isinstance(given, Mapping):
+        if not isinstance(given, cls):
+            raise ValueError(f'{kind} is {given!r}; expected {cls.__name__} or a mapping')
+        return given
+    known = [field.name for field in dataclasses.fields(cls)]
+    for name in given:
+        if name not in known:
+            raise ValueError(errors.unknown(f'option of {kind}', name, known))
+    return cls(**given)
+
+
+class Footsteps(Tracking):
+    """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
+
+    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
+    left, z up), N = 8: 125 numbers:
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. The right foot stands below 0.5.
+      contact: whether right and left foot touch the ground; 2.
+      plan: where the first step lands as seen from the right foot, zero while that one stands, and
+        from the left foot, zero while that one does; where the second lands as seen from the right
+        foot, zero unless that one stands, and from the left foot; (x, y, z) each, z from the ground
+        under the root; then the planned heading, rad to the left of the present one; 13.
+    Mirrored, 117 numbers: all of it reflected in left stance, actions too; the phase is that of the
+    single step, with the one-hot of its half (3), and the plan (7) has the heading first, then the
+    first landing place as seen from the swing foot, then the second from the stance foot.
+    """
+
+    TERMS = rewards.STEP_TERMS
+    ABOUT = 'root'
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialTerrain,
+        steps: Steps,
+        *,
+        actuation_model: str = 'position',
+        plans: Plans | Mapping[str, Any] | None = None,
+        goal: bool = False,
+        pushes: Pushes | Mapping[str, Any] | None = None,
+        miss: float | None = None,
+        footstep_scale: float = 1.0,
+        heading_scale: float = 1.0,
+        terrain_map: bool = False,
+        mirrored: bool = False,
+        substeps: int = SUBSTEPS,
+        centre: str = 'clip',
+        half_range: float | None = None,
+        start_phase: float | None = None,
+        blend: float = 0.0,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: where it moves.
+          steps: library of single steps of this character; the clock has the period of two.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+          plans: how plans are drawn; or keyword arguments of `Plans`.
+          pushes: forces on the torso; or keyword arguments of `Pushes`. None without.
+          goal: plans head for a goal on the terrain instead, one after the other.
+          miss: an episode fails where a foot lands farther than this from its place, m. The original
+            meant to fail at 1 m and does not.
+          footstep_scale: times the squared distance between swing foot and landing place in the
+            reward; more than 1 teaches accuracy sooner.
+          heading_scale: the same of the error of the heading.
+          terrain_map, mirrored, substeps, centre, half_range, start_phase, blend: as for
+            `SpatialImitation`; the middle of position control is the mean pose of a straight step.
+
+        Raises:
+          ValueError: options out of range, or steps that do not fit the character.
+        """
+        if len(character.row.end_effectors) != 2:
+            raise ValueError(f'character {character.row.name!r} has no two feet to place')
+        if miss is not None and not 0 < miss < np.inf:
+            raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
+        for name, scale in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
+            if not 0 <= scale < np.inf:
+                raise ValueError(f'{name} is {scale}; expected 0 or more')
+        self.plans = _options(Plans, 'plans', {} if plans is None else plans)
+        self.pushes = None if pushes is None else _options(Pushes, 'pushes', pushes)
+        if self.pushes:
+            self.fields = (*self.fields, 'xfrc_applied')
+        self.steps, self.period = steps, 2 * steps.duration
+        self.goal_given, self.miss = goal, miss
+        self._footstep_scale, self._heading_scale = footstep_scale, heading_scale
+        mean = np.mean([self.plans.length])
+        # The straight step of about the planned length, from which episodes start.
+        straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
+        self._first = int(np.lexsort((np.abs(steps.labels[:, 0] - mean), straight))[0])
+        super().__init__(
+            character, arena, steps, actuation_model=actuation_model, substeps=substeps,
+            centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
+            mirrored=mirrored, blend=blend, phase=True, extras={'contact': 2, 'plan': 13},
+        )  # fmt: skip
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def bind(self, world: World) -> None:
+        super().bind(world)
+        n, kinematics = world.n, self.figure.kinematics
+        self.reference = SpatialReference.of_steps(self.steps, kinematics, world.models[0])
+        weights = np.array(list(self.TERMS.values()))
+        self._term_weights, self._term_scales = weights[None, :-1, 0], -weights[None, :-1, 1]
+        self._heading_weight = weights[-1, 0]
+        self._random = [np.random.default_rng(0)] * n
+        self.stance = np.zeros(n, int)  # foot that stands
+        self.landing = np.zeros((n, 2, 3))  # m; where the swing foot lands, then the stance foot
+        self.heading = np.zeros(n)  # rad; planned
+        self._length, self._width = np.zeros(n), np.zeros(n)  # m; of the steps of now
+        self._track = np.zeros(n, int)  # of the reference
+        self._turned = np.zeros(n)  # rad; by which the reference is turned
+        self._shift = np.zeros((n, 2))  # m; where the origin of its track is
+        self.goal = np.zeros((n, 3))  # m
+        self.landing_error = np.zeros(n)  # m; of the last foot that landed
+        self.heading_error = np.zeros(n)  # rad; at that moment
+        self.landed = np.zeros(n, bool)  # whether one did in this step
+        self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
+        self._push = np.zeros((n, 3))  # N
+        # Control steps of an episode at which the push ends and the next one begins.
+        self._push_end, self._push_begin = np.zeros((2, n), int)
+
+    @property
+    def step_phase(self) -> np.ndarray:
+        """Share of the single step that has passed, (n,)."""
+        twice = 2 * self.phase
+        return twice - np.floor(twice)
+
+    # Episodes and plans.
+
+    def _start(
+        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = np.zeros((len(rows), 3))
+        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+            drawn = random_state.random_sample()
+            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
+            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            self._random[row] = np.random.default_rng(drawn_seed(random_state))
+            spawns[i] = ground.spawn(self._random[row])
+            self.arena.begin_episode(row, ground, spawns[i, :2])
+        stance = (self.phase[rows] >= 0.5).astype(int)
+        self.stance[rows] = stance
+        times = self.step_phase[rows] * self.steps.duration
+        poses = self.steps.pose(self._first, times, stance == LEFT)
+        poses[:, :2] = 0.0
+        rates = self.steps.velocity(self._first, times, stance == LEFT)
+        return poses, rates, spawns
+
+    def _begun_on_ground(self, rows: np.ndarray) -> None:
+        found = self.figure.measure()
+        self.landing_error[rows] = self.heading_error[rows] = 0.0
+        self.landed[rows] = False
+        self._push_end[rows] = 0
+        for row in rows.tolist():
+            if self.pushes:
+                self._push_begin[row] = self._steps_within(row, self.pushes.interval)
+            place, angle = self._origin[row, :2], self._origin[row, 2]
+            stance = int(self.stance[row])
+            self._redraw_step(row, always=True)
+            # The line of the plan goes through the start, half a width beside each foot.
+            along, _ = quaternion.turned(found.feet[row, stance, :2] - place, -angle)
+            aside = 0.5 * SIDE[stance] * self._width[row]
+            anchor = place + quaternion.turned(np.array([along, aside]), angle)
+            self.heading[row] = angle
+            if self.goal_given:
+                self.goal[row] = self.arena.goal(row, self._random[row], place, 'step')
+                self._head_for_goal(row, found.root[row, :2])
+                anchor = found.feet[row, stance, :2]
+            self._lay(row, 0, self._next(row, 1 - stance, anchor))
+            self._lay(row, 1, self._next(row, stance, self.landing[row, 0, :2]))
+        self._put_reference(rows, found, np.full(len(rows), self._first))
+
+    def _redraw_step(self, row: int, always: bool = False) -> None:
+        """Draws length and width of the steps to come, perhaps."""
+        plans, random = self.plans, self._random[row]
+        if always or random.uniform() < plans.change:
+            self._length[row] = random.uniform(*plans.length)
+            self._width[row] = random.uniform(*plans.width)
+
+    def _next(self, row: int, foot: int, place: np.ndarray) -> np.ndarray:
+        """Returns where a foot lands while the other one stands at a place (x, y)."""
+        self._redraw_step(row)
+        step = np.array([self._length[row], SIDE[foot] * self._width[row]])
+        return place + quaternion.turned(step, self.heading[row])
+
+    def _lay(self, row: int, which: int, place: np.ndarray) -> None:
+        """Enters a landing place (x, y) into the plan, on the ground."""
+        rows = np.array([row])
+        height = self.arena.height(place[None, :1], place[None, 1:], rows)
+        self.landing[row, which] = *place, height[0, 0]
+
+    def _head_for_goal(self, row: int, place: np.ndarray) -> None:
+        way = self.goal[row, :2] - place
+        if np.hypot(*way) > NEAR_GOAL:
+            self.heading[row] = np.arctan2(way[1], way[0])
+
+    def _steps_within(self, row: int, seconds: tuple[float, float]) -> int:
+        return round(self._random[row].uniform(*seconds) / self.control_timestep)
+
+    def act(self, action: np.ndarray) -> None:
+        super().act(action)
+        pushes = self.pushes
+        if not pushes:
+            return
+        for row in np.flatnonzero(self._count >= self._push_begin).tolist():
+            angle = self._random[row].uniform(-np.pi, np.pi)
+            force = self._random[row].uniform(*pushes.force)
+            self._push[row] = force * np.cos(angle), force * np.sin(angle), 0.0
+            self._push_end[row] = self._count[row] + self._steps_within(row, pushes.duration)
+            self._push_begin[row] = self._push_end[row] + self._steps_within(row, pushes.interval)
+        pushing = (self._count < self._push_end)[:, None]
+        self.world.xfrc_applied[:, self._torso, :3] = self._push * pushing
+
+    def _step(self, found: SimpleNamespace, stepped: np.ndarray | None) -> None:
+        stance = (self.phase >= 0.5).astype(int)
+        switched = (stance != self.stance) & ~self.diverged  # what breaks down lands nowhere
+        self.landed = switched
+        if not switched.any():
+            return
+        rows = np.flatnonzero(switched)
+        self.stance[rows] = stance[rows]  # the foot that has just landed
+        gap = found.feet[rows, stance[rows], :2] - self.landing[rows, 0, :2]
+        self.landing_error[rows] = np.hypot(gap[:, 0], gap[:, 1])
+        self.heading_error[rows] = np.abs(rewards.wrap(self.heading[rows] - found.heading[rows]))
+        for row in rows.tolist():
+            self._replan(row, found)
+        self._put_reference(rows, found, self._choose(rows, found))
+
+    def _replan(self, row: int, found: SimpleNamespace) -> None:
+        """Makes the next plan of one simulation, at a switch of stance."""
+        plans, random = self.plans, self._random[row]
+        stance = int(self.stance[row])
+        if plans.from_root and random.uniform() < plans.from_root:
+            off = np.clip(random.normal(0, ROOT_TURN), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            self.heading[row] = found.heading[row] + off
+            place = found.feet[row, stance, :2]
+            for which, foot in enumerate((1 - stance, stance)):
+                step = random.uniform(*ROOT_LENGTH), SIDE[foot] * random.uniform(*ROOT_WIDTH)
+                place = place + quaternion.turned(np.array(step), self.heading[row])
+                self._lay(row, which, place)
+            return
+        if self.goal_given:
+            if np.hypot(*(found.root[row, :2] - self.goal[row, :2])) < GOAL_REACHED:
+                self.goal[row] = self.arena.goal(row, random, found.root[row, :2], 'step')
+            self._head_for_goal(row, self.landing[row, :, :2].mean(0))
+        elif plans.sharp and random.uniform() < plans.sharp:
+            self.heading[row] += random.uniform(-np.pi, np.pi)
+        elif plans.turn:
+            self.heading[row] += random.normal(0, plans.turn)
+        self.landing[row, 0] = self.landing[row, 1]
+        self._lay(row, 1, self._next(row, stance, self.landing[row, 0, :2]))
+
+    def _choose(self, rows: np.ndarray, found: SimpleNamespace) -> np.ndarray:
+        """Returns the steps nearest to the plans of some simulations."""
+        feet = found.feet[rows]
+        query = step_features(
+            found.root[rows, :2], found.heading[rows], feet[:, RIGHT, :2], feet[:, LEFT, :2],
+            self.landing[rows, 0, :2], self.heading[rows], self.stance[rows] == RIGHT,
+        )  # fmt: skip
+        return self.steps.select(query)
+
+    def _put_reference(self, rows: np.ndarray, found: SimpleNamespace, chosen: np.ndarray) -> None:
+        """Has the chosen steps begin where the characters are and as they head."""
+        self._track[rows] = chosen + len(self.steps) * (self.stance[rows] == LEFT)
+        columns = self.reference.columns
+        now = self.reference.features(self.step_phase[rows], self._track[rows])
+        turned = found.heading[rows] - now[:, columns['heading'].start]
+        self._turned[rows] = turned
+        self._shift[rows] = found.root[rows, :2] - quaternion.turned(
+            now[:, columns['root']], turned
+        )
+
+    # Reward and observation.
+
+    def _gone(self, stepped: np.ndarray | None) -> np.ndarray | bool:
+        if self.miss is None:
+            return False
+        return self.landed & (self.landing_error > self.miss)
+
+    def _compare(self, found: SimpleNamespace) -> None:
+        n, kinematics = len(found.features), self.figure.kinematics
+        rows = np.arange(n)
+        columns = kinematics.columns
+        share = self.step_phase
+        reference = self.reference.features(share, self._track)
+        # The reference heads where the character did when it was put there.
+        velocity = reference[:, columns['com_velocity']]
+        reference[:, columns['com_velocity']][:, :2] = quaternion.turned(
+            velocity[:, :2], self._turned
+        )
+        error = kinematics.compare(found.features, reference[:, : found.features.shape[1]])
+        feet = error[:, self._effector_columns].reshape(n, 2, 3)
+        late = share > 0.5
+        swing = 1 - self.stance
+        away = feet[rows, swing]
+        away[late, :2] = 0.0  # in the second half the plan takes the place of the reference
+        feet[rows, swing] = away
+        raised = reference[:, columns['effectors']].reshape(n, 2, 3)[rows, swing, 2]
+        step = self.landing[:, 0] - found.feet[rows, swing]
+        step[:, 2] += raised
+        step *= late[:, None]
+        end = (feet * feet).reshape(n, 6).sum(1) + self._footstep_scale * (step * step).sum(1)
+        error *= error
+        # Row by row, so that a row's sums do not depend on how many rows there are.
+        pose, velocity, com, root = np.matmul(error[:, None], self._weights)[:, 0].T
+        errors = np.stack([pose, velocity, end, com, root], axis=1)
+        terms = self.reward_terms
+        terms[:, :-1] = rewards.exponentials(errors, self._term_weights, self._term_scales)
+        self._off = rewards.wrap(self.heading - found.heading)
+        error = np.minimum(self._heading_scale * np.abs(self._off), np.pi)
+        terms[:, -1] = self._heading_weight * rewards.heading(error)
+
+    def _write_extras(self, found: SimpleNamespace) -> None:
+        n = len(found.features)
+        rows = np.arange(n)
+        self._observation[:, self._full['contact']] = found.contact
+        plan = self._observation[:, self._full['plan']]
+        feet = np.stack([1 - self.stance, self.stance], axis=1)  # which of them lands where
+        way = self.landing - found.feet[rows[:, None], feet]
+        way[..., 2] = self.landing[..., 2] - found.under
+        way = turn(way, found.cosine, found.sine)
+        slots = np.zeros((n, 2, 2, 3))  # first and second step; as seen from right and left foot
+        slots[rows[:, None], np.arange(2), feet] = way
+        plan[:, :12] = slots.reshape(n, 12)
+        plan[:, 12] = self._off
+
+    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        if name == 'contact':
+            return np.array([1, 0]), np.ones(2)
+        index = np.arange(13)
+        index[:12] = np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel()
+        return index, np.append(np.tile([1.0, -1.0, 1.0], 4), -1.0)
+
+    def _canonical_extras(self, extras: dict[str, int]) -> dict[str, int]:
+        return {**extras, 'plan': 7}
+
+    def _canonical_extra_columns(self, name: str) -> np.ndarray:
+        columns = super()._canonical_extra_columns(name)
+        if name == 'contact':
+            return columns
+        # Heading; the first step as seen from the left foot, the second from the right one.
+        return columns[[12, 3, 4, 5, 6, 7, 8]]
+
+    def infos(self) -> dict[str, Any]:
+        """As for every task; and of the last foot that landed, whether it did so in this step.
+
+        `landed` (n,) bool; `landing_error` m and `heading_error` rad, (n,), 0 before any landing.
+        """
+        return {
+            **super().infos(),
+            'landed': self.landed.copy(),
+            'landing_error': self.landing_error.copy(),
+            'heading_error': self.heading_error.copy(),
+        }
+
+    def markers(self, row: int) -> list[Marker]:
+        """Where the feet are to land, which way the body is to head, and the goal."""
+        yaw = float(self.heading[row])
+        ahead = SOLE_AHEAD * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        found = [
+            Marker('box', place + ahead + (0, 0, SOLE[2]), SOLE, colour, yaw)
+            for place, colour in zip(self.landing[row], (SWING_COLOUR, STANCE_COLOUR), strict=True)
+        ]
+        root = self.world.xpos[row, self.figure.kinematics.links[0]]
+        found.append(Marker('arrow', root, (0.012, 0.012, 0.5), SWING_COLOUR, yaw))
+        if self.goal_given:
+            found.append(Marker('cylinder', self.goal[row], (0.15, 0.15, 0.4), GOAL_COLOUR))
+        return found
+
+    def reference_pose(self, row: int) -> np.ndarray:
+        """Pose of the reference where it was put: root, then joints."""
+        mirrored, index = divmod(int(self._track[row]), len(self.steps))
+        time = self.step_phase[row] * self.steps.duration
+        pose = self.steps.pose(index, time, bool(mirrored))
+        pose[:2] = self._shift[row] + quaternion.turned(pose[:2], self._turned[row])
+        pose[3:7] = quaternion.multiply(quaternion.about_z(self._turned[row]), pose[3:7])
+        rows = np.array([row])
+        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], rows)[0, 0]
+        return pose
+
+    _KEPT = (
+        'stance', 'landing', 'heading', '_length', '_width', '_track', '_turned', '_shift', 'goal',
+        'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin',
+    )  # fmt: skip
+
+    def get_state(self, row: int) -> dict[str, Any]:
+        return {
+            **super().get_state(row),
+            'random': self._random[row].bit_generator.state,
+            **{name: getattr(self, name)[row].copy() for name in self._KEPT},
+        }
+
+    def set_state(self, row: int, state: dict[str, Any]) -> None:
+        super().set_state(row, state)
+        random = np.random.default_rng(0)
+        random.bit_generator.state = state['random']
+        self._random[row] = random
+        for name in self._KEPT:
+            getattr(self, name)[row] = state[name]
