@@ -58,8 +58,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '99 environments')
-        self.assertLen(lines, 101)
+        self.assertEqual(lines[-1], '104 environments')
+        self.assertLen(lines, 106)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -67,7 +67,7 @@ class ListTest(CommandTest):
             self.assertEndsWith(line, row.description)
 
     @parameterized.parameters(
-        (('--domain', 'imitation'), 22),
+        (('--domain', 'imitation'), 27),
         (('--domain', 'deeploco'), 6),
         (('--domain', 'plaid'), 28),
         (('--domain', 'terrainrl'), 43),
@@ -78,8 +78,8 @@ class ListTest(CommandTest):
         (('--character', 'raptor'), 23),
         (('--terrain', 'gaps_humanoid'), 3),
         (('--tag', 'original'), 72),
-        (('--tag', 'spatial'), 14),
-        (('--character', 'biped3d'), 8),
+        (('--tag', 'spatial'), 19),
+        (('--character', 'biped3d'), 13),
         (('--terrain', 'plane'), 7),
         (('--tag', 'original', '--domain', 'terrainrl'), 32),
         (('--tag', 'blind'), 4),

@@ -134,6 +134,12 @@ class ParametersTest(parameterized.TestCase):
             ('Down.StanceHip', 0.665958), ('Up.SwingAnkle', 0.182327),
         ):  # fmt: skip
             self.assertEqual(biped.centre[biped.place(parameter)], value)
+        goat = controllers.load('goat')
+        for parameter, value in (
+            ('TransTime', 0.125), ('Cv', 0.035053), ('BackForceX', 509.408108), ('FrontForceY', 363.495957),
+            ('Extend.Hip', 1.2993), ('Gather.Ankle', 1.794969),
+        ):  # fmt: skip
+            self.assertEqual(goat.centre[goat.place(parameter)], value)
 
     @parameterized.parameters(*NAMES)
     def test_actions(self, name):

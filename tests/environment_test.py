@@ -31,7 +31,8 @@ SIZES = {
     'FSM_Hopper2D_Terrain_Slopes-v0': (211, 9),
     # Three numbers for the rotation of a ball joint; the original has angle and axis, four.
     'PD_Biped3D_Imitate-v0': (112, 17), 'PD_Biped3D_Imitate-Stairs-v0': (112, 17),
-    'PD_Biped3D_Imitate-Track-v0': (156, 17), 'PD_Biped3D_Imitate-Run-v0': (112, 17),
+    'PD_Biped3D_Imitate-Track-v0': (156, 17), 'PD_Biped3D_Imitate-Hills_Terrain-v0': (1136, 17),
+    'PD_Biped3D_Imitate-Run-v0': (112, 17),
     'PD_Biped3D_LLC_General_Step-v0': (125, 17), 'PD_Biped3D_LLC_Symetric_Step-v0': (117, 17),
     'PD_Biped3D_LLC_Run_FootStep-v0': (125, 17), 'PD_Biped3D_FULL_Imitate-Steps-v0': (229, 35),
 }  # fmt: skip
@@ -57,7 +58,8 @@ def expected_blocks(id_):
     figure = id_.split('_')[1]
     if figure == 'Biped3D':
         links = 16 if 'FULL' in id_ else 8
-        sizes = {'pose': 7 * links + 1, 'velocity': 6 * links}
+        sizes = {'terrain': 1024} if '_Terrain-' in id_ else {}
+        sizes |= {'pose': 7 * links + 1, 'velocity': 6 * links}
         if '_Imitate' in id_ and 'FULL' not in id_:
             track = 'Track' in id_
             return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}

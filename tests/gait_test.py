@@ -607,8 +607,8 @@ class OptionTest(parameterized.TestCase):
 class GaitTest(parameterized.TestCase):
     """The gaits themselves, on flat ground: they stay up, at about their speed."""
 
-    @parameterized.parameters((DOG, 3.4, 4.4), (RAPTOR, 3.0, 4.1), (BIPED, 2.6, 3.4),
-                              (HOPPER, 2.5, 4.6))  # fmt: skip
+    @parameterized.parameters((DOG, 3.4, 4.4), (GOAT, 1.4, 2.2), (RAPTOR, 3.0, 4.1),
+                              (BIPED, 2.6, 3.4), (HOPPER, 2.5, 4.6))  # fmt: skip
     def test_they_run(self, id_, slowest, fastest):
         """Six rows with action 0, and six with random ones of amplitude 0.1, for 6 s."""
         rows = VectorEnvironment(

@@ -76,6 +76,16 @@ SPATIAL = {
     'PD_Biped3D_Imitate-Stairs-v0': ('pd_biped3d_stairs', 'stairs3d', *_WALKS, True),
     'PD_Biped3D_Imitate-Steps-v0': ('pd_biped3d_steps', 'steps3d', *_WALKS, True),
     'PD_Biped3D_Imitate-Rough-v0': ('pd_biped3d_rough', 'checkers3d', *_WALKS, False),
+    **{
+        f'PD_Biped3D_Imitate-{name}_Terrain-v0': (task, ground, *_WALKS, False)
+        for name, task, ground in (
+            ('Hills', 'pd_biped3d_hills_terrain', 'hills3d'),
+            ('Ramp', 'pd_biped3d_ramp_terrain', 'ramp3d'),
+            ('Stairs', 'pd_biped3d_stairs_terrain', 'stairs3d'),
+            ('Steps', 'pd_biped3d_steps_terrain', 'steps3d'),
+            ('Rough', 'pd_biped3d_rough_terrain', 'checkers3d'),
+        )
+    },
     'PD_Biped3D_Imitate-Run-v0': ('pd_biped3d_run', 'plane', 'biped3d', 'biped3d_run', False),
     **{
         f'PD_Biped3D_{name}-v0': (task, ground, character, character, original)
@@ -166,7 +176,8 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(task.motion.name, clip)
         self.assertEqual(task.actuation_model, 'position')
         self.assertEqual(task.mirrored, 'Symetric' in id_)
-        self.assertNotIn('terrain', environment.blocks)  # blind as in the original
+        # The others are blind, as in the original.
+        self.assertEqual('terrain' in environment.blocks, '_Terrain-' in id_)
         self.assertEqual('target' in environment.blocks, 'Track' in id_)
         self.assertEqual(environment.step_limit, 256)
         self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
@@ -234,8 +245,8 @@ class CatalogueTest(parameterized.TestCase):
     def test_tables(self):
         self.assertEqual(
             {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()},
-            # Of imitation 14 in the plane and 8 in three dimensions.
-            {'plaid': 28, 'imitation': 22, 'terrainrl': 43, 'deeploco': 6},
+            # Of imitation 14 in the plane and 13 in three dimensions.
+            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 6},
         )
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)

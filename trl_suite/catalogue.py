@@ -196,19 +196,20 @@ def _imitation3d(
     name: str, preset: str, words: str, original: bool, clip: str = 'biped3d_walk', **options: Any
 ) -> Row:
     gait = 'run' if clip.endswith('run') else 'walk'
+    seeing = options.get('terrain_map', False)
+    sight = ', seeing the ground around it,' if seeing else ''
+    sight = ', whose state it sees,' if options.get('target') else sight
     return Row(
-        id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}-v0',
+        id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}{"_Terrain" if seeing else ""}-v0',
         domain='imitation',
-        task=f'pd_biped3d{"_" if name else ""}{name.lower()}',
+        task=f'pd_biped3d{"_" if name else ""}{name.lower()}{"_terrain" if seeing else ""}',
         character='biped3d',
         actuation='position',
         terrain=preset,
         rules='imitation3d',
         clip=clip,
         options=MappingProxyType(options),
-        description=f'The 3D biped tracks a {gait}'
-        f'{", whose state it sees," if options.get("target") else ""} straight on over {words} by PD '
-        'targets.',
+        description=f'The 3D biped tracks a {gait}{sight} straight on over {words} by PD targets.',
         tags=frozenset({'spatial', 'original' if original else 'completion'}),
     )
 
@@ -303,6 +304,8 @@ ROWS: tuple[Row, ...] = (
     ),
     *(_gait(*row, original=False) for row in _MORE_GAITS),
     *(_imitation3d(*terrain) for terrain in _SPATIAL_TERRAINS),
+    # The original is blind on all of them.
+    *(_imitation3d(*terrain[:3], False, terrain_map=True) for terrain in _SPATIAL_TERRAINS[1:]),
     _imitation3d('Track', 'plane', 'flat ground', True, target=True),
     _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
     *_STEPS,

@@ -162,7 +162,8 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     ),
     (
         lambda row: row.rules == 'gait' and row.character == 'goat',
-        'the original has the gait and no environment for it',
+        "action 0 is a gait tuned anew: the original's fall here on flat ground; the original has the "
+        'gait and no environment for it',
     ),
     (
         lambda row: row.actuation == 'position' and row.character != 'biped3d_mocap_run',

@@ -10,7 +10,8 @@
         time_step = environment.step(policy(time_step.observation))
 
 A file holds these arrays and no pickled objects (U is text, a the number of actions, k the number
-of observations, L the number of layers):
+of observations, L the number of layers, c the number of observations that the network sees: k, unless
+there are `columns`):
 
     format       U ()        'trl_suite policy'
     version      int ()      1
@@ -19,7 +20,7 @@ of observations, L the number of layers):
     block_sizes  int (B,)    numbers in each; they sum to k
     actions      U (a,)      names of the actions in order
     quantity     U ()        what an action sets, e.g. 'target angle'
-    mean, std    float (k,)  normalisation: (observation - mean) / std
+    mean, std    float (c,)  normalisation: (observation - mean) / std
     clip         float ()    bound of the normalised observation
     activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
     layers       int ()      L
@@ -35,6 +36,10 @@ and, if the policy sees left stance as right stance in a mirror (see `trl_suite.
     mirror_observation_sign   float (k,)
     mirror_action_index       int (a,)
     mirror_action_sign        float (a,)
+
+and, if the network sees only a part of it, say of a map of the terrain what is near:
+
+    columns      int (c,)    of the observation, after any mirror
 
 Floats are written as float32.
 """
@@ -87,8 +92,8 @@ class Policy:
       blocks: name and size of the observation blocks, in order; k numbers in all.
       actions: names of the a actions, in order.
       quantity: what an action sets, as `ActionMap.quantity` has it.
-      mean: subtracted from observations, (k,) float32, like all arrays read-only.
-      std: divides what is left, (k,).
+      mean: subtracted from what the network sees, (c,) float32, like all arrays read-only.
+      std: divides what is left, (c,).
       clip: bound of the normalised observation.
       weights: per layer (inputs, outputs).
       biases: per layer (outputs,).
@@ -96,6 +101,7 @@ class Policy:
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was made; what JSON can hold.
       mirror: how it sees left stance as right stance; None if it sees all as it is.
+      columns: of the observation, after any mirror, that the network sees, (c,); None: all.
 
     Raises:
       ValueError: a field is malformed, or fields do not fit each other; the message names it.
@@ -114,6 +120,7 @@ class Policy:
     log_std: np.ndarray = dataclasses.field(repr=False)
     info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
     mirror: Mirror | None = dataclasses.field(default=None, repr=False)
+    columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -131,8 +138,18 @@ class Policy:
         if self.activation not in ACTIVATIONS:
             raise ValueError(errors.unknown('activation', self.activation, ACTIVATIONS))
         k, a = self.observation_size, len(self.actions)
-        put('mean', _array('mean', self.mean, (k,)))
-        put('std', _array('std', self.std, (k,)))
+        seen = k
+        if self.columns is not None:
+            columns = np.array(self.columns)
+            if columns.ndim != 1 or columns.dtype.kind not in 'iu' or not len(columns):
+                raise ValueError('columns: expected integers, at least one')
+            if columns.min() < 0 or columns.max() >= k:
+                raise ValueError(f'columns: expected numbers of 0 to {k - 1}')
+            columns.setflags(write=False)
+            put('columns', columns)
+            seen = len(columns)
+        put('mean', _array('mean', self.mean, (seen,)))
+        put('std', _array('std', self.std, (seen,)))
         if not (self.std > 0).all():
             raise ValueError('std: expected positive numbers')
         put('log_std', _array('log_std', self.log_std, (a,)))
@@ -142,7 +159,7 @@ class Policy:
         layers = len(self.weights)
         if not layers or len(self.biases) != layers:
             raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
-        weights, biases, inputs = [], [], k
+        weights, biases, inputs = [], [], seen
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             outputs = a if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
             weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
@@ -241,6 +258,8 @@ class Policy:
         seen, left = np.atleast_2d(flat), None
         if self.mirror is not None:
             seen, left = self.mirror.canonical(seen)
+        if self.columns is not None:
+            seen = seen.take(self.columns, 1)
         x = np.clip((seen - self.mean) / self.std, -self.clip, self.clip)
         x = x.astype(np.float32, order='C')
         activation = ACTIVATIONS[self.activation]
@@ -285,6 +304,8 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
         for name, (kind, _) in _MIRROR.items():
             value = np.asarray(getattr(policy.mirror, name))
             fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
+    if policy.columns is not None:
+        fields['columns'] = policy.columns
     with rendering.replacing(rendering.check_path(path, ('.npz',))) as part:
         np.savez_compressed(part, allow_pickle=False, **fields)
 
@@ -322,13 +343,19 @@ def load(path: str | os.PathLike[str]) -> Policy:
                 field = f'mirror_{name}'
                 parts[name] = _read(archive, field, kind, axes)
             mirror = Mirror(**{**parts, 'phase': int(parts['phase'])})
+        columns = None
+        if 'columns' in archive.files:
+            field = 'columns'
+            columns = _read(archive, field, 'iu', 1)
         field = 'info'
         fields[field] = json.loads(fields[field])
         for field in archive:
-            known = field in _FIELDS or field.removeprefix('mirror_') in _MIRROR
+            known = field in _FIELDS or field == 'columns'
+            known |= field.removeprefix('mirror_') in _MIRROR
             if not known and field.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
         expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) if mirror else 0)
+        expected += columns is not None
         if len(archive.files) != expected:
             field = 'layers'
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
@@ -344,6 +371,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
             weights=tuple(weights),
             biases=tuple(biases),
             mirror=mirror,
+            columns=columns,
             **fields,
         )
     except ValueError as error:

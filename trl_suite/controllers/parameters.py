@@ -15,7 +15,7 @@ One JSON file per character:
                              of the root (m/s, m/s, rad/s), and angle and rate of each joint
 
 Source of the figures: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
-Panne (2016); the set 'tuned' of biped2d_simbicon is our own.
+Panne (2016); the sets 'tuned' of biped2d_simbicon and goat are our own.
 """
 
 from __future__ import annotations
