@@ -257,7 +257,7 @@ class Trainer:
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
-        self.curve, self.best = [], -np.inf
+        self.curve: list[dict[str, Any]] = []
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.recent = np.zeros(3)  # return, steps and number of the episodes ended lately
 
@@ -270,6 +270,7 @@ class Trainer:
     def begin_lesson(self) -> None:
         """Makes the simulations of the present lesson, all at their start."""
         s, self.current = self.settings, self.lesson
+        self.best = -np.inf  # who has not had all lessons does not ship
         seed: int | list[int] = self.seed
         if self.current > 1:
             sequence = np.random.SeedSequence((self.seed, self.current))

@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import train_all
 
 from trl_suite import catalogue, resources
 
@@ -69,7 +70,7 @@ def comparison_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     rows = []
     for id_, entry in entries.items():
         row, runs = catalogue.BY_ID[id_], entry['runs']
-        if row.domain != 'imitation' or '_Run_' in id_:
+        if not train_all.compared(row):
             continue
         fractions = [run['evaluation']['fraction'] for run in runs]
         cells = [f'{row.character}, {MODELS[row.actuation]}', str(len(runs))]
@@ -89,6 +90,38 @@ def comparison_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
             )
         rows.append(cells)
     return rows
+
+
+def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """Trained gaits beside default gaits, on the same ground."""
+    path = resources.directory('trained') / 'default_gaits.json'
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    rows = []
+    for id_, entry in entries.items():
+        if catalogue.BY_ID[id_].rules != 'gait' or id_ not in stored:
+            continue
+        run = shipped(entry)
+        own, default = (
+            float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
+        )
+        rows.append([
+            f'`{id_}`', f'{own:.1f}', f'{default:.1f}', f'{own / default:.1f}',
+            f'{run["settings"]["samples"] / 1e3:.0f} k', str(run['seed']),
+        ])  # fmt: skip
+    return rows
+
+
+def footstep_rows() -> list[list[str]]:
+    path = resources.directory('trained') / 'footsteps.json'
+    if not path.exists():
+        return []
+    return [
+        [
+            name, str(found['episodes']), f'{found["survived"]:.0%}', f'{found["fraction"]:.3f}',
+            f'{found["landing"]:.3f}', f'{found["landing_90"]:.3f}', f'{found["heading"]:.3f}',
+        ]
+        for name, found in json.loads(path.read_text())['conditions'].items()
+    ]  # fmt: skip
 
 
 def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
@@ -125,7 +158,11 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '## Every environment',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed'),
-            (environment_row(id_, entry) for id_, entry in entries.items()),
+            (
+                environment_row(id_, entry)
+                for id_, entry in entries.items()
+                if catalogue.BY_ID[id_].rules != 'gait'
+            ),
         ),
         '![Learning curves](learning_curves.png)',
         '## Actuation models',
@@ -137,6 +174,25 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             comparison_rows(entries),
         ),
     ]  # fmt: skip
+    rows = gait_rows(entries)
+    if rows:
+        parts += [
+            '## Gaits',
+            'A sample is a whole cycle. Median distance in m before a fall, of the trained policy and '
+            'of action 0, the default gait, in the same episodes.',
+            table(('environment', 'trained', 'default', 'ratio', 'cycles', 'seed'), rows),
+        ]
+    rows = footstep_rows()
+    if rows:
+        parts += [
+            '## Where the feet are told to go',
+            'The footstep controller by `examples/evaluate_footsteps.py`: episodes of 20 s, seed 0; '
+            'landing error in m, mean and 90th percentile, and mean error of the heading in rad when '
+            'a foot lands.',
+            table(
+                ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
+            ),
+        ]
     rows = transfer_rows(entries)
     if rows:
         parts += [
@@ -160,11 +216,11 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
-    figures = {'biped2d': 'biped2d', 'biped2d_full': 'biped', 'dog': 'dog', 'raptor': 'raptor'}
     panels: dict[tuple[str, str], list[str]] = {}
     for id_ in entries:
         row = catalogue.BY_ID[id_]
-        panels.setdefault((row.domain, figures[row.character]), []).append(id_)
+        if row.rules != 'gait':  # whose return says little
+            panels.setdefault((row.domain, row.character), []).append(id_)
     columns = 3
     count = -(-len(panels) // columns)
     figure, axes = pyplot.subplots(

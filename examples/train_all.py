@@ -43,6 +43,11 @@ GAITS = (  # that are compared with their default gaits
 )  # fmt: skip
 
 
+def compared(row: catalogue.Row) -> bool:
+    """Whether an environment is one of those that compare actuation models."""
+    return row.domain == 'imitation' and 'planar' in row.tags and '_Run_' not in row.id
+
+
 def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
     """Which runs there are: first one of each environment, then the repetitions."""
     ids = [
@@ -53,12 +58,7 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
-    seeds = {
-        id_: COMPARED_SEEDS
-        if catalogue.BY_ID[id_].domain == 'imitation' and '_Run_' not in id_
-        else SEEDS
-        for id_ in ids
-    }
+    seeds = {id_: COMPARED_SEEDS if compared(catalogue.BY_ID[id_]) else SEEDS for id_ in ids}
     found = [(id_, seed) for id_ in ids for seed in seeds[id_] if seed in only_seeds]
     return sorted(found, key=lambda job: job[1])  # sorting is stable
 

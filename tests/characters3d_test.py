@@ -690,14 +690,16 @@ class OwnArenaTest(parameterized.TestCase):
 
 
 class PlanarTaskTest(parameterized.TestCase):
-    """Tasks of the plane refuse a character that is not of it."""
+    """What is of the plane refuses a character that is not."""
 
     @parameterized.parameters(
-        {'task': 'gait'}, {'clip': 'biped2d_walk'}, {'clip': None},
-        {'clip': 'biped2d_walk', 'actuation': 'muscle'},
-    )  # fmt: skip
-    def test_refusal(self, **options):
-        with self.assertRaisesRegex(ValueError, "'biped3d_mocap'"):
+        ({'task': 'gait'}, "'biped3d_mocap'"),
+        ({'clip': 'biped2d_walk'}, "'biped2d_walk'.*free root"),
+        ({'terrain': 'gaps'}, "'biped3d_mocap'.*'gaps'|'gaps'.*'biped3d_mocap'"),
+        ({'actuation': 'muscle'}, "'biped3d_mocap' has no muscles"),
+    )
+    def test_refusal(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
             suite.build('biped3d_mocap', **options)
 
 

@@ -1,6 +1,7 @@
 """Every command of the command line, what it prints, what it leaves, and how it fails."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -15,7 +16,7 @@ import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, suite
+from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, scripted, suite
 from trl_suite.tasks.gait import GaitTask
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -58,8 +59,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '104 environments')
-        self.assertLen(lines, 106)
+        self.assertEqual(lines[-1], '111 environments')
+        self.assertLen(lines, 113)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -68,7 +69,7 @@ class ListTest(CommandTest):
 
     @parameterized.parameters(
         (('--domain', 'imitation'), 27),
-        (('--domain', 'deeploco'), 6),
+        (('--domain', 'deeploco'), 13),
         (('--domain', 'plaid'), 28),
         (('--domain', 'terrainrl'), 43),
         (('--actuation', 'gait'), 43),
@@ -77,10 +78,11 @@ class ListTest(CommandTest):
         (('--actuation', 'muscle'), 4),
         (('--character', 'raptor'), 23),
         (('--terrain', 'gaps_humanoid'), 3),
-        (('--tag', 'original'), 72),
-        (('--tag', 'spatial'), 19),
+        (('--tag', 'original'), 78),
+        (('--tag', 'spatial'), 26),
+        (('--tag', 'hierarchical'), 7),
         (('--character', 'biped3d'), 13),
-        (('--terrain', 'plane'), 7),
+        (('--terrain', 'plane'), 8),
         (('--tag', 'original', '--domain', 'terrainrl'), 32),
         (('--tag', 'blind'), 4),
         (('--domain', 'plaid', '--character', 'dog', '--tag', 'original'), 6),
@@ -114,15 +116,17 @@ class InfoTest(CommandTest):
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
         rules = suite.find(id_).rules
-        gait, steps = rules == 'gait', rules == 'footsteps'
+        gait, steps, high = rules == 'gait', rules == 'footsteps', rules in ('hike', 'soccer')
         for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
                       'Termination', 'Time', 'Differs'):  # fmt: skip
             self.assertIn(f'\n{title}', out)
         for title, shown in (
-            ('Clip', not gait and not steps), ('Gait', gait), ('Parameters', gait),
+            ('Clip', not gait and not steps and not high), ('Gait', gait), ('Parameters', gait),
             ('Steps', steps), ('Plans', steps),
         ):  # fmt: skip
             self.assertEqual(f'\n{title}:' in out, shown, title)
+        self.assertEqual('\nFootstep controller\n' in out, high)
+        self.assertEqual('reward weight' in out, not gait and not high)
 
     def test_figures(self):
         # Sizes from the original's registry, limits from its character file.
@@ -226,6 +230,39 @@ class InfoTest(CommandTest):
         self.assertIn('Action: 35 numbers', out)
         self.assertRegex(out, r'\n  head +106 +113 +203 +209\n')
 
+    def test_high_level(self):
+        # Sizes, ranges and rewards of the specification.
+        out = self.output('info', 'PD_Biped3D_HLC_DynamicsObstacles-v0')
+        self.assertIn('Observation: 2155 numbers', out)
+        for name, start, stop in (
+            ('surface', 0, 2048), ('pose', 2048, 2105), ('velocity', 2105, 2153),
+            ('target', 2153, 2155),
+        ):  # fmt: skip
+            self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start}  \S')
+        self.assertIn('Action: 5 numbers in [-1, 1]; footstep plan = centre + half range', out)
+        for name, centre, half_range, unit in (
+            ('first_x', '0.5', '1', 'm'), ('first_y', '0', '1', 'm'), ('second_x', '1', '2', 'm'),
+            ('second_y', '0', '2', 'm'), ('turn', '0', '3.142', 'rad'),
+        ):  # fmt: skip
+            self.assertRegex(out, rf'\n  {name} +{centre} +{half_range}  {unit}; ')
+        self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
+        self.assertRegex(out, r'\n  upright +0\.2  1\n')
+        self.assertRegex(out, r'drawn anew within 1 m of it, or after 50 to 100 s')
+        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+looks')
+        self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
+        self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
+        out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
+        self.assertIn('Observation: 116 numbers', out)
+        self.assertRegex(out, r'\n  ball +107 +116 +9 ')
+        self.assertRegex(out, r'as seen from the ball')
+        self.assertRegex(out, r'a ball of 0\.2 m and 0\.1 kg lies 0\.7 to 10 m')
+        for name, weight in (
+            ('approach', '0.1667'), ('near', '0.1667'), ('dribble', '0.3333'), ('goal', '0.3333'),
+        ):  # fmt: skip
+            self.assertRegex(out, rf'\n  {name} +{weight}  exp\(-')
+        self.assertIn('within 0.5 m of the goal and within 2 m of the walker', out)
+        self.assertNotRegex(out, r'\n  (speed|upright) ')
+
     def test_an_alias_is_as_good(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
 
@@ -246,7 +283,7 @@ class InfoTest(CommandTest):
             'tuned anew': 'biped',
             'z up': 'space',
             'one cone': 'space',
-            'rotation vectors': 'space',
+            'rotation vectors': 'vectors',
             'straight on': 'straight on',
             'walks at 1.535 m/s': '3D walk',
             '27 of them': 'steps',
@@ -257,10 +294,19 @@ class InfoTest(CommandTest):
             'captured, 4.4 m/s': 'run',
             'drawn anew': 'goal',
             'treads': 'stairs',
+            'whole footstep': 'high',
+            'controller is inside': 'high',
+            'over the whole step': 'high',
+            'cuts them after 256': 'high',
+            'after 256 steps (discount 1)': 'short',
+            'heights of its pillars': 'forest',
+            'a goal is reached or its time': 'hike',
+            'times of ball and goal': 'soccer',
         }
-        tracking = {'clip', 'imitation'}
-        walking = {'space', 'straight on', 'clip', '3D walk', 'imitation'}
-        stepping = {'space', 'footsteps', 'steps', 'imitation'}
+        tracking = {'clip', 'imitation', 'short'}
+        walking = {'space', 'vectors', 'straight on', 'clip', '3D walk', 'imitation', 'short'}
+        stepping = {'space', 'vectors', 'footsteps', 'steps', 'imitation', 'short'}
+        planning = {'space', 'imitation', 'high'}
         for id_, expected in (
             ('PD_Biped2D_LLC_Imitate_Flat-v0', tracking),
             ('Vel_Dog2D_LLC_Imitate_Flat-v0', tracking | {'completion'}),
@@ -271,10 +317,13 @@ class InfoTest(CommandTest):
                 tracking
                 | {'completion', 'mixed_humanoid', 'PD targets of a dog or raptor', 'terrain'},
             ),
-            ('FSM_Dog2D_Terrain_Mixed-v0', {'gait', 'terrain'}),
-            ('FSM_Raptor2D_Terrain_Narrow_Gaps-v0', {'gait', 'terrain', 'raptor', 'completion'}),
-            ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped'}),
-            ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper'}),
+            ('FSM_Dog2D_Terrain_Mixed-v0', {'gait', 'terrain', 'short'}),
+            (
+                'FSM_Raptor2D_Terrain_Narrow_Gaps-v0',
+                {'gait', 'terrain', 'raptor', 'completion', 'short'},
+            ),
+            ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped', 'short'}),
+            ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper', 'short'}),
             ('PD_Biped3D_Imitate-v0', walking),
             ('PD_Biped3D_Imitate-Stairs-v0', walking | {'stairs'}),
             ('PD_Biped3D_Imitate-Rough-v0', walking | {'completion'}),
@@ -283,6 +332,10 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_LLC_Symetric_Step-v0', stepping | {'mirrored'}),
             ('PD_Biped3D_LLC_Run_FootStep-v0', stepping - {'steps'} | {'run'}),
             ('PD_Biped3D_LLC_Trail_Step-v0', stepping | {'goal', 'completion'}),
+            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'hike'}),
+            ('PD_Biped3D_HLC_Forest-v0', planning | {'hike', 'forest'}),
+            ('PD_Biped3D_HLC_Soccer-v0', planning | {'soccer'}),
+            ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'hike', 'completion'}),
         ):
             with self.subTest(id_):
                 out = self.output('info', id_).split('\nDiffers')[1]
@@ -392,6 +445,30 @@ class RolloutTest(CommandTest):
         self.assertLen(frames, 1 + int(30 * environment.physics.data.time))
         self.assertEqual(iio.imread('a.png').shape[1], 7 * 160 + 6 * rendering.STRIP_MARGIN)
 
+    def test_a_scripted_policy_in_real_time(self):
+        id_ = 'PD_Biped3D_HLC_PathFollowing-v0'
+        out = self.output(
+            'rollout', id_, '--steps', '4', '--policy', 'scripted', '--seed', '2', '--video', 'a.mp4',
+            '--trajectory', 'a.npz', *SIZE,
+        )  # fmt: skip
+        self.assertRegex(out, r'\n4 steps in 1 episode: ')
+        environment = suite.make(id_, {'random': 2}, {'flat_observation': True})
+        policy, time_step = scripted.scripted(environment), environment.reset()
+        for _ in range(4):
+            time_step = environment.step(policy(time_step.observation['observations'][None])[0])
+        with np.load('a.npz') as trajectory:
+            np.testing.assert_array_equal(trajectory['qpos'][-1], environment.physics.data.qpos)
+        frames = iio.imread('a.mp4', plugin='FFMPEG')
+        self.assertLen(frames, 1 + round(30 * environment.physics.data.time))
+        self.assertLen(frames, 1 + 12 + 3 * 15)  # a start in phase 0.1 or 0.6, then whole steps
+
+    def test_no_ghost_above_a_controller(self):
+        self.assert_refused(
+            'a HighLevel task has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
+            '--video', 'a.mp4', *SIZE,
+        )  # fmt: skip
+        self.assert_only()
+
     def test_how_an_episode_of_a_gait_ends(self):
         for end in ('fell', 'stuck'):
             info = {'fell': end == 'fell', 'stuck': end == 'stuck', 'diverged': False}
@@ -419,8 +496,10 @@ class RolloutTest(CommandTest):
         ("'big' is not a size such as 640x480", GAPS, '--size', 'big'),
         ("'0' is not a positive integer", GAPS, '--steps', '0'),
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
-        ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, zero", GAPS, '--policy',
-         'walk'),
+        ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
+         '--policy', 'walk'),
+        ('an? Imitation task has no scripted policy; high-level tasks with', GAPS, '--policy',
+         'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('No such file', GAPS, '--policy', 'none.npz'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
@@ -541,6 +620,15 @@ class EvaluateTest(CommandTest):
         expected = evaluation.evaluate(GAPS, evaluation.BASELINES[name], 2, factory=True)
         self.assertIn(f'  policy       {name}\n', out)
         self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
+
+    def test_the_scripted_baseline(self):
+        self.assert_refused('no scripted policy', 'evaluate', GAPS, '--policy', 'scripted')
+        row = dataclasses.replace(suite.find('PD_Biped3D_HLC_Forest-v0'), step_limit=5)
+        with mock.patch.object(suite, 'find', lambda id_: row):
+            out = self.output('evaluate', row.id, '--policy', 'scripted', '--episodes', '2')
+        expected = evaluation.evaluate(row, scripted.scripted, 2, factory=True)
+        self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
+        self.assertIn('of the maximum 5\n', out)
 
     def test_one_episode_has_no_interval(self):
         out = self.output('evaluate', GAPS, '--policy', 'zero', '--episodes', '1')

@@ -35,13 +35,17 @@ SIZES = {
     'PD_Biped3D_Imitate-Run-v0': (112, 17),
     'PD_Biped3D_LLC_General_Step-v0': (125, 17), 'PD_Biped3D_LLC_Symetric_Step-v0': (117, 17),
     'PD_Biped3D_LLC_Run_FootStep-v0': (125, 17), 'PD_Biped3D_FULL_Imitate-Steps-v0': (229, 35),
+    'PD_Biped3D_HLC_LargeBlocks-v0': (1131, 5), 'PD_Biped3D_HLC_Forest-v0': (1131, 5),
+    'PD_Biped3D_HLC_PathFollowing-v0': (1131, 5), 'PD_Biped3D_HLC_DynamicsObstacles-v0': (2155, 5),
+    'PD_Biped3D_HLC_Conveyors-v0': (2155, 5), 'PD_Biped3D_HLC_Conveyors_Wide-v0': (2155, 5),
+    'PD_Biped3D_HLC_Soccer-v0': (116, 5),
 }  # fmt: skip
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 EXAMPLES = (
     GAPS, 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
     'Torque_Biped2D_LLC_Imitate_Flat-v0', 'Vel_Dog2D_LLC_Imitate_Flat-v0',
     'FSM_Raptor2D_Terrain_Slopes-v0', 'PD_Biped3D_Imitate-Hills-v0',
-    'PD_Biped3D_LLC_General_Step-v0',
+    'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_HLC_LargeBlocks-v0',
 )  # fmt: skip
 
 
@@ -50,12 +54,27 @@ def is_gait(id_):
     return suite.find(id_).rules == 'gait'
 
 
+def is_high(id_):
+    """Whether a step lasts a whole footstep, up to 15 control steps."""
+    return suite.find(id_).rules in ('hike', 'soccer')
+
+
+ONE_BY_ONE = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
+
+
 def expected_blocks(id_):
     """Blocks and their sizes by the rules: terrain, pose 2n + 1, velocity 2n, extras.
 
     In three dimensions pose 7n + 1, velocity 6n.
     """
     figure = id_.split('_')[1]
+    if is_high(id_):
+        ground = id_.split('_', 3)[3].removesuffix('-v0')
+        sizes = {'terrain': 1024} if ground in ('LargeBlocks', 'Forest', 'PathFollowing') else {}
+        if ground in ('DynamicsObstacles', 'Conveyors', 'Conveyors_Wide'):
+            sizes = {'surface': 2048}
+        ball = {'ball': 9} if ground == 'Soccer' else {}
+        return sizes | {'pose': 57, 'velocity': 48, 'target': 2} | ball
     if figure == 'Biped3D':
         links = 16 if 'FULL' in id_ else 8
         sizes = {'terrain': 1024} if '_Terrain-' in id_ else {}
@@ -102,10 +121,11 @@ def contract(id_):
 
     class Contract(test_utils.EnvironmentTestMixin, absltest.TestCase):
         def make_object_under_test(self):
-            return suite.make(id_, {'random': 0, 'step_limit': 2 if is_gait(id_) else 12})
+            limit = 2 if is_gait(id_) or is_high(id_) else 12
+            return suite.make(id_, {'random': 0, 'step_limit': limit})
 
         def make_action_sequence(self):
-            return random_actions(self.environment, 3 if is_gait(id_) else 30)
+            return random_actions(self.environment, 3 if is_gait(id_) or is_high(id_) else 30)
 
         def test_specs(self):
             spec = self.environment.action_spec()
@@ -147,12 +167,12 @@ class EveryRowTest(parameterized.TestCase):
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_random_rollout(self, id_):
-        self.wander(id_, *((6, 4) if is_gait(id_) else (200,)))
+        self.wander(id_, *((6, 4) if is_gait(id_) else (16,) if is_high(id_) else (200,)))
 
     @parameterized.parameters(*suite.ALL_IDS)
     @pytest.mark.slow
     def test_long_random_rollout(self, id_):
-        self.wander(id_, 300 if is_gait(id_) else 5000)
+        self.wander(id_, 300 if is_gait(id_) or is_high(id_) else 5000)
 
     def wander(self, id_, steps, step_limit=256):
         environment = suite.make(id_, {'random': 1, 'step_limit': step_limit})
@@ -174,12 +194,12 @@ class EveryRowTest(parameterized.TestCase):
     def test_flat_observation_is_the_blocks_side_by_side(self, id_):
         blocks = suite.make(id_, {'random': 2})
         flat = suite.make(id_, {'random': 2}, {'flat_observation': True})
-        actions = random_actions(blocks, 1 if is_gait(id_) else 20)
+        actions = random_actions(blocks, 1 if is_gait(id_) else 3 if is_high(id_) else 20)
         for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
-    # A gait runs its physics by itself: see gait_test.
-    @parameterized.parameters(*(id_ for id_ in suite.ALL_IDS if not is_gait(id_)))
+    # A gait runs its physics by itself, and so does a footstep: see gait_test, and below.
+    @parameterized.parameters(*ONE_BY_ONE)
     def test_plain_composer_environment_agrees(self, id_):
         ours = suite.make(id_, {'random': 3})
         theirs = composer.Environment(
@@ -190,6 +210,18 @@ class EveryRowTest(parameterized.TestCase):
         actions = random_actions(ours, 40)
         for mine, composers in zip(rollout(ours, actions), rollout(theirs, actions), strict=True):
             np.testing.assert_array_equal(mine, composers)
+
+    @parameterized.product(
+        id_=[id_ for id_ in suite.ALL_IDS if is_high(id_)], interface=('plan', 'frame')
+    )
+    def test_plain_composer_environment_is_refused(self, id_, interface):
+        task = suite.build_task(suite.find(id_), {'interface': interface})
+        environment = composer.Environment(task, random_state=3)
+        environment.reset()
+        with self.assertRaisesRegex(
+            RuntimeError, 'trl_suite.environment.Environment, not.*composer'
+        ):
+            environment.step(np.zeros(len(task.action_map)))
 
 
 class ActionTest(parameterized.TestCase):
@@ -282,7 +314,8 @@ class EpisodeTest(parameterized.TestCase):
 
     def test_every_row_is_cut_after_256_steps(self):
         for id_ in suite.ALL_IDS:
-            self.assertEqual(suite.find(id_).step_limit, 256)
+            # Plans of half a second: 200 s.
+            self.assertEqual(suite.find(id_).step_limit, 400 if is_high(id_) else 256)
         self.assertEqual(suite.make(GAPS).step_limit, 256)
 
     @parameterized.parameters(({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.5}, 15))
@@ -302,7 +335,7 @@ class EpisodeTest(parameterized.TestCase):
             lift(environment)
             self.assertTrue(environment.step(np.zeros(6)).mid())
 
-    @parameterized.parameters(*[id_ for id_ in suite.ALL_IDS if not is_gait(id_)][::3])
+    @parameterized.parameters(*ONE_BY_ONE[::3], *filter(is_high, suite.ALL_IDS))
     def test_a_fall_is_a_failure(self, id_):
         environment = suite.make(id_, {'random': 5})
         environment.reset()

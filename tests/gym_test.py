@@ -22,6 +22,7 @@ GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SHORT = {'step_limit': 20}  # so that random actions meet both ends: falls and the limit
 SMALL = {'height': 48, 'width': 64}
+LONG = ('gait', 'hike', 'soccer')  # rules of tasks whose steps last many control steps
 # Two for each Box: what has no bounds is declared without.
 UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
 
@@ -84,7 +85,7 @@ class EveryIdTest(Same, parameterized.TestCase):
         flat = [theirs.reset().observation['observations']]
         ours = [observation]
         env.action_space.seed(0)
-        for _ in range(2 if suite.find(id_).rules == 'gait' else 4):
+        for _ in range(2 if suite.find(id_).rules in LONG else 4):
             action = env.action_space.sample()
             observation, reward, terminated, truncated, info = env.step(action)
             time_step = theirs.step(action)
@@ -99,7 +100,7 @@ class EveryIdTest(Same, parameterized.TestCase):
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_vector_entry_point_is_the_sync_vector(self, id_):
-        limit = 1 if suite.find(id_).rules == 'gait' else 3
+        limit = 1 if suite.find(id_).rules in LONG else 3
         options = {'num_envs': 2, 'task_kwargs': {'step_limit': limit}}
         ours = gymnasium.make_vec(
             f'trl_suite/{id_}', vectorization_mode='vector_entry_point', num_threads=1, **options
@@ -133,8 +134,12 @@ class EveryIdTest(Same, parameterized.TestCase):
             self.assertEqual(action.shape, (len(env.environment.action_map),))
             self.assertTrue((action.low == -1).all() and (action.high == 1).all())
             self.assertEqual(action.dtype, np.float32)
-        # All of PLAiD, and in three dimensions all but the one that observes a target.
-        spatial = [row for row in catalogue.ROWS if 'spatial' in row.tags]
+        # All of PLAiD, and in three dimensions all but the one that observes a target and those
+        # above a controller, which are not told the phase.
+        spatial = [
+            row for row in catalogue.ROWS
+            if 'spatial' in row.tags and 'hierarchical' not in row.tags
+        ]  # fmt: skip
         self.assertEqual(phases, len(suite.TASKS_BY_DOMAIN['plaid']) + len(spatial) - 1)
 
 

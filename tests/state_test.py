@@ -22,8 +22,11 @@ EXAMPLES = (
     'PD_Raptor2D_Slopes_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
     'Torque_Dog2D_LLC_Imitate_Flat-v0', 'Vel_Biped2D_LLC_Imitate_Flat-v0',
 )  # fmt: skip
-# In three dimensions; more in imitation3d_test and footsteps_test.
-SPATIAL = ('PD_Biped3D_Imitate-Hills-v0', 'PD_Biped3D_LLC_Trail_Step-v0')
+# In three dimensions; more in imitation3d_test, footsteps_test and high_level_test.
+SPATIAL = (
+    'PD_Biped3D_Imitate-Hills-v0', 'PD_Biped3D_LLC_Trail_Step-v0', 'PD_Biped3D_HLC_Soccer-v0',
+    'PD_Biped3D_HLC_LargeBlocks-v0',
+)  # fmt: skip
 GAITS = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0')  # more in gait_test
 DOG = EXAMPLES[1]
 
@@ -65,7 +68,7 @@ class DeterminismTest(parameterized.TestCase):
             environment = suite.make(id_, {'random': 5}, {'flat_observation': True})
             environment.reset()
             rng, digest = np.random.default_rng(1), hashlib.sha256()
-            for _ in range(8 if id_.startswith('FSM') else 120):
+            for _ in range(8 if 'FSM' in id_ or '_HLC_' in id_ else 120):
                 step = environment.step(rng.uniform(-1, 1, len(environment.action_map)))
                 digest.update(step.observation['observations'].tobytes())
                 digest.update(repr((step.reward, step.discount)).encode())

@@ -99,6 +99,20 @@ SPATIAL = {
         )
     },
 }
+# Above a controller: id -> terrain, which maps are seen, phases of the start, original.
+_EITHER, _ZERO = (0.1, 0.6), (0.0,)
+HIGH_LEVEL = {
+    f'PD_Biped3D_HLC_{name}-v0': values
+    for name, values in {
+        'LargeBlocks': ('obstacles3d', ('height',), _EITHER, True),
+        'DynamicsObstacles': ('dynamic_obstacles3d', ('velocity',), _ZERO, True),
+        'Soccer': ('plane', (), _EITHER, True),
+        'Forest': ('pillars3d', ('height',), _ZERO, True),
+        'Conveyors': ('conveyor3d', ('velocity',), _ZERO, True),
+        'Conveyors_Wide': ('conveyor3d_wide', ('velocity',), _ZERO, True),
+        'PathFollowing': ('trail3d1', ('height',), _EITHER, False),
+    }.items()
+}
 
 
 def ids_of(rules):
@@ -155,7 +169,9 @@ class CatalogueTest(parameterized.TestCase):
 
     def test_three_dimensions(self):
         self.assertCountEqual([*ids_of('imitation3d'), *ids_of('footsteps')], SPATIAL)
-        self.assertCountEqual([row.id for row in catalogue.ROWS if 'spatial' in row.tags], SPATIAL)
+        self.assertCountEqual(
+            [row.id for row in catalogue.ROWS if 'spatial' in row.tags], [*SPATIAL, *HIGH_LEVEL]
+        )
         for id_, (task, ground, character, clip, original) in SPATIAL.items():
             row = suite.find(id_)
             self.assertEqual((row.task, row.terrain, row.character, row.clip),
@@ -183,12 +199,48 @@ class CatalogueTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
+    def test_high_level(self):
+        self.assertEqual(list(suite.ALL_IDS[-7:]), list(HIGH_LEVEL))
+        self.assertCountEqual([*ids_of('hike'), *ids_of('soccer')], HIGH_LEVEL)
+        self.assertEqual(ids_of('soccer'), ['PD_Biped3D_HLC_Soccer-v0'])
+        for id_, (ground, _, _, original) in HIGH_LEVEL.items():
+            row = suite.find(id_)
+            self.assertEqual(
+                (row.domain, row.terrain, row.actuation), ('deeploco', ground, 'position')
+            )
+            self.assertEqual((row.character, row.clip), ('biped3d_mocap', 'biped3d_mocap'))
+            self.assertEqual(row.step_limit, 400)
+            self.assertEqual(
+                row.tags, {'spatial', 'hierarchical', 'original' if original else 'completion'}
+            )
+
+    @parameterized.parameters(*HIGH_LEVEL)
+    def test_what_an_id_above_a_controller_says(self, id_):
+        ground, sight, phases, _ = HIGH_LEVEL[id_]
+        environment = suite.make(id_, {'random': 0})
+        task = environment.task
+        self.assertEqual(task.arena.terrain.name, ground)
+        self.assertEqual('terrain' in environment.blocks, 'height' in sight)
+        self.assertEqual('surface' in environment.blocks, 'velocity' in sight)
+        self.assertEqual('ball' in environment.blocks, 'Soccer' in id_)
+        self.assertEqual(task.interface, 'plan')
+        self.assertEqual(environment.step_limit, 400)
+        self.assertAlmostEqual(environment.control_timestep(), 0.5)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
+        found = set()
+        for _ in range(8):
+            environment.reset()
+            found.add(round(float(task.phase[0]), 9))
+        self.assertEqual(found, set(phases))
+
     def test_other_names_of_rows_in_three_dimensions(self):
         for name, id_ in (
             ('PD_Biped3D_LLC_Symmetric_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'),
             ('PD_Biped3D_Full_LLC_Step-v0', 'PD_Biped3D_FULL_Imitate-Steps-v0'),
             ('deeploco/llc_general_step', 'PD_Biped3D_LLC_General_Step-v0'),
             ('imitation/pd_biped3d', 'PD_Biped3D_Imitate-v0'),
+            ('PD_Biped3D_HLC_DynamicObstacles-v0', 'PD_Biped3D_HLC_DynamicsObstacles-v0'),
+            ('deeploco/hlc_soccer', 'PD_Biped3D_HLC_Soccer-v0'),
         ):
             self.assertEqual(suite.find(name).id, id_)
 
@@ -246,7 +298,8 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(
             {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()},
             # Of imitation 14 in the plane and 13 in three dimensions.
-            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 6},
+            # Of deeploco 6 of footsteps and 7 above them.
+            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 13},
         )
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)
@@ -302,6 +355,11 @@ class LoadTest(parameterized.TestCase):
         (lambda: suite.make('FSM_Dog2D_Terrain_Gap-v0'), "'FSM_Dog2D_Terrain_Gaps-v0'"),
         (lambda: suite.load('terrainrl', 'dog_gap'), "unknown task.*'dog_gaps'"),
         (lambda: suite.make('terrainrl/dog_gaps', {'start_phase': 0.5}), 'unknown option'),
+        (lambda: suite.make('PD_Biped3D_HLC_Forrest-v0'), "'PD_Biped3D_HLC_Forest-v0'"),
+        (
+            lambda: suite.make('deeploco/hlc_forest', {'goal_reach': 2}),
+            "unknown option.*'goal_reached'",
+        ),
         (lambda: suite.build('dgo'), "unknown character 'dgo'.*'dog'"),
         (lambda: suite.build('dog', 'torqe'), "unknown actuation 'torqe'.*'torque'"),
         (lambda: suite.build('dog', terrain='gap'), "unknown terrain 'gap'.*'gaps'"),

@@ -38,10 +38,13 @@ class IdentityTest(parameterized.TestCase):
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_every_row_is_a_single_environment(self, id_):
-        # A step of a gait is a whole cycle; gait_test looks closer.
+        # A step of a gait is a whole cycle, one above a controller a footstep; gait_test and
+        # high_level_test look closer.
         limit, steps, scale = LIMIT, 2 * LIMIT + 6, 1.0
         if suite.find(id_).rules == 'gait':
             limit, steps, scale = 1, 4, 0.3
+        elif suite.find(id_).rules in ('hike', 'soccer'):
+            limit, steps = 3, 8
         rows = VectorEnvironment(id_, 3, num_threads=2, seed=5, step_limit=limit)
         alone = singles(rows.seeds, id_, step_limit=limit)
         first = rows.reset()

@@ -273,6 +273,54 @@ _STEPS = (
     ),
 )  # fmt: skip
 
+HIKE_LIMIT = 400  # plans after which an episode is cut: 200 s
+
+
+def _hike(
+    name: str, preset: str, words: str, *, original: bool = True, rules: str = 'hike',
+    aliases: tuple[str, ...] = (), **options: Any,
+) -> Row:  # fmt: skip
+    return Row(
+        id=f'PD_Biped3D_HLC_{name}-v0',
+        domain='deeploco',
+        task=f'hlc_{name.lower()}',
+        character='biped3d_mocap',
+        actuation='position',
+        terrain=preset,
+        rules=rules,
+        clip='biped3d_mocap',
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}; an action plans its next two footsteps.',
+        tags=frozenset({'spatial', 'hierarchical', 'original' if original else 'completion'}),
+        aliases=aliases,
+        step_limit=HIKE_LIMIT,
+    )
+
+
+_FROM_ZERO = (0.0,)  # phase of the start
+_HIKES = (
+    _hike('LargeBlocks', 'obstacles3d', 'goes from goal to goal among large blocks'),
+    _hike(
+        'DynamicsObstacles', 'dynamic_obstacles3d', 'goes from goal to goal among moving boxes',
+        aliases=('PD_Biped3D_HLC_DynamicObstacles-v0',), sight=('velocity',),
+        start_phases=_FROM_ZERO,
+    ),
+    _hike('Soccer', 'plane', 'dribbles a ball to a goal', rules='soccer', sight=()),
+    _hike(
+        'Forest', 'pillars3d', 'goes from goal to goal between the pillars of a forest',
+        start_phases=_FROM_ZERO,
+    ),
+    _hike(
+        'Conveyors', 'conveyor3d', 'goes from goal to goal over conveyor belts',
+        sight=('velocity',), start_phases=_FROM_ZERO,
+    ),
+    _hike(
+        'Conveyors_Wide', 'conveyor3d_wide', 'goes from goal to goal over a wide conveyor belt',
+        sight=('velocity',), start_phases=_FROM_ZERO,
+    ),
+    _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', original=False),
+)  # fmt: skip
+
 _BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
 
 ROWS: tuple[Row, ...] = (
@@ -309,6 +357,7 @@ ROWS: tuple[Row, ...] = (
     _imitation3d('Track', 'plane', 'flat ground', True, target=True),
     _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
     *_STEPS,
+    *_HIKES,
 )  # fmt: skip
 
 BY_ID: dict[str, Row] = {row.id: row for row in ROWS}

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from trl_suite.environment import Environment
 
-POLICIES = ('reference', 'clip', 'zero', 'random')  # or a file
+POLICIES = ('reference', 'clip', 'scripted', 'zero', 'random')  # or a file
 SHOWN_EPISODES = 8  # episodes that a rollout prints one by one
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
 _ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
@@ -261,6 +261,15 @@ def _policy(name: str, environment: Environment, id: str, seed: int) -> renderin
     if name == 'random':
         generator = np.random.default_rng(seed)
         return lambda time_step: generator.uniform(-1, 1, size)
+    if name == 'scripted':
+        from trl_suite.scripted import scripted
+
+        walk = scripted(environment)
+
+        def act(time_step: dm_env.TimeStep) -> np.ndarray:
+            return walk(np.concatenate(list(time_step.observation.values()))[None])[0]
+
+        return act
     if name != 'clip':
         trained = _trained(name, id)
         trained.check(environment)

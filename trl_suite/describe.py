@@ -62,6 +62,28 @@ _SPATIAL_BLOCKS = {
     'contact': ('1', 'whether the right and the left foot touch the ground'),
     'plan': ('m, rad', 'see below'),
 }
+_HIGH_BLOCKS = {
+    **_SPATIAL_BLOCKS,
+    'surface': (
+        'm/s',
+        'velocities of the ground against that under the root, at 32 lines from the left to the right (5.5 m '
+        'to each side), each of 32 from 1 m behind to 10 m ahead: all ahead, then all to the right',
+    ),
+    'target': ('rad, m', 'bearing (positive to the left) and distance of the goal'),
+    'ball': (
+        'rad, m, m/s, rad/s',
+        'bearing, distance and height of the ball; its velocity (3) and its angular velocity (3)',
+    ),
+    'low_level': ('', 'what the footstep controller observes'),
+}
+_TARGET_OF_BALL = ('rad, m', 'bearing and distance of the goal as seen from the ball')
+_PLAN_MEANINGS = {
+    'first_x': 'm; where the foot that swings lands, ahead of the root',
+    'first_y': 'm; the same, to the left of the root',
+    'second_x': 'm; where the other foot lands after it, ahead of the root',
+    'second_y': 'm; the same, to the left of the root',
+    'turn': 'rad; heading to have, to the left of the present one',
+}
 _MIRRORED_BLOCKS = {
     'phase': ('1', 'phase of the step in [0, 1); then the one-hot of its half'),
     'contact': ('1', 'whether the stance and the swing foot touch the ground'),
@@ -90,11 +112,12 @@ _GAIT_UNITS = {
 }  # fmt: skip
 
 # What differs from the original, as (applies to a row?, sentence); docs/differences.md has reasons.
-_ANY, _CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS = (
-    lambda row: True, lambda row: row.rules == 'imitation', lambda row: row.rules == 'gait',
+_CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS, _HIGH = (
+    lambda row: row.rules == 'imitation', lambda row: row.rules == 'gait',
     lambda row: row.rules in ('imitation3d', 'footsteps'), lambda row: row.rules == 'imitation3d',
-    lambda row: row.rules == 'footsteps',
+    lambda row: row.rules == 'footsteps', lambda row: row.rules in ('hike', 'soccer'),
 )  # fmt: skip
+_SPACE = lambda row: _SPATIAL(row) or _HIGH(row)  # noqa: E731
 _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (
         lambda row: 'completion' in row.tags,
@@ -103,8 +126,39 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (_CLIP, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
     (_GAIT, 'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at which they fall here'),
     (_CLIP3D, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
-    (_STEPS, 'MuJoCo at 300 Hz instead of Bullet at 1200 Hz; task option substeps'),
-    (_SPATIAL, 'axes are x forward, y left, z up; the original has y up and z to the right'),
+    (
+        lambda row: _STEPS(row) or _HIGH(row),
+        'MuJoCo at 300 Hz instead of Bullet at 1200 Hz; task option substeps',
+    ),
+    (
+        _HIGH,
+        'a step is a whole footstep, from one switch of stance to the next; that of the original is 1/30 s '
+        'and leaves the cadence to the caller; task option interface',
+    ),
+    (
+        _HIGH,
+        'the footstep controller is inside, and trained by us; the original leaves it to the caller; task '
+        'option controller',
+    ),
+    (
+        _HIGH,
+        'actions are in [-1, 1], clipped, and scaled as by the native learner of the original; its Python '
+        'interface takes m and rad',
+    ),
+    (
+        _HIGH,
+        'the reward is over the whole step; that of the original is since the last plan, down to a few ms',
+    ),
+    (
+        lambda row: row.terrain == 'pillars3d' and _HIGH(row),
+        'sees the heights of its pillars; the original gives it a map of velocities that are all zero',
+    ),
+    (
+        lambda row: row.rules == 'hike',
+        'whether a goal is reached or its time over is looked at once a step',
+    ),
+    (lambda row: row.rules == 'soccer', 'the times of ball and goal are looked at once a step'),
+    (_SPACE, 'axes are x forward, y left, z up; the original has y up and z to the right'),
     (
         lambda row: row.rules in ('imitation', 'imitation3d', 'footsteps'),
         'actions are in [-1, 1] and clipped; the original takes physical units',
@@ -115,7 +169,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         "original's angle and axis",
     ),
     (
-        _SPATIAL,
+        _SPACE,
         'a ball joint is limited by one cone, as wide as the widest of its three ranges',
     ),
     (
@@ -210,7 +264,10 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         lambda row: row.rules == 'footsteps' and row.character == 'biped3d_mocap_run',
         "the step is our own, 3.83 m/s; the original's is captured, 4.4 m/s",
     ),
-    (lambda row: row.clip is not None, 'the start phase is drawn uniformly instead of swept'),
+    (
+        lambda row: row.clip is not None and not _HIGH(row),
+        'the start phase is drawn uniformly instead of swept',
+    ),
     (
         lambda row: row.terrain == 'stairs3d',
         'treads have vertical faces and run on to both sides; those of the original slope over 0.2 m and change '
@@ -224,24 +281,39 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         lambda row: row.rules in ('imitation', 'gait') and row.terrain != 'flat',
         'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
     ),
-    (_ANY, f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)'),
+    (
+        lambda row: not _HIGH(row),
+        f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)',
+    ),
+    (
+        _HIGH,
+        f'episodes are cut after {catalogue.HIKE_LIMIT} steps, 200 s (discount 1); the registry of the original '
+        'cuts them after 256 steps of 1/30 s',
+    ),
 )  # fmt: skip
 
 
 def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str, str]]:
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     from trl_suite.tasks.gait import GaitTask
+    from trl_suite.tasks.high_level import HighLevel
     from trl_suite.tasks.imitation import Imitation
     from trl_suite.tasks.tracking3d import Tracking
 
     task: Any = environment.task
     gait, spatial = isinstance(task, GaitTask), isinstance(task, Tracking)
+    high = isinstance(task, HighLevel)
     known = gait or spatial or isinstance(task, Imitation)
     if known:
         yield from _character(environment)
     if gait:
         yield from _gait(task)
     meanings = _gait_blocks(task) if gait else _spatial_blocks(task) if spatial else _BLOCKS
+    if high:
+        meanings = {
+            **_HIGH_BLOCKS,
+            **({'target': _TARGET_OF_BALL} if 'ball' in task.blocks else {}),
+        }
     size = max(part.stop for part in environment.blocks.values())
     axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
     yield (
@@ -256,16 +328,21 @@ def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str
     )
     if spatial:
         yield from _spatial_parts(task)
-    yield _gait_action(task) if gait else _action(environment)
+    if high:
+        yield _high_action(task)
+    else:
+        yield _gait_action(task) if gait else _action(environment)
     if known:
         yield _terrain(task)
     if gait:
         yield from _gait_rules(task)
+    elif high:
+        yield from _high_rules(task)
     elif spatial:
         yield from _spatial_rules(task)
     elif known:
         yield from _rules(environment)
-    yield 'Time', _gait_time(row, task) if gait else _time(row, task)
+    yield 'Time', (_gait_time if gait else _high_time if high else _time)(row, task)
     yield (
         'Differs from the original (reasons in docs/differences.md)',
         '\n'.join(f'  - {text}' for applies, text in _DIFFERENCES if applies(row)),
@@ -289,7 +366,7 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
         f'high at the root, {len(row.links)} links, {len(row.joints)} joints',
     )
     # The last column: a weight in a reward that has none of a gait, or what a gait tracks.
-    gait = getattr(task, 'gait', None)
+    gait, above = getattr(task, 'gait', None), hasattr(task, 'controller')
     masses = _floats(environment.physics.bind(character.bodies).mass)
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', '')]
     for (name, joint), mass, (low, high), limit, slides, ball in zip(
@@ -299,7 +376,7 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
         if ball:
             reach = f'ball, up to {high:.3g}'
-        last: object = joint.weight
+        last: object = '' if above else joint.weight
         if gait is not None:
             last = 'the world' if name in gait.world_joints else 'its parent'
         units = ('m', 'N', 'N/m', 'N s/m') if slides else ('', '', '', '')
@@ -310,7 +387,7 @@ def _character(environment: Environment) -> Iterator[tuple[str, str]]:
         ))  # fmt: skip
     header = (
         'link and joint', 'kg', 'range (rad)', 'limit (N m)', 'kp (N m/rad)', 'kd (N m s/rad)',
-        'reward weight' if gait is None else 'target to',
+        'target to' if gait else '' if above else 'reward weight',
     )  # fmt: skip
     yield 'Links', table(header, cells)
 
@@ -510,6 +587,102 @@ def _plans(task: Any) -> tuple[str, str]:
         low, high = task.pushes.force
         lines.append(f'the torso is pushed now and then by {low:g} to {high:g} N')
     return 'Plans: at every switch of stance', _fold('; '.join(lines))
+
+
+# Above a footstep controller
+
+
+def _high_action(task: Any) -> tuple[str, str]:
+    action_map = task.action_map
+    return (
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
+        table(
+            ('sets', 'centre', 'half range', 'unit and meaning'),
+            (
+                (name, centre, half_range, _PLAN_MEANINGS.get(name, 'of the footstep controller'))
+                for name, centre, half_range in zip(
+                    action_map.names, _floats(action_map.centre), _floats(action_map.half_range),
+                    strict=True,
+                )
+            ),
+        ),
+    )  # fmt: skip
+
+
+def _high_rules(task: Any) -> Iterator[tuple[str, str]]:
+    from trl_suite.tasks import high_level, soccer
+
+    yield (
+        'Footstep controller',
+        _fold(
+            f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins'
+        ),
+    )
+    if isinstance(task, soccer.Soccer):
+        yield (
+            'Goal and ball',
+            _fold(
+                f'a ball of {soccer.RADIUS:g} m and {soccer.MASS:g} kg lies {soccer.BALL_AWAY[0]:g} to '
+                f'{soccer.BALL_AWAY[1]:g} m from the walker, the goal up to {soccer.GOAL_AWAY:g} m from the ball; '
+                f'both are drawn anew, the ball after {_seconds(soccer.BALL_LASTS)}, the goal after '
+                f'{_seconds(high_level.GOAL_LASTS)}'
+            ),
+        )
+        speeds = f'exp(-{soccer.SPEED_SHARPNESS:g} min(0, v - {soccer.SPEED:g})^2)'
+        formulas: tuple[str, ...] = (
+            f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
+            f'exp(-{soccer.BALL_SHARPNESS:g} d^2), d: from where it was to the ball, m',
+            f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
+            f'exp(-{soccer.GOAL_SHARPNESS:g} d), d: from the ball to the goal, m',
+        )
+        full = (
+            f'all are full while the ball is within {soccer.AT_GOAL:g} m of the goal and within '
+            f'{soccer.NEAR:g} m of the walker'
+        )
+    else:
+        yield (
+            'Goal',
+            _fold(
+                f'drawn anew within {task._goal_reached:g} m of it, or after {_seconds(high_level.GOAL_LASTS)}'
+            ),
+        )
+        formulas = (
+            f'exp(-{high_level.SPEED_SHARPNESS:g} min(0, v - {task._target_speed:g})^2), v: speed of the '
+            'centre of mass towards the goal, m/s',
+            '1',
+        )
+        full = f'speed is full where a step begins within {task._goal_reached:g} m of the goal'
+    terms = zip(task.TERMS.items(), formulas, strict=True)
+    yield (
+        'Reward of a step: sum of weight * term, at most 1; 0 after a fall',
+        table(
+            ('name', 'weight', 'term'),
+            ((name, weight, formula) for (name, (weight, _)), formula in terms),
+        )
+        + f'\n{_fold(full)}',
+    )
+    looks = _samples_until_fall(high_level)
+    every = high_level.SAMPLE_FRAMES / 30
+    yield (
+        f'Termination (discount 0), looked at every {every:g} s',
+        _fold(
+            f'one of {", ".join(task.character.row.fall_links)} touches the ground in {looks} looks in a row, '
+            'or often enough; or the physics diverges'
+        ),
+    )
+
+
+def _seconds(span: tuple[float, float]) -> str:
+    return f'{span[0]:g} to {span[1]:g} s'
+
+
+def _high_time(row: catalogue.Row, task: Any) -> str:
+    duration, physics = task.control_timestep, 1 / task.physics_timestep
+    return (
+        f'  a step is {duration:.3g} s, the first of an episode may be shorter; footstep controller 30 Hz, '
+        f'physics\n  {physics:.4g} Hz; an episode is cut (discount 1) after {row.step_limit} steps, '
+        f'{row.step_limit * duration:.3g} s'
+    )
 
 
 # Gaits

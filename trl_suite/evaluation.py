@@ -17,6 +17,7 @@ import numpy as np
 
 from trl_suite.catalogue import Row
 from trl_suite.policies import Policy
+from trl_suite.scripted import scripted
 from trl_suite.vector import VectorEnvironment
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
@@ -162,4 +163,5 @@ BASELINES: dict[str, Callable[[VectorEnvironment], BatchPolicy]] = {
     'random': random,
     'zero': zero,
     'clip': clip,
+    'scripted': scripted,
 }

@@ -87,7 +87,7 @@ def frame(
     ):
         if not 0 < operator.index(size) <= limit:
             raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
-    if ghost and not hasattr(environment.task, 'reference_pose'):
+    if ghost and getattr(environment.task, 'reference_pose', None) is None:
         raise ValueError(
             f'a {type(environment.task).__name__} task has no reference clip to draw as a ghost'
         )

@@ -15,8 +15,10 @@ from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
 from trl_suite.tasks.footsteps import Footsteps
 from trl_suite.tasks.gait import GaitTask
+from trl_suite.tasks.high_level import HighLevel
 from trl_suite.tasks.imitation import Imitation
 from trl_suite.tasks.imitation3d import SpatialImitation
+from trl_suite.tasks.soccer import Soccer
 from trl_suite.tasks.task import Task
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
@@ -82,11 +84,23 @@ def _footsteps(row: Row, options: dict[str, Any]) -> Task:
     )  # fmt: skip
 
 
+def _high_level(cls: type[HighLevel]) -> Callable[[Row, dict[str, Any]], Task]:
+    def make(row: Row, options: dict[str, Any]) -> Task:
+        steps = (
+            row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
+        )
+        return cls(characters.make(row.character), _spatial(row), steps, **options)
+
+    return make
+
+
 _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], type[Task]]] = {
     'imitation': (_imitation, Imitation),
     'gait': (_gait, GaitTask),
     'imitation3d': (_imitation3d, SpatialImitation),
     'footsteps': (_footsteps, Footsteps),
+    'hike': (_high_level(HighLevel), HighLevel),
+    'soccer': (_high_level(Soccer), Soccer),
 }
 TASKS = ('imitation', 'footsteps', 'gait')  # as `build` names rules
 _DIMENSIONS = {False: 'planar', True: 'three-dimensional'}

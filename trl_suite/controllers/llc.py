@@ -37,6 +37,7 @@ class Controller:
 
     def __init__(self, function: Function, name: str) -> None:
         self._function, self.name = function, name
+        self._size: int | None = None  # of an action, once it is known
         self.policy = function if isinstance(function, policies.Policy) else None
 
     def check(self, task: Any) -> None:
@@ -48,6 +49,7 @@ class Controller:
         Raises:
           ValueError: they are not; the message has both.
         """
+        self._size = len(task.action_map)
         if self.policy is None:
             return
         self.policy.check(task)
@@ -66,14 +68,16 @@ class Controller:
           ValueError: the controller gives no array of numbers, another shape, or anything but
             finite numbers; the message names the row.
         """
+        answer = self._function(observation)
         try:
-            action = np.asarray(self._function(observation), dtype=float)
-        except TypeError as error:
+            action = np.asarray(answer, dtype=float)
+        except (TypeError, ValueError) as error:
             raise ValueError(f'controller {self.name} gives no numbers: {error}') from None
-        if action.ndim != 2 or len(action) != len(observation):
+        n, size = len(observation), self._size
+        if action.ndim != 2 or len(action) != n or size not in (None, action.shape[1]):
             raise ValueError(
-                f'controller {self.name} gives actions of shape {action.shape}; expected one row '
-                f'for each of {len(observation)}'
+                f'controller {self.name} gives actions of shape {action.shape}; expected '
+                f'({n}, {"k" if size is None else size}), one row for each body'
             )
         if not np.isfinite(action).all():
             row = int(np.argwhere(~np.isfinite(action))[0, 0])

@@ -77,9 +77,9 @@ class Kinematics:
           surface: (x, y) -> velocities of the ground, (n, k, 2) m/s; None if nothing moves.
 
         Returns:
-          A namespace: `root` (n, 3) m; `heading` (n,) rad; `cosine`, `sine` of it (n, 1); `under`
-          (n, 1) m, ground under the root; `height` of the root above it (n, 1) m; in the heading
-          frame `positions` of link centres from the root (n, links, 3) m, `orientations`
+          A namespace: `root` and `com`, the centre of mass, (n, 3) m; `heading` (n,) rad; `cosine`,
+          `sine` of it (n, 1); `under` (n, 1) m, ground under the root; `height` of the root above
+          it (n, 1) m; in the heading frame `positions` of link centres from the root (n, links, 3) m, `orientations`
           (n, links, 4) with w not negative, `velocities` of the centres against the ground under
           the root (n, links, 3) m/s, `spins` (n, links, 3) rad/s; `feet`, the end effectors' joints
           in the world (n, E, 3) m; `com_velocity` (n, 3) m/s; and `features`, see `columns`.
@@ -127,7 +127,7 @@ class Kinematics:
             axis=1,
         )  # fmt: skip
         return SimpleNamespace(
-            root=root, heading=heading, cosine=cosine, sine=sine, under=under,
+            root=root, com=com, heading=heading, cosine=cosine, sine=sine, under=under,
             height=features[:, -1:], positions=positions,
             orientations=np.where(orientations[..., :1] < 0, -orientations, orientations),
             velocities=relative, spins=spins, feet=feet, com_velocity=com_velocity,

@@ -251,6 +251,12 @@ class Footsteps(Tracking):
             self._random[row] = np.random.default_rng(drawn_seed(random_state))
             spawns[i] = ground.spawn(self._random[row])
             self.arena.begin_episode(row, ground, spawns[i, :2])
+        return self._pose_of_start(rows, spawns)
+
+    def _pose_of_start(
+        self, rows: np.ndarray, spawns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns what `_start` does, for the phases that have been drawn."""
         stance = (self.phase[rows] >= 0.5).astype(int)
         self.stance[rows] = stance
         times = self.step_phase[rows] * self.steps.duration
@@ -477,7 +483,7 @@ class Footsteps(Tracking):
         root = self.world.xpos[row, self.figure.kinematics.links[0]]
         found.append(Marker('arrow', root, (0.012, 0.012, 0.5), SWING_COLOUR, yaw))
         if self.goal_given:
-            found.append(Marker('cylinder', self.goal[row], (0.15, 0.15, 0.4), GOAL_COLOUR))
+            found.append(Marker('cylinder', self.goal[row], (0.15, 0.2, 0.0), GOAL_COLOUR))
         return found
 
     def reference_pose(self, row: int) -> np.ndarray:
@@ -491,7 +497,7 @@ class Footsteps(Tracking):
         pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], rows)[0, 0]
         return pose
 
-    _KEPT = (
+    _KEPT: tuple[str, ...] = (
         'stance', 'landing', 'heading', '_length', '_width', '_track', '_turned', '_shift', 'goal',
         'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin',
     )  # fmt: skip

@@ -25,7 +25,8 @@ class Marker(NamedTuple):
     Attributes:
       shape: 'box', 'cylinder', 'sphere', 'ellipsoid', or 'arrow', which points along its yaw.
       position: of its middle, of an arrow its tail, m.
-      size: half sizes as MuJoCo has them; of an arrow radius, radius and length, m.
+      size: as MuJoCo has it, m: half sides, radii, or of a cylinder radius and half height; of an
+        arrow radius, radius and length.
       colour: red, green, blue, opacity.
       yaw: rad.
     """

@@ -102,6 +102,7 @@ class Tracking(Task):
             character, actuation_model, self.physics_timestep,
             **(self._range(centre, half_range) if actuation_model == 'position' else {}),
         )  # fmt: skip
+        self._drive = self.action_map  # from actions to the actuators
         full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
         self._full = consecutive(full)
         self._reflection = self._mirror() if phase else None
@@ -166,7 +167,7 @@ class Tracking(Task):
         self.world, n = world, world.n
         self.figure.bind(world, self.ABOUT)
         scope = f'{self.character.mjcf_model.model}/'
-        names = [scope + name for name in self.action_map.actuators]
+        names = [scope + name for name in self._drive.actuators]
         first = int(world.control_addresses(names[:1])[0])  # added one after the other
         self._ctrl = world.ctrl[:, first : first + self._controls]
         kinematics = self.figure.kinematics
@@ -239,7 +240,7 @@ class Tracking(Task):
             action = np.asarray(action, dtype=float)
             assert self._reflection is not None
             action = self._reflection.answered(action, self._reflection.left(self._observation))
-        self._ctrl[...] = self.action_map.control(action)
+        self._ctrl[...] = self._drive.control(action)
         root = self.figure.kinematics.links[0]
         # Ground ahead is laid before the physics, so that its pictures are current after it.
         self.arena.follow(self.world.xpos[:, root, :2])
@@ -284,12 +285,15 @@ class Tracking(Task):
         """Writes the full observation and the reward terms."""
         self.figure.write(found, self._observation, self._full)
         if 'phase' in self._full:
-            phase = self.phase
-            part = self._observation[:, self._full['phase']]
-            part[:, 0] = phase
-            part[:, 1:] = np.floor(phase * PHASE_BINS)[:, None] == np.arange(PHASE_BINS)
+            self._write_phase()
         self._compare(found)
         self._write_extras(found)
+
+    def _write_phase(self) -> None:
+        phase = self.phase
+        part = self._observation[:, self._full['phase']]
+        part[:, 0] = phase
+        part[:, 1:] = np.floor(phase * PHASE_BINS)[:, None] == np.arange(PHASE_BINS)
 
     def _publish(self) -> None:
         """Writes the mirrored observation from the full one."""

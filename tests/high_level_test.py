@@ -1,0 +1,1102 @@
+"""Tests of the tasks above a footstep controller: clock, plans, rewards, goals, ball, controllers."""
+
+import contextlib
+import dataclasses
+import json
+import pathlib
+import pickle
+import tempfile
+import warnings
+from unittest import mock
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import evaluation, policies, rendering, scripted, suite, terrain
+from trl_suite.controllers import llc
+from trl_suite.vector import VectorEnvironment
+
+PREFIX = 'PD_Biped3D_HLC_'
+BLOCKS, MOVERS, SOCCER = (f'{PREFIX}{n}-v0' for n in ('LargeBlocks', 'DynamicsObstacles', 'Soccer'))
+FOREST, TRAIL = f'{PREFIX}Forest-v0', f'{PREFIX}PathFollowing-v0'
+BELTS, WIDE = f'{PREFIX}Conveyors-v0', f'{PREFIX}Conveyors_Wide-v0'
+IDS = [id_ for id_ in suite.ALL_IDS if id_.startswith(PREFIX)]
+PLANE = dataclasses.replace(suite.find(FOREST), terrain='plane')  # to go from goal to goal
+RIGHT, LEFT = 0, 1
+STILL = 0.8 * np.exp(-1.5) + 0.2  # what standing still earns
+AHEAD = np.zeros(5)  # two steps of half a metre, straight on
+
+
+def started(id_=FOREST, **options):
+    """An environment of few surprises, after a reset."""
+    options = {'random': 8, 'step_limit': None, 'start_phases': (0.0,), **options}
+    row = id_ if not isinstance(id_, str) else suite.find(id_)
+    environment = suite.build_row(row, options, {})
+    return environment, environment.reset()
+
+
+def body(environment, field, link):
+    name = environment.task.character.row.name
+    return getattr(environment.physics.named.data, field)[f'{name}/{link}'].copy()
+
+
+def ankles(environment):
+    """Right and left, (2, 3) m."""
+    return np.stack([body(environment, 'xpos', f'{side}_ankle') for side in ('right', 'left')])
+
+
+def heading_of(environment):
+    ahead = body(environment, 'xmat', 'root').reshape(3, 3)[:, 0]
+    return np.arctan2(ahead[1], ahead[0])
+
+
+def com_of(environment):
+    """Centre of mass of the walker, (3,) m, from its links."""
+    bound = environment.physics.bind(environment.task.character.bodies)
+    return np.asarray(bound.mass) @ np.asarray(bound.xipos) / np.asarray(bound.mass).sum()
+
+
+def turned(way, angle):
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([cosine * way[0] - sine * way[1], sine * way[0] + cosine * way[1]])
+
+
+def difference(a, b):
+    return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def carry(environment, away=(0, 0, 0), yaw=0.0):
+    """Moves the walker by a way, and turns it about its root."""
+    task, data = environment.task, environment.physics.data
+    pose = data.qpos[task.figure.pose_qpos]
+    pose[:3] += away
+    half = 0.5 * yaw
+    w, x, y, z = pose[3:7]
+    cosine, sine = np.cos(half), np.sin(half)
+    pose[3:7] = cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x, (
+        cosine * z + sine * w
+    )  # fmt: skip
+    data.qpos[task.figure.pose_qpos] = pose
+    environment.physics.forward()
+
+
+def put_ball(environment, position, velocity=(0, 0, 0), spin=(0, 0, 0)):
+    data = environment.physics.named.data
+    data.qpos['ball'] = *position, 1, 0, 0, 0
+    data.qvel['ball'] = *velocity, *spin
+    environment.physics.forward()
+
+
+@contextlib.contextmanager
+def moved(task, walker=(0, 0), ball=None, each=None):
+    """Instead of physics: the walker glides at a velocity, m/s, and so does the ball."""
+    world, pose = task.world, task.figure.pose_qpos
+
+    def step(nstep, rows=None):
+        rows = np.arange(world.n) if rows is None else rows
+        world.qpos[rows[:, None], pose[:2]] += np.array(walker) / 30
+        if ball is not None:
+            world.qpos[rows[:, None], task._ball_qpos[:3]] += np.array(ball) / 30
+        if each is not None:
+            each()
+        if np.any(walker) or ball is not None or each is not None:
+            world.forward(rows)
+
+    with mock.patch.object(world, 'step', step):
+        yield
+
+
+def idle(observation):
+    return np.zeros((len(observation), 17))
+
+
+def uniform(values, low, high):
+    """Kolmogorov-Smirnov at a significance of 1 in 1000."""
+    values = np.sort(np.ravel(values))
+    assert values[0] >= low and values[-1] <= high, (values[0], values[-1])
+    share = (values - low) / (high - low)
+    distance = np.abs(share - (np.arange(len(share)) + 0.5) / len(share)).max()
+    assert distance < 1.95 / np.sqrt(len(share)), distance
+
+
+class ClockTest(parameterized.TestCase):
+    """A step lasts from one switch of stance to the next."""
+
+    @parameterized.parameters(
+        (0.0, [15, 15, 15, 15], [LEFT, RIGHT, LEFT, RIGHT]),
+        (0.1, [12, 15, 15, 15], [LEFT, RIGHT, LEFT, RIGHT]),
+        (0.6, [12, 15, 15, 15], [RIGHT, LEFT, RIGHT, LEFT]),
+        (0.5, [15, 15], [RIGHT, LEFT]),
+        (0.4, [3, 15], [LEFT, RIGHT]),
+    )  # fmt: skip
+    def test_durations(self, phase, expected, stances):
+        environment, _ = started(start_phases=(phase,), controller=idle)
+        task, data = environment.task, environment.physics.data
+        for count, stance in zip(expected, stances, strict=True):
+            carry(environment, (0, 0, 5))  # nothing falls there within a step
+            before, calls = data.time, []
+            task.watch = lambda calls=calls: calls.append(data.time)
+            self.assertTrue(environment.step(AHEAD).mid())
+            self.assertAlmostEqual(data.time - before, count / 30, delta=1e-9)
+            self.assertLen(calls, count)
+            np.testing.assert_allclose(np.diff([before, *calls]), 1 / 30, atol=1e-9)
+            self.assertAlmostEqual(environment.info['duration'], count / 30)
+            self.assertEqual(task.stance[0], stance)
+            self.assertTrue(environment.info['landed'])
+
+    def test_start_phases_are_drawn_evenly(self):
+        rows = VectorEnvironment(BLOCKS, 200, 1, seed=0)
+        rows.reset()
+        phases = np.round(rows.task.phase, 9)
+        self.assertEqual(set(phases), {0.1, 0.6})
+        self.assertAlmostEqual((phases == 0.1).mean(), 0.5, delta=4 * np.sqrt(0.25 / 200))
+
+    def test_rows_switch_each_in_its_time(self):
+        rows = VectorEnvironment(
+            PLANE, 12, 2, seed=1, task_kwargs={'start_phases': (0.0, 0.1, 0.6), 'controller': idle}
+        )
+        rows.reset()
+        phases = np.round(rows.task.phase, 9)
+        self.assertLen(set(phases), 3)
+        step = rows.step(np.zeros((12, 5)))
+        np.testing.assert_allclose(step.info['duration'], np.where(phases == 0, 0.5, 0.4))
+        self.assertTrue(step.info['landed'].all())
+        np.testing.assert_array_equal(rows.task.stance, np.where(phases < 0.5, LEFT, RIGHT))
+
+
+class PlanTest(parameterized.TestCase):
+    """What an action means."""
+
+    def test_native_mapping(self):
+        action_map = started()[0].action_map
+        np.testing.assert_allclose(action_map.control(np.zeros(5)), [0.5, 0, 1, 0, 0])
+        np.testing.assert_allclose(action_map.control(np.ones(5)), [1.5, 1, 3, 2, np.pi])
+        np.testing.assert_allclose(action_map.control(-np.ones(5)), [-0.5, -1, -1, -2, -np.pi])
+
+    @parameterized.parameters(FOREST, MOVERS, SOCCER, TRAIL)
+    def test_it_is_laid_out_from_the_beginning_of_the_step_and_stays_put(self, id_):
+        environment, _ = started(id_)
+        task = environment.task
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
+            action = 0.15 * rng.uniform(-1, 1, 5)
+            plan = np.array([0.5, 0, 1, 0, 0]) + np.array([1, 1, 2, 2, np.pi]) * action
+            seen, before = [], task.stance[0]
+            task.watch = lambda seen=seen: seen.append((*task.landing[0].ravel(), task.heading[0]))
+            environment.step(action)
+            self.assertLen(seen, 15)
+            self.assertGreater(np.hypot(*(body(environment, 'xpos', 'root') - root)[:2]), 0.1)
+            for which, way in enumerate((plan[:2], plan[2:4])):
+                place = task.landing[0, which]
+                np.testing.assert_allclose(place[:2], root[:2] + turned(way, heading), atol=1e-9)
+                # Height grids are kept in single precision.
+                ground = terrain.Ground.from_state(task.arena.grounds[0].state())
+                self.assertAlmostEqual(place[2], float(ground.height(*place[:2])), delta=1e-5)
+            self.assertLess(difference(task.heading[0], heading + plan[4]), 1e-9)
+            np.testing.assert_array_equal(seen, np.tile(seen[0], (15, 1)))
+            # How well the foot that swung met its place, at the switch.
+            foot = ankles(environment)[1 - before]
+            gap = np.hypot(*(foot - task.landing[0, 0])[:2])
+            self.assertAlmostEqual(environment.info['landing_error'], gap, delta=1e-9)
+            off = difference(task.heading[0], heading_of(environment))
+            self.assertAlmostEqual(environment.info['heading_error'], off, delta=1e-9)
+
+    def test_what_the_controller_is_told(self):
+        found = []
+
+        def controller(observation):
+            feet, heading = ankles(environment), heading_of(environment)
+            found.append((observation.copy(), feet, heading, task.phase[0]))
+            return default(observation)
+
+        default = llc.load()
+        environment, _ = started(SOCCER, controller=controller)
+        task = environment.task
+        for step in range(2):
+            found.clear()
+            environment.step(AHEAD)
+            self.assertLen(found, 15)
+            swing, stance = ((LEFT, RIGHT), (RIGHT, LEFT))[step]
+            for i, (observation, feet, heading, phase) in enumerate(found):
+                self.assertEqual(observation.shape, (1, 125))
+                self.assertAlmostEqual(phase, (0.5 * step + i / 30) % 1, delta=1e-6)
+                self.assertEqual(observation[0, 105], phase)
+                np.testing.assert_array_equal(
+                    observation[0, 106:110], np.arange(4) == int(4 * phase + 1e-9)
+                )
+                slots = observation[0, 112:124].reshape(2, 2, 3)
+                for which, foot in enumerate((swing, stance)):
+                    way = turned((task.landing[0, which] - feet[foot])[:2], -heading)
+                    np.testing.assert_allclose(slots[which, foot, :2], way, atol=1e-9)
+                    np.testing.assert_array_equal(slots[which, 1 - foot], 0)
+                off = observation[0, 124]
+                self.assertLess(difference(heading + off, task.heading[0]), 1e-9)
+
+
+class HikeRewardTest(parameterized.TestCase):
+    """0.8 exp(-1.5 min(0, v - 1)^2) + 0.2, over the whole step."""
+
+    def test_from_the_physics(self):
+        environment, _ = started(PLANE, start_phases=(0.1,))
+        task = environment.task
+        for i, angle in enumerate((0.0, np.pi, 1.5, -0.4)):
+            before = com_of(environment)
+            task.goal[0] = before + 6 * np.array([np.cos(angle), np.sin(angle), 0])
+            step = environment.step(AHEAD)
+            way = task.goal[0, :2] - before[:2]
+            moved_by = (com_of(environment) - before)[:2]
+            speed = way @ moved_by / np.hypot(*way) / (0.4 if i == 0 else 0.5)
+            expected = 0.8 * np.exp(-1.5 * min(0, speed - 1) ** 2) + 0.2
+            self.assertAlmostEqual(step.reward, expected, delta=1e-9)
+            self.assertAlmostEqual(environment.info['speed'], speed, delta=1e-9)
+            terms = environment.info['reward_terms']
+            self.assertAlmostEqual(terms['upright'], 0.2)
+            self.assertAlmostEqual(sum(terms.values()), step.reward, delta=1e-12)
+
+    @parameterized.parameters(
+        ((0, 0), 0.0), ((0.5, 0), 0.5), ((1, 0), 1.0), ((3, 0), 3.0), ((-1, 0), -1.0),
+        ((0, 0.9), 0.0), ((0.6, 0.8), 0.6),
+    )  # fmt: skip
+    def test_speeds(self, velocity, towards):
+        environment, _ = started(PLANE, controller=idle)
+        task = environment.task
+        task.goal[0] = com_of(environment) + np.array((7, 0, 0))
+        with moved(task, velocity):
+            step = environment.step(AHEAD)
+        expected = 0.8 * np.exp(-1.5 * min(0, towards - 1) ** 2) + 0.2
+        self.assertAlmostEqual(step.reward, expected, delta=1e-9)
+        if velocity == (0, 0):
+            self.assertAlmostEqual(step.reward, 0.379, delta=5e-4)  # as specified
+
+    @parameterized.parameters((0.9, {}, 1), (1.1, {}, STILL), (1.9, {'goal_reached': 2.0}, 1),
+                              (0.6, {'goal_reached': 0.5}, STILL))  # fmt: skip
+    def test_near_the_goal_it_is_full(self, distance, options, expected):
+        environment, _ = started(PLANE, controller=idle, **options)
+        environment.task.goal[0] = com_of(environment) + np.array((0, distance, 0))
+        with moved(environment.task):
+            self.assertAlmostEqual(environment.step(AHEAD).reward, expected, delta=1e-9)
+
+    def test_target_speed(self):
+        environment, _ = started(PLANE, controller=idle, target_speed=0.4)
+        environment.task.goal[0] = com_of(environment) + np.array((7, 0, 0))
+        with moved(environment.task, (0.4, 0)):
+            self.assertAlmostEqual(environment.step(AHEAD).reward, 1, delta=1e-9)
+        with moved(environment.task):
+            expected = 0.8 * np.exp(-1.5 * 0.16) + 0.2
+            self.assertAlmostEqual(environment.step(AHEAD).reward, expected, delta=1e-9)
+
+
+class FallTest(parameterized.TestCase):
+    """A fall is a running share of samples, one every 0.1 s."""
+
+    @parameterized.parameters(FOREST, SOCCER)
+    def test_four_samples_of_unbroken_contact(self, id_):
+        environment, _ = started(id_, controller=idle)
+        task = environment.task
+        carry(environment, (0, 0, -1.0))  # the root in the ground
+        with moved(task):
+            step = environment.step(AHEAD)
+        self.assertTrue(step.last())
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['fell'])
+        self.assertFalse(environment.info['diverged'])
+        self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
+        self.assertAlmostEqual(environment.info['duration'], 0.4)
+        self.assertTrue(environment.step(AHEAD).first())
+        self.assertFalse(environment.info['fell'])
+
+    @parameterized.parameters(
+        # Samples with contact, and at which sample it is a fall: S <- 0.9 S + c / 11 > 0.25.
+        ('1111', 4), ('11101', 5), ('111001', 6), ('0001111', 7), ('1010101', 7), ('11011', 5),
+        ('1001001001', None), ('11100', None),
+    )  # fmt: skip
+    def test_broken_contact(self, samples, fall):
+        environment, _ = started(PLANE, controller=idle)
+        task, share = environment.task, 0.0
+        for i, touch in enumerate(samples, 1):
+            share = 0.9 * share + int(touch) / 11
+            self.assertEqual(share > 0.25, i == fall)  # the case is what it says
+        height = environment.physics.data.qpos[task.figure.pose_qpos[2]]
+
+        def place():
+            number = task._count[0] // 3
+            touch = number < len(samples) and samples[number] == '1'
+            task.world.qpos[0, task.figure.pose_qpos[2]] = height - 1.0 if touch else 5.0
+
+        with moved(task, each=place):
+            for _ in range(1 + len(samples) // 5):
+                step = environment.step(AHEAD)
+                if step.last():
+                    break
+        self.assertEqual(step.last(), fall is not None)
+        self.assertEqual(environment.info['fell'], fall is not None)
+        if fall is not None:
+            self.assertEqual(task._count[0], 3 * fall)
+
+    def test_a_touch_of_the_feet_is_none(self):
+        environment, _ = started(PLANE)
+        for _ in range(10):
+            self.assertTrue(environment.step(AHEAD).mid())
+
+    @parameterized.parameters(FOREST, SOCCER)
+    def test_what_breaks_down(self, id_):
+        environment, _ = started(id_)
+        kept = environment.step(AHEAD).observation
+        environment.physics.data.qvel[:6] = 1e12
+        environment.physics.data.qvel[environment.task.figure.pose_dof] = 1e12
+        step = environment.step(AHEAD)
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['diverged'])
+        self.assertFalse(environment.info['fell'])
+        for name, value in step.observation.items():
+            np.testing.assert_array_equal(value, kept[name])
+        self.assertTrue(environment.step(AHEAD).first())
+        self.assertTrue(environment.step(AHEAD).mid())
+
+
+class GoalTest(parameterized.TestCase):
+    """Where to go."""
+
+    def test_target_block(self):
+        environment, _ = started(PLANE, controller=idle)
+        task = environment.task
+        for yaw in (0.0, 0.9, -2.5):
+            carry(environment, yaw=yaw)
+            root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
+            bearing, distance = 0.7, 4.0  # to the left
+            task.goal[0, :2] = root[:2] + distance * turned((np.cos(0.7), np.sin(0.7)), heading)
+            task.observe()
+            found = environment.observation()['target']
+            np.testing.assert_allclose(found, [bearing, distance], atol=1e-9)
+
+    def test_it_is_drawn_anew_when_reached(self):
+        environment, _ = started(PLANE, controller=idle)
+        task = environment.task
+        root = body(environment, 'xpos', 'root')
+        with moved(task):
+            for distance, reached in ((1.05, 0), (0.95, 1), (1.05, 1), (0.0, 2)):
+                task.goal[0] = root + np.array((distance, 0, 0))
+                given = task.goal[0].copy()
+                step = environment.step(AHEAD)
+                self.assertEqual(environment.info['goals_reached'], reached)
+                self.assertEqual((task.goal[0] == given).all(), distance > 1)
+                # On the plane within 3 m along x and along y of the root; observed at once.
+                self.assertLessEqual(np.abs(task.goal[0] - root)[:2].max(), 3)
+                away = np.hypot(*(task.goal[0] - root)[:2])
+                self.assertAlmostEqual(step.observation['target'][1], away, delta=1e-9)
+        environment.reset()
+        self.assertEqual(environment.info['goals_reached'], 0)
+
+    def test_it_is_drawn_anew_by_a_timer(self):
+        n, steps = 12, 420
+        rows = VectorEnvironment(
+            PLANE, n, 1, seed=0, step_limit=None, task_kwargs={'controller': idle}
+        )
+        rows.reset()
+        task, begun, lasted = rows.task, np.zeros(n), []
+        with moved(task), mock.patch.object(task.arena, 'goal', lambda *_: next(far)):
+            far = (np.array([100.0 + i, 0, 0]) for i in range(1000))
+            for row in range(n):
+                task._begin_goal(row, task.figure.measure())
+            before = task.goal.copy()
+            for i in range(1, steps + 1):
+                rows.step(np.zeros((n, 5)))
+                for row in np.flatnonzero((task.goal != before).any(1)):
+                    lasted.append(0.5 * i - begun[row])
+                    begun[row] = 0.5 * i
+                before = task.goal.copy()
+        self.assertGreaterEqual(len(lasted), 2 * n)
+        # 50 to 100 s, looked at every half second.
+        uniform(lasted, 50.0, 100.5)
+        self.assertEqual(task.goals_reached.max(), 0)
+
+    @parameterized.parameters(*IDS)
+    def test_goals_of_all_grounds(self, id_):
+        rows = VectorEnvironment(id_, 8, 1, seed=4)
+        observation = rows.reset()
+        self.assertTrue(np.isfinite(rows.task.goal).all())
+        self.assertLen(np.unique(rows.task.goal[:, 0]), 8)
+        distance = observation[:, rows.blocks['target']][:, 1]
+        reach = {SOCCER: 10.0, TRAIL: 22.0}.get(id_, 48 * np.sqrt(2))
+        self.assertBetween(distance.max(), 1.0, reach)
+
+
+class MapTest(parameterized.TestCase):
+    """What is seen of the ground: lines from the left to the right, along them ahead."""
+
+    POINTS = (
+        np.tile(np.linspace(-1, 10, 32), 32),
+        np.repeat(np.linspace(5.5, -5.5, 32), 32),
+    )
+
+    @parameterized.parameters(FOREST, BLOCKS, TRAIL)
+    def test_heights(self, id_):
+        environment, step = started(id_)
+        root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
+        x, y = root[:2, None] + turned(self.POINTS, heading)
+        ground = terrain.Ground.from_state(environment.task.arena.grounds[0].state())
+        expected = ground.height(x, y) - ground.height(*root[:2])
+        np.testing.assert_allclose(step.observation['terrain'], expected, atol=1e-5)
+        if id_ == FOREST:
+            self.assertBetween(step.observation['terrain'].max(), 2, 8)  # pillars are seen
+
+    @parameterized.parameters((BELTS, (3, 5), 0.4), (WIDE, (3, 8), 0.6))
+    def test_velocities_beside_a_belt(self, id_, belt, speed):
+        environment, _ = started(id_, controller=idle)
+        task = environment.task
+        place = body(environment, 'xpos', 'root')
+        carry(environment, (1.5 - place[0], -place[1], 0), yaw=-heading_of(environment))
+        task.arena.follow(np.array([[1.5, 0.0]]))
+        task.observe()
+        ahead, right = environment.observation()['surface'].reshape(2, 1024)
+        x, y = 1.5 + self.POINTS[0], self.POINTS[1]
+        on = (x > belt[0]) & (x < belt[1])
+        self.assertGreater(on.sum(), 100)
+        velocity = task.arena.grounds[0].layout.belts.velocity[0]
+        self.assertAlmostEqual(abs(velocity[1]), speed)
+        np.testing.assert_allclose(right[on & (np.abs(y) < 5)], -velocity[1], atol=1e-9)
+        off = (x < belt[0]) if id_ == BELTS else ~on
+        np.testing.assert_allclose(right[off], 0, atol=1e-9)
+        np.testing.assert_allclose(ahead, 0, atol=1e-9)
+
+    @parameterized.parameters(
+        (('height', 'velocity'), 1024, 2048), ('height', 1024, 0), (('velocity',), 0, 2048),
+        ((), 0, 0),
+    )  # fmt: skip
+    def test_sight(self, sight, heights, velocities):
+        _, step = started(MOVERS, sight=sight)
+        sizes = {name: value.size for name, value in step.observation.items()}
+        self.assertEqual(sizes.pop('terrain', 0), heights)
+        self.assertEqual(sizes.pop('surface', 0), velocities)
+        self.assertEqual(sizes, {'pose': 57, 'velocity': 48, 'target': 2})
+
+
+class BallTest(parameterized.TestCase):
+    """A light ball."""
+
+    def test_figures(self):
+        environment, _ = started(SOCCER)
+        model = environment.physics.named.model
+        self.assertAlmostEqual(model.body_mass['ball'], 0.1)
+        self.assertAlmostEqual(model.geom_size['ball'][0], 0.2)
+        np.testing.assert_allclose(model.body_inertia['ball'], 0.4 * 0.1 * 0.2**2)
+        self.assertAlmostEqual(model.geom_friction['ball'][0], 0.45)
+        self.assertGreater(model.geom_priority['ball'], model.geom_priority['plane'])
+
+    def test_velocity_halves_in_a_second(self):
+        rows = VectorEnvironment(SOCCER, 2, 1, seed=0)
+        environment, _ = started(SOCCER)
+        rows.reset()
+        for task in (environment.task, rows.task):
+            world, qpos, dof = task.world, task._ball_qpos, task._ball_dof
+            world.qpos[:, qpos[:3]] = 0, 0, 60
+            world.qvel[:, dof] = 2, -1, 0, 6, 3, -2
+            world.forward(np.arange(world.n))
+            world.step(300)
+            after = world.qvel[:, dof]
+            fall = -9.81 / np.log(2) * 0.5  # against a drag of ln 2 per second
+            for row in after:
+                np.testing.assert_allclose(row, [1, -0.5, fall, 3, 1.5, -1], rtol=3e-3)
+
+    def test_a_kicked_ball_rolls(self):
+        environment, _ = started(SOCCER)
+        task = environment.task
+        carry(environment, (0, 20, 0))  # out of the way
+        put_ball(environment, (0, 0, 0.2), (3, 0, 0))
+        place = []
+        for _ in range(30):
+            task.world.step(10)
+            place.append(environment.physics.named.data.qpos['ball'][:3].copy())
+        place = np.array(place)
+        velocity = environment.physics.named.data.qvel['ball']
+        self.assertGreater(place[-1, 0], 1.0)
+        self.assertTrue((np.diff(place[:, 0]) > 0).all())
+        np.testing.assert_allclose(place[:, 2], 0.2, atol=0.02)  # it hops a little at first
+        np.testing.assert_allclose(place[10:, 2], 0.2, atol=0.001)
+        np.testing.assert_allclose(place[:, 1], 0, atol=1e-6)
+        self.assertAlmostEqual(velocity[4], velocity[0] / 0.2, delta=0.02 * velocity[0] / 0.2)
+
+    def test_walkers_kick_it(self):
+        environment, _ = started(SOCCER)
+        place = body(environment, 'xpos', 'root')
+        put_ball(environment, (place[0] + 0.7, place[1], 0.2))
+        heading = []
+        for _ in range(6):
+            environment.step(AHEAD)
+            heading.append(environment.physics.named.data.qpos['ball'][0] - place[0])
+        self.assertGreater(heading[-1], 0.9)
+
+    def test_it_sets_no_contacts_of_feet_and_is_no_fall(self):
+        seen = []
+
+        def controller(observation):
+            seen.append(observation[0, 110:112].copy())
+            return np.zeros((1, 17))
+
+        environment, _ = started(SOCCER, controller=controller)
+        task = environment.task
+        carry(environment, (0, 0, 5))
+        touched = set()
+        for link in ('right_ankle', 'left_ankle', 'root', 'torso'):
+            put_ball(environment, body(environment, 'xipos', link))
+            data, model = environment.physics.data.ptr, environment.physics.model.ptr
+            geoms = data.contact.geom[: data.ncon]
+            names = {model.body(b).name.split('/')[-1] for b in model.geom_bodyid[geoms].ravel()}
+            touched |= names
+            with moved(task):
+                self.assertTrue(environment.step(AHEAD).mid())
+        self.assertContainsSubset({'ball', 'right_ankle', 'left_ankle', 'root'}, touched)
+        np.testing.assert_array_equal(seen, np.zeros((60, 2)))
+
+    def test_where_ball_and_goal_are_put(self):
+        rows = VectorEnvironment(SOCCER, 300, 1, seed=0)
+        rows.reset()
+        task = rows.task
+        root = task.world.xpos[:, task.figure.kinematics.links[0], :2]
+        ball = task.world.qpos[:, task._ball_qpos]
+        away, shot = ball[:, :2] - root, task.goal[:, :2] - ball[:, :2]
+        uniform(np.hypot(*away.T), 0.7, 10)
+        uniform(np.hypot(*shot.T), 0, 10)
+        for way in (away, shot):
+            uniform(np.arctan2(way[:, 1], way[:, 0]), -np.pi, np.pi)
+        np.testing.assert_allclose(ball[:, 2], 0.2)
+        np.testing.assert_array_equal(task.goal[:, 2], 0)
+        np.testing.assert_array_equal(task.world.qvel[:, task._ball_dof], 0)
+
+    def test_blocks(self):
+        environment, _ = started(SOCCER, controller=idle)
+        task = environment.task
+        for yaw in (0.8, -2.0):
+            carry(environment, yaw=yaw)
+            root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
+            bearing, distance = -0.6, 2.5  # to the right
+            place = root[:2] + distance * turned((np.cos(bearing), np.sin(bearing)), heading)
+            put_ball(environment, (*place, 0.3), (1, 2, 3), (4, 5, 6))
+            task.goal[0] = *(place + 4 * turned((np.cos(2.0), np.sin(2.0)), heading)), 0
+            task.observe()
+            found = environment.observation()
+            np.testing.assert_allclose(found['target'], [2.0, 4.0], atol=1e-9)
+            expected = [
+                bearing, distance, 0.3, *turned((1, 2), -heading), 3, *turned((4, 5), -heading), 6,
+            ]  # fmt: skip
+            np.testing.assert_allclose(found['ball'], expected, atol=1e-9)
+
+    def test_timers(self):
+        n, steps = 10, 430
+        rows = VectorEnvironment(
+            SOCCER, n, 1, seed=0, step_limit=None, task_kwargs={'controller': idle}
+        )
+        rows.reset()
+        task = rows.task
+        lasted, begun = {'ball': [], 'goal': []}, {'ball': np.zeros(n), 'goal': np.zeros(n)}
+        # The first step is shorter where the phase is 0.1 or 0.6.
+        with moved(task):
+            now = np.zeros(n)
+            before = {}
+            for i in range(steps):
+                step = rows.step(np.zeros((n, 5)))
+                now += step.info['duration']
+                places = {'ball': task.world.qpos[:, task._ball_qpos[:2]], 'goal': task.goal.copy()}
+                for name, place in places.items():
+                    if i:
+                        for row in np.flatnonzero((place != before[name]).any(1)):
+                            lasted[name].append(now[row] - begun[name][row])
+                            begun[name][row] = now[row]
+                before = places
+        uniform(lasted['ball'], 100, 200.5)
+        uniform(lasted['goal'], 50, 100.5)
+        self.assertGreater(len(lasted['goal']), len(lasted['ball']))
+
+    def test_reaching_the_goal_leaves_it_where_it_is(self):
+        environment, _ = started(SOCCER, controller=idle)
+        task = environment.task
+        with moved(task):
+            for i, (gap, reached) in enumerate(((0.4, 1), (0.5, 1), (0.0, 2))):
+                ball = environment.physics.named.data.qpos['ball'][:2]
+                # The ball's middle is 0.2 m above the ground.
+                task.goal[0] = *(ball + np.array((gap, 0))), 0
+                given = task.goal[0].copy()
+                environment.step(AHEAD)
+                self.assertEqual(environment.info['goals_reached'], reached, i)
+                self.assertEqual(environment.info['at_goal'], gap < 0.45)
+                np.testing.assert_array_equal(task.goal[0], given)
+
+
+class SoccerRewardTest(parameterized.TestCase):
+    """Two sixths for the walker and the ball, two thirds for the ball and the goal."""
+
+    @parameterized.parameters(
+        # From the walker to the ball, velocities of both, from the ball to the goal.
+        ((3, 0), (0, 0), (0, 0), (4, 0)), ((3, 0), (0.6, 0), (0, 0), (4, 0)),
+        ((1, 2), (0.5, 1.5), (0, 0), (0, 3)), ((2, 0), (-0.5, 0), (0.7, 0), (4, 0)),
+        ((2, 0), (0, 0), (2, 0), (4, 0)), ((0, 1.5), (0, 1), (0, -0.4), (0, 5)),
+        ((0, 1.5), (0, 1), (0.3, 0.4), (0, 5)), ((5, 0), (3, 0), (0, 0), (0, 0.1)),
+    )  # fmt: skip
+    def test_terms(self, to_ball, walks, rolls, to_goal):
+        environment, _ = started(SOCCER, controller=idle)
+        task = environment.task
+        walker = com_of(environment)[:2]
+        ball = walker + to_ball
+        put_ball(environment, (*ball, 0.2))
+        task.goal[0] = *(ball + to_goal), 0
+        with moved(task, walks, (*rolls, 0)):
+            step = environment.step(AHEAD)
+        after = ball + 0.5 * np.array(rolls)
+
+        def along(velocity, way):
+            return np.dot(velocity, way) / np.hypot(*way)
+
+        towards_ball, towards_goal = along(walks, after - walker), along(rolls, to_goal)
+        left = np.hypot(np.hypot(*(ball + to_goal - after)), 0.2)
+        expected = {
+            'approach': np.exp(-1.5 * min(0, towards_ball - 1) ** 2) / 6,
+            'near': np.exp(-0.5 * ((after - walker) ** 2).sum()) / 6,
+            'dribble': (towards_goal > 0) * np.exp(-1.5 * min(0, towards_goal - 1) ** 2) / 3,
+            'goal': np.exp(-0.5 * left) / 3,
+        }
+        found = environment.info['reward_terms']
+        for name, value in expected.items():
+            self.assertAlmostEqual(found[name], value, delta=1e-9, msg=name)
+        self.assertCountEqual(found, expected)
+        self.assertAlmostEqual(step.reward, sum(expected.values()), delta=1e-9)
+        self.assertAlmostEqual(environment.info['speed'], towards_goal, delta=1e-9)
+
+    @parameterized.parameters((1.9, 0.4, True), (2.1, 0.4, False), (1.0, 0.5, False))
+    def test_at_the_goal_all_is_full(self, to_ball, gap, full):
+        environment, _ = started(SOCCER, controller=idle)
+        ball = com_of(environment)[:2] + np.array((to_ball, 0))
+        put_ball(environment, (*ball, 0.2))
+        environment.task.goal[0] = *(ball + np.array((0, gap))), 0  # 0.2 m below
+        with moved(environment.task):
+            step = environment.step(AHEAD)
+        self.assertEqual(abs(step.reward - 1) < 1e-9, full)
+
+
+class FrameTest(parameterized.TestCase):
+    """The interface for whoever trains both levels."""
+
+    @parameterized.parameters((FOREST, 1131), (SOCCER, 116), (BELTS, 2155))
+    def test_sizes(self, id_, size):
+        environment, step = started(id_, interface='frame')
+        self.assertEqual(environment.action_spec().shape, (22,))
+        self.assertEqual(environment.blocks['low_level'], slice(size, size + 125))
+        self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
+        before = environment.physics.data.time
+        self.assertTrue(environment.step(np.zeros(22)).mid())
+        self.assertAlmostEqual(environment.physics.data.time - before, 1 / 30, delta=1e-9)
+        self.assertEqual(step.observation['low_level'].shape, (125,))
+
+    @parameterized.parameters(BLOCKS, SOCCER, BELTS, MOVERS)
+    def test_driven_by_the_shipped_controller_it_is_the_other_interface(self, id_):
+        options = {'start_phases': (0.1,), 'random': 3}
+        plan, first = started(id_, **options)
+        frame, begun = started(id_, interface='frame', **options)
+        controller, rng = llc.load(), np.random.default_rng(0)
+        for name, value in first.observation.items():
+            np.testing.assert_array_equal(begun.observation[name], value)
+        for i in range(4):
+            action = 0.1 * rng.uniform(-1, 1, 5)
+            expected = plan.step(action)
+            low = frame.task.lay(np.append(action, np.zeros(17))[None])
+            np.testing.assert_array_equal(frame.observation()['low_level'], low[0])
+            for k in range(12 if i == 0 else 15):
+                found = frame.step(np.append(action, controller(low)[0]))
+                low = found.observation['low_level'][None]
+                self.assertEqual(frame.info['landed'], k == (11 if i == 0 else 14))
+            np.testing.assert_array_equal(frame.physics.data.qpos, plan.physics.data.qpos)
+            np.testing.assert_array_equal(frame.physics.data.qvel, plan.physics.data.qvel)
+            for name, value in expected.observation.items():
+                np.testing.assert_array_equal(found.observation[name], value)
+            np.testing.assert_array_equal(frame.task.landing, plan.task.landing)
+
+    def test_a_plan_counts_where_a_footstep_begins(self):
+        environment, _ = started(PLANE, interface='frame')
+        task, rng, plans = environment.task, np.random.default_rng(0), []
+        for i in range(31):
+            before = task.landing[0].copy(), task.heading[0]
+            root, heading = body(environment, 'xpos', 'root'), heading_of(environment)
+            action = np.append(0.2 * rng.uniform(-1, 1, 5), np.zeros(17))
+            self.assertTrue(environment.step(action).mid())
+            if i % 15 == 0:
+                place = root[:2] + turned((0.5 + action[0], action[1]), heading)
+                np.testing.assert_allclose(task.landing[0, 0, :2], place, atol=1e-9)
+                plans.append(task.landing[0].copy())
+            else:
+                np.testing.assert_array_equal(task.landing[0], before[0])
+                self.assertEqual(task.heading[0], before[1])
+            self.assertEqual(environment.info['landed'], i in (14, 29))
+        self.assertLen(plans, 3)
+
+    def test_reward_is_of_the_frame(self):
+        environment, _ = started(PLANE, interface='frame')
+        task = environment.task
+        for _ in range(3):
+            task.goal[0] = com_of(environment) + np.array((5, 0, 0))
+            before = com_of(environment)
+            step = environment.step(np.zeros(22))
+            speed = 30 * (com_of(environment) - before)[0]
+            expected = 0.8 * np.exp(-1.5 * min(0, speed - 1) ** 2) + 0.2
+            self.assertAlmostEqual(step.reward, expected, delta=1e-9)
+
+
+class ControllerTest(parameterized.TestCase):
+    """Footstep controllers: the shipped one, files, functions."""
+
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+    def positions(self, **options):
+        environment, _ = started(PLANE, **options)
+        for _ in range(2):
+            environment.step(AHEAD)
+        return environment.physics.data.qpos.copy()
+
+    def test_all_ways_to_name_it(self):
+        shipped = policies.reference(llc.DEFAULT)
+        path = self.folder / 'mine.npz'
+        policies.save(shipped, path)
+        expected = self.positions()
+        for source in (
+            llc.DEFAULT, 'deeploco/llc_general_step', path, str(path), shipped, llc.load(),
+            lambda observation: shipped(observation),
+        ):  # fmt: skip
+            with self.subTest(source=str(source)):
+                np.testing.assert_array_equal(self.positions(controller=source), expected)
+        self.assertIsNone(llc.load(idle).policy)
+        self.assertIsNotNone(llc.load(path).policy)
+        controller = llc.load()
+        self.assertIs(llc.load(controller), controller)
+
+    def test_one_of_ones_own(self):
+        def mine(observation):
+            calls.append(observation.shape)
+            return [[0.0] * 17] * len(observation)
+
+        calls = []
+        rows = VectorEnvironment(PLANE, 3, 1, seed=0, task_kwargs={'controller': mine})
+        rows.reset()
+        rows.step(np.zeros((3, 5)))
+        self.assertEqual(calls, [(3, 125)] * 15)
+        self.assertTrue((self.positions(controller=mine) != self.positions()).any())
+
+    @parameterized.parameters(
+        (lambda n: np.zeros((n, 16)), r'shape \(1, 16\); expected \(1, 17\)'),
+        (lambda n: np.zeros((n, 18)), r'shape \(1, 18\)'), (lambda n: np.zeros(17), r'shape \(17,\)'),
+        (lambda n: np.zeros((n + 1, 17)), r'shape \(2, 17\)'), (lambda n: np.zeros(()), r'shape \(\)'),
+        (lambda n: np.full((n, 17), np.nan), 'no finite action for row 0'),
+        (lambda n: np.full((n, 17), np.inf), 'no finite action for row 0'),
+        (lambda n: None, r'no numbers|shape'), (lambda n: 'left', 'no numbers'),
+        (lambda n: [[1, 2], [3]], 'no numbers'),
+    )  # fmt: skip
+    def test_wrong_answers(self, answer, message):
+        def crooked(observation):
+            return answer(len(observation))
+
+        environment, _ = started(PLANE, controller=crooked)
+        with self.assertRaisesRegex(ValueError, f'controller crooked gives .*({message})'):
+            environment.step(AHEAD)
+
+    def test_the_row_is_named(self):
+        def half(observation):
+            return np.where(np.arange(len(observation))[:, None] == 2, np.nan, np.zeros((1, 17)))
+
+        rows = VectorEnvironment(PLANE, 4, 1, seed=0, task_kwargs={'controller': half})
+        rows.reset()
+        with self.assertRaisesRegex(ValueError, 'controller half gives no finite action for row 2'):
+            rows.step(np.zeros((4, 5)))
+
+    def test_errors_of_the_function_are_its_own(self):
+        def broken(observation):
+            raise TypeError('mine')
+
+        environment, _ = started(PLANE, controller=broken)
+        with self.assertRaisesRegex(TypeError, '^mine$'):
+            environment.step(AHEAD)
+
+    def test_far_actions_are_clipped(self):
+        ones = self.positions(controller=lambda o: np.ones((len(o), 17)))
+        far = self.positions(controller=lambda o: np.full((len(o), 17), 50.0))
+        np.testing.assert_array_equal(ones, far)
+
+    def test_unknown(self):
+        with self.assertRaisesRegex(ValueError, f"did you mean '{llc.DEFAULT}'"):
+            llc.load('PD_Biped3D_LLC_Genral_Step-v0')
+        with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
+            llc.load('PD_Raptor2D_Flat-v0')
+        with self.assertRaises(FileNotFoundError):
+            llc.load(self.folder / 'none.npz')
+        (self.folder / 'broken.npz').write_bytes(b'no')
+        with self.assertRaisesRegex(ValueError, 'broken.npz'):
+            llc.load(str(self.folder / 'broken.npz'))
+
+    def test_one_that_observes_something_else(self):
+        task = suite.build_task(suite.find('PD_Biped3D_LLC_Symetric_Step-v0'))
+        blocks = [(name, part.stop - part.start) for name, part in task.blocks.items()]
+        size = sum(size for _, size in blocks)
+        policy = policies.Policy(
+            id='mirrored', blocks=blocks, actions=task.action_map.names,
+            quantity=task.action_map.quantity, mean=np.zeros(size), std=np.ones(size), clip=5.0,
+            weights=[np.zeros((size, 17))], biases=[np.zeros(17)], activation='tanh',
+            log_std=np.zeros(17),
+        )  # fmt: skip
+        with self.assertRaisesRegex(ValueError, "'mirrored' observes .*plan 7.* gives .*plan 13"):
+            started(PLANE, controller=policy)
+
+    def test_another_body_is_a_warning(self):
+        shipped = policies.reference(llc.DEFAULT)
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            started(PLANE)  # no warning
+        info = {**json.loads(json.dumps(shipped.info)), 'character': '0123abcd'}
+        other = dataclasses.replace(shipped, info=info)
+        policies.save(other, self.folder / 'other.npz')
+        with self.assertWarnsRegex(UserWarning, 'other.npz.*trained with body 0123abcd'):
+            started(PLANE, controller=self.folder / 'other.npz')
+
+
+class ScriptedTest(parameterized.TestCase):
+    """The hand-written policy."""
+
+    def test_walks_from_goal_to_goal(self):
+        rows = VectorEnvironment(PLANE, 6, 1, seed=0, step_limit=None, autoreset='disabled')
+        policy, observation, rewards = scripted.scripted(rows), rows.reset(), []
+        fell = np.zeros(6, bool)
+        for _ in range(60):  # half a minute
+            step = rows.step(policy(observation))
+            fell |= step.terminated
+            rewards.append(step.reward[~fell].mean())
+            observation = rows.reset(step.terminated) if step.terminated.any() else step.observation
+        self.assertLessEqual(fell.sum(), 1)
+        self.assertGreaterEqual(step.info['goals_reached'][~fell].mean(), 3)
+        self.assertGreater(np.mean(rewards), 0.5)  # standing still earns 0.38
+
+    @parameterized.parameters(*IDS)
+    def test_on_every_row(self, id_):
+        rows = VectorEnvironment(id_, 3, 1, seed=1)
+        policy, observation = scripted.scripted(rows), rows.reset()
+        for _ in range(6):
+            action = policy(observation)
+            self.assertEqual(action.shape, (3, 5))
+            self.assertLessEqual(np.abs(action).max(), 1)
+            step = rows.step(action)
+            self.assertFalse(step.terminated.any())
+            observation = step.observation
+
+    @parameterized.parameters(RIGHT, LEFT)
+    def test_plans(self, stance):
+        ways = np.array([0.0, 0.3, -0.3, 2.0])
+        plans = scripted.steps(ways, np.full(4, 5.0), np.full(4, stance))
+        side = -1 if stance == LEFT else 1  # of the foot that swings
+        first, second = plans[:, :2], plans[:, 2:4]
+        self.assertAlmostEqual(first[0, 1], side * 0.075)
+        self.assertAlmostEqual(second[0, 1], -side * 0.075)
+        self.assertAlmostEqual(second[0, 0] - first[0, 0], 0.5)
+        np.testing.assert_allclose(np.sign(plans[:, 4]), [0, 1, -1, 1])
+        self.assertLess(np.abs(plans[:, 4]).max(), 0.5)
+
+    def test_goes_around_what_it_sees(self):
+        x = np.tile(np.linspace(-1, 10, 32), 32).reshape(32, 32)
+        y = np.repeat(np.linspace(5.5, -5.5, 32), 32).reshape(32, 32)
+        wall = (x > 1.5) & (x < 2.5) & (y > -0.9) & (y < 3)  # more of it to the left
+        parts = {'terrain': np.stack([2.0 * wall.ravel(), np.zeros(1024)])}
+        ways = scripted.free_way(parts, np.zeros(2), np.full(2, 8.0))
+        self.assertLess(ways[0], -0.3)
+        self.assertAlmostEqual(ways[1], 0)
+        moving = np.stack([0.4 * wall.ravel(), np.zeros(1024)])[None].reshape(1, 2048)
+        found = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
+        self.assertLess(found[0], -0.3)
+        # What lies behind the goal is in nobody's way.
+        near = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
+        np.testing.assert_allclose(near, 0)
+
+    def test_gets_behind_the_ball(self):
+        ball = np.zeros((2, 9))
+        ball[:, 1] = 2.0  # straight on
+        parts = {'ball': ball, 'target': np.array([[0.0, 5.0], [np.pi / 2, 5.0]])}
+        bearing, distance = scripted.towards_ball(parts)
+        self.assertAlmostEqual(bearing[0], 0)
+        self.assertGreater(distance[0], 2)  # through it, towards the goal
+        # To shoot it to the left one has to stand to the right of it.
+        place = distance[1] * np.array([np.cos(bearing[1]), np.sin(bearing[1])])
+        np.testing.assert_allclose(place, [2, -0.7], atol=1e-9)
+
+    def test_single_and_many_agree(self):
+        row = dataclasses.replace(suite.find(BLOCKS), step_limit=5)
+        found = evaluation.evaluate(row, scripted.scripted, 3, 1, factory=True)
+        self.assertIs(evaluation.BASELINES['scripted'], scripted.scripted)
+        for seed, total in zip(found['seeds'], found['returns'], strict=True):
+            environment = suite.build_row(row, {'random': seed}, {'flat_observation': True})
+            policy, step, mine = scripted.scripted(environment), environment.reset(), 0.0
+            while not step.last():
+                step = environment.step(policy(step.observation['observations'][None])[0])
+                mine += step.reward
+            self.assertEqual(mine, total)
+
+    @parameterized.parameters(
+        ('PD_Biped3D_LLC_General_Step-v0', {}), (FOREST, {'interface': 'frame'})
+    )
+    def test_other_tasks_are_refused(self, id_, options):
+        with self.assertRaisesRegex(ValueError, 'has no scripted policy.*interface'):
+            scripted.scripted(suite.make(id_, options))
+
+
+class SaveTest(parameterized.TestCase):
+    """State and pickles go on bit for bit; many rows are single ones."""
+
+    OPTIONS = (
+        *((id_, {}) for id_ in IDS), (SOCCER, {'interface': 'frame'}),
+        (MOVERS, {'interface': 'frame', 'sight': ('height', 'velocity')}),
+    )  # fmt: skip
+
+    def advance(self, environment, seed, steps):
+        rng, found, task = np.random.default_rng(seed), [], environment.task
+        for _ in range(steps):
+            step = environment.step(0.15 * rng.uniform(-1, 1, len(environment.action_map)))
+            found.append(np.concatenate([
+                [step.reward or 0.0, int(step.step_type)], *step.observation.values(),
+                task.goal[0], task.landing[0].ravel(), environment.physics.data.qpos,
+            ]))  # fmt: skip
+        return np.array(found)
+
+    @parameterized.parameters(*OPTIONS)
+    def test_goes_on(self, id_, options):
+        environment = suite.make(id_, {'random': 6, **options})
+        environment.reset()
+        self.advance(environment, 0, 3)
+        twin = pickle.loads(pickle.dumps(environment))
+        state = pickle.loads(pickle.dumps(environment.get_state()))
+        other = suite.make(id_, {'random': 9, **options})
+        other.reset()
+        self.advance(other, 4, 2)
+        # The ball is put elsewhere, and a goal drawn, from the stream that was saved.
+        for each in (environment, twin, other):
+            if each is other:
+                each.set_state(state)
+            each.task._due[0] = each.task._count[0] + 2
+            if 'Soccer' in id_:
+                each.task._ball_due[0] = each.task._count[0] + 2
+        goal = environment.task.goal[0].copy()
+        expected, info = self.advance(environment, 1, 5), environment.info
+        self.assertTrue((environment.task.goal[0] != goal).any())
+        for each in (twin, other):
+            np.testing.assert_array_equal(self.advance(each, 1, 5), expected)
+            self.assertEqual(each.info, info)
+            each.reset()
+        environment.reset()
+        again = self.advance(environment, 2, 3)
+        np.testing.assert_array_equal(self.advance(twin, 2, 3), again)
+        np.testing.assert_array_equal(self.advance(other, 2, 3), again)
+
+    @parameterized.parameters(*OPTIONS)
+    def test_rows_are_single_environments(self, id_, options):
+        limit, n = (16, 3) if options else (3, 3)
+        rows = VectorEnvironment(id_, n, 2, seed=3, step_limit=limit, task_kwargs=options)
+        alone = [
+            suite.make(
+                id_, {'random': int(s), 'step_limit': limit, **options}, {'flat_observation': True}
+            )
+            for s in rows.seeds
+        ]
+        first = [one.reset().observation['observations'] for one in alone]
+        np.testing.assert_array_equal(rows.reset(), first)
+        rng, ends = np.random.default_rng(0), 0
+        for _ in range(2 * limit + 3):
+            action = 0.6 * rng.uniform(-1, 1, (n, len(rows.action_map)))
+            step = rows.step(action)
+            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
+            np.testing.assert_array_equal(
+                step.observation, [one.observation['observations'] for one in steps]
+            )
+            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
+            ends += sum(one.last() for one in steps)
+            for name, values in step.info.items():
+                if name != 'reward_terms':
+                    np.testing.assert_array_equal(values, [one.info[name] for one in alone], name)
+        self.assertGreaterEqual(ends, n)
+
+    def test_a_frame_in_the_middle_of_a_footstep(self):
+        environment, _ = started(BLOCKS, interface='frame')
+        for _ in range(7):
+            environment.step(np.zeros(22))
+        twin = pickle.loads(pickle.dumps(environment))
+        np.testing.assert_array_equal(twin.task.lay(np.zeros((1, 22))),
+                                      environment.task.lay(np.zeros((1, 22))))  # fmt: skip
+        np.testing.assert_array_equal(self.advance(twin, 0, 20), self.advance(environment, 0, 20))
+
+
+class PictureTest(parameterized.TestCase):
+    """What is pointed out, and videos."""
+
+    def test_markers(self):
+        environment, _ = started(FOREST)
+        environment.step(AHEAD)
+        task = environment.task
+        *plan, flag = task.markers(0)
+        self.assertEqual([marker.shape for marker in plan], ['box', 'box', 'arrow'])
+        for marker, place in zip(plan[:2], task.landing[0], strict=True):
+            self.assertLess(np.hypot(*(marker.position - place)[:2]), 0.06)
+            self.assertAlmostEqual(marker.yaw, task.heading[0])
+        self.assertEqual(flag.shape, 'cylinder')
+        radius, half_height = flag.size[:2]
+        # It stands on the ground at the goal.
+        np.testing.assert_allclose(flag.position, task.goal[0] + (0, 0, half_height))
+        self.assertGreater(half_height, radius)
+
+    def test_the_goal_of_a_ball_is_a_disc(self):
+        environment, _ = started(SOCCER)
+        *plan, disc = environment.task.markers(0)
+        self.assertEqual([marker.shape for marker in plan], ['box', 'box', 'arrow'])
+        self.assertEqual((disc.shape, disc.size[0]), ('cylinder', 0.5))
+        self.assertLess(disc.size[1], 0.02)
+        np.testing.assert_array_equal(disc.position, environment.task.goal[0])
+
+    @parameterized.parameters(('plan', 2, 27), ('frame', 3, 3))
+    def test_thirty_pictures_a_second(self, interface, steps, count):
+        environment, _ = started(SOCCER, start_phases=(0.1,), interface=interface)
+        size = len(environment.action_map)
+        images = list(
+            rendering.frames(environment, lambda _: np.zeros(size), steps, height=60, width=80)
+        )
+        self.assertLen(images, 1 + count)
+        self.assertIsNone(environment.task.watch)
+        self.assertTrue((images[0] != images[-1]).any())
+
+    def test_no_ghost(self):
+        environment, _ = started(FOREST)
+        with self.assertRaisesRegex(ValueError, 'HighLevel task has no reference clip'):
+            rendering.frame(environment, 60, 80, ghost=True)
+
+
+class OptionTest(parameterized.TestCase):
+    """What is refused."""
+
+    @parameterized.parameters(
+        ({'interface': 'plans'}, "unknown interface 'plans'; did you mean 'plan'"),
+        ({'sight': 'heigth'}, "unknown sight 'heigth'; did you mean 'height'"),
+        ({'sight': ('height', 'colour')}, "unknown sight 'colour'"),
+        ({'target_speed': 0}, 'target_speed is 0'), ({'target_speed': np.nan}, 'target_speed is nan'),
+        ({'goal_reached': -1}, 'goal_reached is -1'), ({'goal_reached': np.inf}, 'goal_reached is'),
+        ({'start_phases': ()}, 'start_phases is'), ({'start_phases': (0.1, 1.0)}, 'start_phases is'),
+        ({'start_phases': (-0.1,)}, 'start_phases is'), ({'substeps': 5}, 'substeps is 5'),
+        ({'controller': 'PD_Biped3D_LLC_Genral_Step-v0'}, 'did you mean'),
+        ({'start_phase': 0.1}, "unknown option.*'start_phases'"),
+    )  # fmt: skip
+    def test_options_out_of_range(self, options, message):
+        for id_ in (FOREST, SOCCER):
+            with self.assertRaisesRegex(ValueError, message):
+                suite.make(id_, options)
+
+    def test_substeps(self):
+        environment, _ = started(PLANE, substeps=20)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 600)
+        before = environment.physics.data.time
+        environment.step(AHEAD)
+        self.assertAlmostEqual(environment.physics.data.time - before, 0.5, delta=1e-9)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,117 @@
+"""Hand-written policies for the high-level tasks: a baseline, and an example of what a plan is.
+
+They step towards the goal, turn by little at a time, and go around what the map shows; towards a
+ball they go in such a way that it is between them and the goal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from trl_suite.tasks.footsteps import SIDE
+from trl_suite.tasks.high_level import PLAN_NAMES, HighLevel
+from trl_suite.tasks.soccer import Soccer
+from trl_suite.terrain.surroundings import AHEAD, ASIDE, SAMPLES
+
+LENGTH, SHORT = 0.5, 0.3  # m; of a step, and of one near the goal
+ANKLE = 0.12  # m; how far behind the root's middle the standing ankle is left at a switch
+WIDTH = 0.15  # m; between the feet
+TURN = 0.4  # rad; the most that a plan turns
+NEAR = 1.0  # m; where steps become short
+CANDIDATES = np.linspace(-1.4, 1.4, 29)  # rad; ways that are looked along
+LOOK = np.arange(0.4, 3.0, 0.3)  # m; how far
+CLEARANCE = 0.45  # m; to both sides of a way
+STEP_HEIGHT = 0.15  # m; what is taken for level
+MOVING = 0.1  # m/s; what is taken for standing
+BEHIND_BALL, ALIGNED = 0.7, 0.5  # m, rad
+
+
+def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """Makes a policy for a high-level task.
+
+    Args:
+      environments: a `VectorEnvironment`, or an `Environment`.
+
+    Returns:
+      A function from observations, (n, k) with all blocks side by side, to actions (n, 5).
+
+    Raises:
+      ValueError: another task.
+    """
+    task = environments.task
+    if not isinstance(task, HighLevel) or task.interface != 'plan':
+        raise ValueError(
+            f'a {type(task).__name__} task has no scripted policy; high-level tasks with the '
+            "interface 'plan' have"
+        )
+    blocks = environments.blocks
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        parts = {name: observation[:, part] for name, part in blocks.items()}
+        bearing, distance = towards_ball(parts) if isinstance(task, Soccer) else parts['target'].T
+        way = free_way(parts, bearing, distance)
+        plan = steps(way, distance, task.stance)
+        return np.clip(task.action_map.action(plan), -1, 1)
+
+    return policy
+
+
+def towards_ball(parts: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Bearing and distance of the place from which a ball is best walked into."""
+    ball = parts['ball'][:, 1, None] * direction(parts['ball'][:, 0])
+    shot = direction(parts['target'][:, 0])
+    off = np.abs(np.arctan2(*_cross_dot(ball, shot)))
+    aim = np.where((off < ALIGNED)[:, None], ball + 0.3 * shot, ball - BEHIND_BALL * shot)
+    return np.arctan2(aim[:, 1], aim[:, 0]), np.sqrt((aim**2).sum(1))
+
+
+def _cross_dot(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(1)
+
+
+def direction(angle: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 2) of angles (n,)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def free_way(parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """The bearing nearest to that of the goal on which the maps show nothing, (n,) rad."""
+    n = len(bearing)
+    blocked = np.zeros((n, SAMPLES, SAMPLES), bool)  # lines from the left, along them ahead
+    if 'terrain' in parts:
+        blocked |= np.abs(parts['terrain'].reshape(n, SAMPLES, SAMPLES)) > STEP_HEIGHT
+    if 'surface' in parts:
+        moving = np.abs(parts['surface'].reshape(n, 2, SAMPLES, SAMPLES)).max(1)
+        blocked |= moving > MOVING
+    if not blocked.any():
+        return bearing
+    ways = np.clip(CANDIDATES[None] + np.clip(bearing, -1.4, 1.4)[:, None], -np.pi, np.pi)
+    along, cost = LOOK, np.zeros(ways.shape)
+    for aside in (-CLEARANCE, 0.0, CLEARANCE):
+        x = along * np.cos(ways)[..., None] - aside * np.sin(ways)[..., None]
+        y = along * np.sin(ways)[..., None] + aside * np.cos(ways)[..., None]
+        column = np.round((x - AHEAD[0]) / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)).astype(int)
+        line = np.round((ASIDE - y) / (2 * ASIDE) * (SAMPLES - 1)).astype(int)
+        column, line = np.clip(column, 0, SAMPLES - 1), np.clip(line, 0, SAMPLES - 1)
+        hit = blocked[np.arange(n)[:, None, None], line, column]
+        hit &= along < np.maximum(distance, along[0])[:, None, None]
+        first = np.where(hit.any(2), along[hit.argmax(2)], np.inf)
+        cost += 1.0 / first
+    cost += 0.15 * np.abs(ways - bearing[:, None])
+    return ways[np.arange(n), cost.argmin(1)]
+
+
+def steps(way: np.ndarray, distance: np.ndarray, stance: np.ndarray) -> np.ndarray:
+    """Plans (n, 5) in physical units that walk along a bearing (n,)."""
+    turn = np.clip(way, -TURN, TURN)
+    length = np.where((distance < NEAR) | (np.abs(way) > 2 * TURN), SHORT, LENGTH)
+    side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
+    forward, left = direction(turn), direction(turn + np.pi / 2)
+    first = (length - ANKLE)[:, None] * forward + side[:, None] * left
+    second = (2 * length - ANKLE)[:, None] * forward - side[:, None] * left
+    plan = np.zeros((len(way), len(PLAN_NAMES)))
+    plan[:, :2], plan[:, 2:4], plan[:, 4] = first, second, turn
+    return plan
