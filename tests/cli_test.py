@@ -756,12 +756,12 @@ class ReadmeTest(CommandTest):
 
     def test_commands_run(self):
         commands = re.findall(r'^(?:.* && \S*/)?trl-suite (.*)$', self.text, re.MULTILINE)
-        self.assertLen(commands, 5)
+        self.assertLen(commands, 6)
         for command in commands:
             with self.subTest(command):
                 pictures = SIZE if command.startswith('rollout') else ()
                 self.output(*command.split(), *pictures)
-        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png')
+        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4')
 
 
 if __name__ == '__main__':

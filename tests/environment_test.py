@@ -167,7 +167,8 @@ class EveryRowTest(parameterized.TestCase):
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_random_rollout(self, id_):
-        self.wander(id_, *((6, 4) if is_gait(id_) else (16,) if is_high(id_) else (200,)))
+        # A walker that is told nonsense may well stay up: its episode is cut.
+        self.wander(id_, *((6, 4) if is_gait(id_) else (16, 12) if is_high(id_) else (200,)))
 
     @parameterized.parameters(*suite.ALL_IDS)
     @pytest.mark.slow
@@ -186,7 +187,7 @@ class EveryRowTest(parameterized.TestCase):
         self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
         self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
         last = np.array([each is dm_env.StepType.LAST for each in types])
-        self.assertTrue(last.any())  # random actions fall
+        self.assertTrue(last.any())  # random actions fall, or the episode is cut
         np.testing.assert_array_equal(rewards[discounts == 0], 0)
         np.testing.assert_array_equal(last[discounts == 0], True)
 
