@@ -37,6 +37,7 @@ from trl_suite.vector import VectorEnvironment
 EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
 OBSERVATION_CLIP = 10.0  # in standard deviations
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
+START_COUNT = 2e4  # observations that the scales of a policy one begins with count as
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +75,10 @@ class Settings:
     # Lessons: from which share of the samples on, with which options of the task. Evaluations have
     # those of the environment.
     lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
+    # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
+    # weights, its scales and its noise. What it did not observe begins without influence.
+    start: str = ''
+    value_first: float = 2e4  # control steps in which such a run learns only the value
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
 
@@ -106,21 +111,37 @@ CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulat
     'value_goes_on': True, 'gamma': 0.9, 'initial_std': 0.1, 'towards_sets': 3.0,
     'least_share': {}, 'evaluate_every': 5e3, 'evaluation_episodes': 32,
 }  # fmt: skip
+WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0'}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
+    ('*_Biped2D_*Flat-v0', {'samples': 0.5e6}),
     ('*_Run_*', {'samples': 1e6, **RUNS}),
     ('*_Raptor2D_*', RUNS),
     ('*_Dog2D_*', {'samples': 1.6e6, **RUNS}),
-    ('PD_Dog2D_*Flat*', {'samples': 1.2e6}),
-    ('PD_Dog2D_*_Terrain-v0', {'samples': 1e6}),
+    ('PD_Dog2D_LLC_*', {'samples': 1.2e6}),
+    ('PD_Dog2D_Flat-v0', {'samples': 0.8e6}),
     ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
+    # From flat ground to all others.
+    ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0'}),
+    *(
+        row
+        for name in ('Dog2D', 'Raptor2D')
+        for row in (
+            (f'PD_{name}_*_Terrain-v0', {'samples': 0.8e6, 'start': f'PD_{name}_Flat_Terrain-v0'}),
+            (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
+        )
+    ),
+    *(
+        (f'PD_{name}_Slopes_Mixed_Terrain-v0', {'start': f'PD_{name}_Slopes_Terrain-v0'})
+        for name in ('Biped2D', 'Dog2D', 'Raptor2D')
+    ),
     # In three dimensions the planar noise fells the body before it has learnt anything.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
-    ('PD_Biped3D_Imitate-*_Terrain-v0', {'samples': 1.5e6, 'view': (2.5, 1.0)}),
-    *((f'PD_Biped3D_Imitate-{name}-v0', {'samples': 1.5e6}) for name in ROUGH),
+    *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
+    ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'view': (2.5, 1.0)}),
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
@@ -255,6 +276,8 @@ class Trainer:
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
+        if s.start:
+            self.begin_with(policies.reference(s.start))
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
@@ -282,6 +305,43 @@ class Trainer:
         self.observation = self.environments.reset()
         self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
         self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
+
+    def begin_with(self, other: policies.Policy) -> None:
+        """Takes over weights, scales and noise of a policy, block by block of the observation."""
+        acts, scales = self.environments.action_map, self.scales
+        same = (other.actions, other.quantity) == (tuple(acts.names), acts.quantity)
+        if not same or self.mixture is not None:
+            raise ValueError(f'{self.row.id} does not act as {other.id} does')
+        hidden = tuple(len(bias) for bias in other.biases[:-1])
+        if hidden != self.settings.hidden:
+            raise ValueError(f'hidden: {self.settings.hidden}, but {other.id} has {hidden}')
+        column = np.full(len(scales.mean), -1)  # of the other's observation
+        offset = 0
+        for name, size in other.blocks:
+            part = self.environments.blocks.get(name, slice(0))
+            if part.stop - (part.start or 0) == size:
+                column[part] = offset + np.arange(size)
+            offset += size
+        seen = np.arange(offset) if other.columns is None else other.columns
+        entry = np.full(offset + 1, -1)  # of the other's network; the last one is for -1
+        entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
+        entry = entry[column]
+        known = entry >= 0
+        scales.count = START_COUNT
+        scales.mean[known] = other.mean[entry[known]]
+        scales.square[:] = LEAST_STD**2
+        scales.square[known] = other.std[entry[known]] ** 2 + scales.mean[known] ** 2
+        if scales.columns is not None:
+            entry = entry[scales.columns]
+        first = np.where((entry >= 0)[:, None], other.weights[0][entry], 0.0)
+        layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
+        with torch.no_grad():
+            for layer, weight, bias in zip(
+                layers, (first, *other.weights[1:]), other.biases, strict=True
+            ):
+                layer.weight.copy_(torch.from_numpy(weight.T.copy()))
+                layer.bias.copy_(torch.from_numpy(bias.copy()))
+            self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
 
     def collect(self) -> dict[str, torch.Tensor]:
         """Steps all rows `horizon` times; returns the samples, flattened."""
@@ -381,7 +441,7 @@ class Trainer:
             group['lr'] = rate
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        divergence = 0.0
+        divergence, waits = 0.0, bool(s.start) and self.samples <= s.value_first
         for _ in range(s.epochs):
             order = torch.from_numpy(self.random.permutation(len(advantage)))
             for part in order.split(s.minibatch):
@@ -405,7 +465,7 @@ class Trainer:
                 value_error = (self.value(b['observation'])[:, 0] - b['target']).square().mean()
                 excess = (self.meant(mean).abs() - 1).clamp(min=0).square().sum(-1).mean()
                 loss = 0.5 * value_error
-                if not far:
+                if not (far or waits):
                     loss = -gain + loss + s.bound_cost * excess
                 self.optimizer.zero_grad()
                 loss.backward()

@@ -5,7 +5,8 @@
     python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
     python examples/train_all.py --only FSM_Goat2D_Terrain_Cliffs-v0
 
-Each run is `examples/ppo.py` on one thread. Stopped runs go on from their checkpoints in RUNS;
+Each run is `examples/ppo.py` on one thread; those that begin with the policy of another environment
+come after it. Stopped runs go on from their checkpoints in RUNS;
 finished ones are evaluated and entered into `trained/ID.json` (settings, learning curve,
 evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
 the same settings is not trained again. Of the rows that gaits drive (FSM_...) five are trained; any
@@ -25,6 +26,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Collection
 from typing import Any
 
@@ -60,7 +62,13 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
         raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
     seeds = {id_: COMPARED_SEEDS if compared(catalogue.BY_ID[id_]) else SEEDS for id_ in ids}
     found = [(id_, seed) for id_ in ids for seed in seeds[id_] if seed in only_seeds]
-    return sorted(found, key=lambda job: job[1])  # sorting is stable
+    return sorted(found, key=lambda job: (job[1], depth(job[0])))  # sorting is stable
+
+
+def depth(id_: str) -> int:
+    """How many environments a policy has learnt in before it comes to this one."""
+    start = ppo.settings_for(id_).start
+    return 1 + depth(start) if start else 0
 
 
 def entries(id_: str) -> list[dict[str, Any]]:
@@ -129,15 +137,27 @@ def main() -> None:
             shutil.rmtree(arguments.runs / id_ / f'seed_{seed}', ignore_errors=True)
         if arguments.again or not entered:
             todo.append((id_, seed))
+    entering = threading.Lock()  # two seeds of one environment
+
+    def work(id_: str, seed: int, before: list[concurrent.futures.Future]) -> dict[str, Any]:
+        concurrent.futures.wait(before)
+        folder = train(id_, seed, arguments.runs)
+        with entering:
+            return enter(id_, seed, folder, arguments.machine)
+
     with (
         concurrent.futures.ThreadPoolExecutor(arguments.jobs) as pool,
         tqdm.tqdm(total=len(todo), unit='run') as bar,
     ):
-        running = {pool.submit(train, *job, arguments.runs): job for job in todo}
+        running: dict[concurrent.futures.Future, tuple[str, int]] = {}
+        for job in todo:  # each waits only for what was submitted earlier
+            start = ppo.settings_for(job[0]).start
+            before = [future for future, (id_, _) in running.items() if id_ == start]
+            running[pool.submit(work, *job, before)] = job
         for done in concurrent.futures.as_completed(running):
             id_, seed = running[done]
             try:
-                run = enter(id_, seed, done.result(), arguments.machine)
+                run = done.result()
             except (subprocess.CalledProcessError, OSError, ValueError) as error:
                 bar.write(f'{id_} seed {seed}: {error}')  # the others go on
             else:

@@ -7,7 +7,7 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import motion, rendering, suite, terrain
 from trl_suite.tasks import rewards
-from trl_suite.tasks.footsteps import Plans, Pushes
+from trl_suite.tasks.plans import Plans, Pushes
 from trl_suite.vector import VectorEnvironment
 
 GENERAL, MIRRORED = 'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'

@@ -61,7 +61,10 @@ class PartsTest(parameterized.TestCase):
         for id_ in catalogue.BY_ID:
             settings = ppo.settings_for(id_)
             cycles = catalogue.BY_ID[id_].rules == 'gait'  # a step is 10 to 20 times longer
-            self.assertGreaterEqual(settings.samples, 5e4 if cycles else 5e5, id_)
+            least = 5e4 if cycles else 2e5 if settings.start else 5e5
+            self.assertGreaterEqual(settings.samples, least, id_)
+            if settings.start:
+                self.assertIn(settings.start, catalogue.BY_ID)
             self.assertEqual(settings.num_envs * settings.horizon % settings.minibatch, 0)
 
     def test_gaits_that_stand_still_are_ended_in_training_only(self):
@@ -78,7 +81,7 @@ class PartsTest(parameterized.TestCase):
         self.assertBetween(steps / 30, 0.2, 0.35)
 
 
-class RunTest(absltest.TestCase):
+class RunTest(parameterized.TestCase):
     def setUp(self):
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
 
@@ -150,6 +153,39 @@ class RunTest(absltest.TestCase):
             np.eye(31, dtype=np.float32) * np.exp(trainer.log_std.detach().numpy())
         )
         np.testing.assert_allclose(np.exp(exported.log_std) ** 2, (noise**2).sum(0), rtol=1e-4)
+
+    @parameterized.parameters(
+        ('PD_Biped2D_Gaps_Terrain-v0',),  # the same observation
+        ('PD_Biped2D_Flat-v0',),  # one without the terrain
+    )
+    def test_a_run_may_begin_with_another_policy(self, id_):
+        start = 'PD_Biped2D_Flat_Terrain-v0'
+        other = policies.reference(start)
+        settings = ppo.Settings(**{**TINY, 'hidden': (256, 256)}, start=start)
+        trainer = ppo.Trainer(id_, 0, settings, 1)
+        flat = ppo.Trainer(start, 0, settings, 1)
+        observation = trainer.observation.copy()
+        blocks, base = trainer.environments.blocks, flat.environments.blocks
+        as_flat = np.zeros((len(observation), other.observation_size))
+        for name in ('pose', 'velocity', 'phase'):
+            as_flat[:, base[name]] = observation[:, blocks[name]]
+        policy = trainer.exported()
+        # Nothing rises on flat ground: what rises here has no influence yet.
+        np.testing.assert_allclose(policy(observation), other(as_flat), atol=1e-4)
+        # At first the value alone is learnt.
+        before = [weight.copy() for weight in policy.weights]
+        trainer.learn(trainer.collect())
+        np.testing.assert_array_equal(trainer.exported().weights[0], before[0])
+        trainer.samples = int(settings.value_first)
+        trainer.learn(trainer.collect())
+        self.assertTrue((trainer.exported().weights[0] != before[0]).any())
+
+    def test_a_policy_that_acts_otherwise_is_no_start(self):
+        settings = ppo.Settings(
+            **{**TINY, 'hidden': (256, 256)}, start='PD_Dog2D_LLC_Imitate_Flat-v0'
+        )
+        with self.assertRaisesRegex(ValueError, 'PD_Biped2D_Flat-v0 does not act as PD_Dog2D'):
+            ppo.Trainer('PD_Biped2D_Flat-v0', 0, settings, 1)
 
     def test_what_goes_on_when_the_policy_has_moved_enough(self):
         for goes_on in (False, True):

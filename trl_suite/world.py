@@ -107,7 +107,7 @@ class World:
         return self._ids(mujoco.mjtObj.mjOBJ_GEOM, names)
 
     def joint_addresses(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the addresses of one-dimensional joints in qpos and in qvel."""
+        """Returns where joints begin in qpos and in qvel."""
         ids = self._ids(mujoco.mjtObj.mjOBJ_JOINT, names)
         # As numpy's own index type: it need not be cast in every step.
         return self._model.jnt_qposadr[ids].astype(int), self._model.jnt_dofadr[ids].astype(int)

@@ -17,6 +17,7 @@ feedback of bipeds; stable PD after Tan, Liu, Turk (2011).
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -34,7 +35,7 @@ GRAVITY = 9.8  # m/s^2
 REGULARISATION = 1e-4  # of the contact forces that carry the weight
 
 
-class Gait:
+class Gait(abc.ABC):
     """One state machine in every simulation of a world.
 
     Attributes:
@@ -111,17 +112,17 @@ class Gait:
     world_joints: tuple[str, ...] = ()  # whose targets are angles in the world
     endings: tuple[str, ...] = ()  # what ends each state, in words
 
+    @abc.abstractmethod
     def enter(self, rows: np.ndarray) -> None:
         """Sets the joint targets of the states that rows are in."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def torques(self, rows: np.ndarray) -> np.ndarray:
         """Returns the torques of the next control step, within limits, (m, J), N m."""
-        raise NotImplementedError
 
     def ends(self, rows: np.ndarray) -> np.ndarray:
-        """Which rows leave their states, (m,) bool."""
-        raise NotImplementedError
+        """Which rows leave their states for the next, (m,) bool; by default none."""
+        return np.zeros(len(rows), bool)
 
     # Common machinery.
 

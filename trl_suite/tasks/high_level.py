@@ -19,8 +19,9 @@ from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import llc
 from trl_suite.motion import Steps, quaternion
+from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import turn
-from trl_suite.tasks.footsteps import GOAL_COLOUR, Footsteps
+from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
 from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
 from trl_suite.terrain import Ground
@@ -35,7 +36,6 @@ PLAN_CENTRE = np.array([0.5, 0.0, 1.0, 0.0, 0.0])
 PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # reward for being on one's feet
-GOAL_REACHED = 1.0  # m
 GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is drawn anew
 HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
 FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples that touch the ground
@@ -280,8 +280,8 @@ class HighLevel(Footsteps):
         self.stance[landed] = stance[switched]
         gap = found.feet[landed, self.stance[landed], :2] - self.landing[landed, 0, :2]
         self.landing_error[landed] = np.hypot(gap[:, 0], gap[:, 1])
-        off = self.heading[landed] - found.heading[landed]
-        self.heading_error[landed] = np.abs(np.arctan2(np.sin(off), np.cos(off)))
+        off = rewards.wrap(self.heading[landed] - found.heading[landed])
+        self.heading_error[landed] = np.abs(off)
         return switched | self.failed[rows] | (self._lasted[rows] >= LONGEST)
 
     def finish_step(self, stepped: np.ndarray | None = None) -> None:
@@ -345,8 +345,7 @@ class HighLevel(Footsteps):
         """Writes what the footstep controller observes."""
         self.figure.write(found, self._observation, self._full)
         self._write_phase()
-        self._off = self.heading - found.heading
-        self._off = np.arctan2(np.sin(self._off), np.cos(self._off))
+        self._off = rewards.wrap(self.heading - found.heading)
         self._write_extras(found)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:

@@ -141,9 +141,9 @@ class Tracking(Task):
         Phases must be in `_start_cycles` afterwards.
         """
 
+    @abc.abstractmethod
     def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns index and sign by which a block of the subclass is reflected."""
-        raise NotImplementedError(name)
 
     def _canonical_extras(self, extras: dict[str, int]) -> dict[str, int]:
         """Returns blocks of the subclass, with their sizes, as mirrored observations have them."""
@@ -215,9 +215,6 @@ class Tracking(Task):
         self._effector_columns = slice(
             columns['effectors'].start - offset, columns['effectors'].stop - offset
         )
-        self._com_columns = slice(
-            columns['com_velocity'].start - offset, columns['com_velocity'].stop - offset
-        )
         return result
 
     def begin_episodes(
@@ -251,29 +248,24 @@ class Tracking(Task):
         if np.vdot(rates, rates) > MAX_JOINT_SPEED**2 or self.world.any_diverged():
             too_fast = np.abs(rates).max(1) > MAX_JOINT_SPEED
             np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
-            # The last finite observation stands for what broke down.
-            kept = self._observation[self.diverged]
-            with np.errstate(invalid='ignore'):
-                found = self.figure.measure()
-                self._step(found, stepped)
-                self._observe(found)
-            self._observation[self.diverged] = kept
-            self._publish()
         else:
             self.diverged[:] = False
+        kept = self._observation[self.diverged]
+        with np.errstate(invalid='ignore' if len(kept) else 'warn'):
             found = self.figure.measure()
-            self._step(found, stepped)
+            self._step(found)
             self._observe(found)
-            self._publish()
+        self._observation[self.diverged] = kept  # the last finite one stands for what broke down
+        self._publish()
         np.logical_or(found.fall.any(1), self.diverged, out=self.failed)
-        self.failed |= self._gone(stepped)
+        self.failed |= self._gone()
         self.reward_terms[self.failed] = 0.0
         np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
-    def _step(self, found: SimpleNamespace, stepped: np.ndarray | None) -> None:
+    def _step(self, found: SimpleNamespace) -> None:
         """What changes between the physics and the observation."""
 
-    def _gone(self, stepped: np.ndarray | None) -> np.ndarray | bool:
+    def _gone(self) -> np.ndarray | bool:
         """Which rows fail by rules of the subclass."""
         return False
 
