@@ -3,6 +3,7 @@
 from setuptools import find_packages, setup
 
 TORCH = 'torch>=2.4,<2.14'
+BVH = 'pybvh>=0.9,<1'
 
 setup(
     name='trl_suite',
@@ -35,6 +36,7 @@ setup(
         'dm-env',
         'numpy>=2.0',
         'lxml',
+        'packaging',
         'tqdm',
         'trimesh',
     ],
@@ -42,6 +44,7 @@ setup(
         'video': ['imageio[ffmpeg]', 'matplotlib'],
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
+        'clips': [BVH],
         'train': [TORCH],
         'tune': ['cma'],
         'test': [
@@ -53,6 +56,7 @@ setup(
             'imageio[ffmpeg]',
             'matplotlib',
             'scipy',
+            BVH,
             TORCH,
         ],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1'],

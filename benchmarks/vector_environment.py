@@ -21,34 +21,15 @@ import json
 import multiprocessing
 import os
 import resource
-import time
 
-import mujoco
-import numpy as np
-
-from trl_suite import suite
-from trl_suite.vector import VectorEnvironment
+from trl_suite import bench
+from trl_suite.bench import actions, rate, raw, warmed
 
 IDS = ('PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0')
 ROWS = (1, 16, 64, 256, 1024)
 THREADS = (1, 2)
 SUBSTEPS = 10
 MEMORY_ROWS = (16, 1024)
-WARM = 40  # steps; most rows have fallen once by then
-
-
-class Stopwatch:
-    """Adds up the time that calls of a function take."""
-
-    def __init__(self, function):
-        self.function, self.seconds, self.items = function, 0.0, 0
-
-    def __call__(self, *arguments, **keywords):
-        begin = time.perf_counter()
-        found = self.function(*arguments, **keywords)
-        self.seconds += time.perf_counter() - begin
-        self.items += len(arguments[0]) if np.ndim(arguments[0] if arguments else 0) else 0
-        return found
 
 
 def resident():
@@ -57,64 +38,16 @@ def resident():
         return int(file.read().split()[1]) * resource.getpagesize()
 
 
-def rate(step, seconds, per_call=1):
-    """Calls `step` for about `seconds`; returns items per second."""
-    step()
-    calls, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
-        step()
-        calls += 1
-    return calls * per_call / (time.perf_counter() - begin)
-
-
-def actions(random, low, high, shape):
-    """A hundred random actions, drawn beforehand and repeated."""
-    return iter(_Cycle(random.uniform(low, high, (100, *shape))))
-
-
-class _Cycle:
-    def __init__(self, items):
-        self.items = items
-
-    def __iter__(self):
-        while True:
-            yield from self.items
-
-
-def warmed(id_, rows, threads):
-    """Our vector environment once its rows are all over their episodes, and random actions."""
-    environments = VectorEnvironment(id_, rows, threads, seed=0)
-    environments.reset()
-    drawn = actions(np.random.default_rng(0), -1, 1, (rows, len(environments.action_map)))
-    for _ in range(WARM):
-        environments.step(next(drawn))
-    return environments, drawn
-
-
 def ours(id_, rows, threads, seconds):
     """Our vector environment: rate, share of physics, reset cost; and the rate of raw Batch.step."""
-    environments, drawn = warmed(id_, rows, threads)
-    physics = environments._world.step = Stopwatch(environments._world.step)
-    begin = environments._begin = Stopwatch(environments._begin)
-    start = time.perf_counter()
-    found = rate(lambda: environments.step(next(drawn)), seconds, rows)
-    total = time.perf_counter() - start
+    found = bench.vector(id_, rows, threads, seconds)
     result = {
-        'control steps per second': round(found),
-        'share of Batch.step': round(physics.seconds / total, 3),
-        'reset, ms per row': round(1e3 * begin.seconds / max(1, begin.items), 3),
-        'share of resets': round(begin.seconds / total, 3),
+        'control steps per second': round(found['control']),
+        'share of Batch.step': round(found['share'], 3),
+        'reset, ms per row': round(found['reset'], 3),
+        'share of resets': round(found['resets'], 3),
     }
-    batch = environments._world.batch  # as it is now, terrains included; nothing is reset any more
-    control = batch.bind('ctrl')
-
-    def step():
-        control[:] = environments.action_map.control(next(drawn))
-        batch.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
-
-    found = rate(step, seconds, rows)
-    environments.close()
-    return result, found
+    return result, found['batch'] / SUBSTEPS
 
 
 def footprint(id_, rows):
@@ -135,38 +68,13 @@ def memory(id_):
     return (sizes[1] - sizes[0]) / (MEMORY_ROWS[1] - MEMORY_ROWS[0])
 
 
-def raw(model, substeps, seconds, state=None):
-    """Raw mj_step of a model under random controls; reset each second of simulated time."""
-    data = mujoco.MjData(model)
-    low, high = model.actuator_ctrlrange.T.copy()
-    limited = model.actuator_ctrllimited.astype(bool)
-    low[~limited], high[~limited] = -1, 1
-    drawn = actions(np.random.default_rng(0), low, high, (model.nu,))
-    calls = 0
-
-    def step():
-        nonlocal calls
-        if calls % 30 == 0:
-            mujoco.mj_resetData(model, data)
-            if state is not None:
-                mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-        calls += 1
-        data.ctrl[:] = next(drawn)
-        mujoco.mj_step(model, data, substeps)
-
-    return rate(step, seconds)
-
-
 def single(id_, seconds):
     """Our single environment, resets included; and raw mj_step of its model from its start."""
-    environment = suite.make(id_, {'random': 0})
-    environment.reset()
-    physics = environment.physics
-    state = physics.get_state(sig=mujoco.mjtState.mjSTATE_INTEGRATION)
-    found = {'raw mj_step': raw(physics.model.ptr, SUBSTEPS, seconds, state)}
-    drawn = actions(np.random.default_rng(0), -1, 1, environment.action_spec().shape)
-    found['single environment'] = rate(lambda: environment.step(next(drawn)), seconds)
-    return found
+    found = bench.single(id_, seconds)
+    return {
+        'raw mj_step': found['mj_step'] / SUBSTEPS,
+        'single environment': found['environment'],
+    }
 
 
 def peers(seconds):
@@ -177,7 +85,7 @@ def peers(seconds):
     for domain, task in (('walker', 'walk'), ('humanoid', 'walk')):
         environment = dm_suite.load(domain, task, task_kwargs={'random': 0})
         spec = environment.action_spec()
-        drawn = actions(np.random.default_rng(0), spec.minimum, spec.maximum, spec.shape)
+        drawn = actions(spec.minimum, spec.maximum, spec.shape)
         environment.reset()
         substeps = round(environment.control_timestep() / environment.physics.timestep())
         reference = raw(environment.physics.model.ptr, substeps, seconds)
@@ -192,7 +100,7 @@ def peers(seconds):
             reference = raw(base.model, base.frame_skip, seconds)
             environment.reset(seed=0)
             space = environment.action_space
-            drawn = actions(np.random.default_rng(0), space.low, space.high, space.shape)
+            drawn = actions(space.low, space.high, space.shape)
 
             def step(environment=environment, drawn=drawn):
                 _, _, terminated, truncated, _ = environment.step(next(drawn))
@@ -204,9 +112,7 @@ def peers(seconds):
                 rows = 16
                 vector = gymnasium.make_vec(id_, num_envs=rows, vectorization_mode=mode)
                 vector.reset(seed=0)
-                drawn_rows = actions(
-                    np.random.default_rng(0), space.low, space.high, (rows, *space.shape)
-                )
+                drawn_rows = actions(space.low, space.high, (rows, *space.shape))
                 speed = rate(lambda v=vector, d=drawn_rows: v.step(next(d)), seconds, rows)
                 found[f'Gymnasium {id_} {mode}, {rows} rows'] = speed / reference
                 vector.close()
@@ -227,7 +133,7 @@ def envpool_humanoid(space, reference, seconds):
         pool = envpool.make_gymnasium('Humanoid-v4', num_envs=rows, num_threads=2)
         pool.reset()
         shape = (rows, *space.shape)
-        drawn = actions(np.random.default_rng(0), space.low, space.high, shape)
+        drawn = actions(space.low, space.high, shape)
         speed = rate(lambda p=pool, d=drawn: p.step(next(d)), seconds, rows)
         found[f'EnvPool Humanoid-v4, {rows} rows, 2 threads'] = speed / reference
     return found

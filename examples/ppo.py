@@ -79,6 +79,7 @@ class Settings:
     # weights, its scales and its noise. What it did not observe begins without influence.
     start: str = ''
     value_first: float = 2e4  # control steps in which such a run learns only the value
+    enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
 
@@ -105,18 +106,40 @@ LESSONS = (
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
 )  # fmt: skip
+# Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
+RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
+RUN_LESSONS = (
+    (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'miss': 0.8}),
+    (0.25, {
+        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
+        'plans': {**RUN_PLANS, 'turn': 0.15},
+    }),
+    (0.5, {
+        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
+        'plans': {
+            **RUN_PLANS, 'length': (0.8, 1.3), 'turn': 0.25, 'from_root': 0.3,
+            'root_length': (0.8, 1.3), 'root_width': (0.08, 0.25), 'root_turn': 0.25,
+        },
+    }),
+)  # fmt: skip
 FOOTSTEPS = {'samples': 6e6, 'gamma': 0.97, 'lessons': LESSONS}
+ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
+STEPS_ON = {  # on other grounds and plans
+    **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+}  # fmt: skip
+RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
     'samples': 6e4, 'horizon': 16, 'epochs': 20, 'minibatch': 128, 'learning_rate': 1e-4,
     'value_goes_on': True, 'gamma': 0.9, 'initial_std': 0.1, 'towards_sets': 3.0,
     'least_share': {}, 'evaluate_every': 5e3, 'evaluation_episodes': 32,
 }  # fmt: skip
-WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0'}
+ENOUGH = {'enough': 0.95}
+WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
     ('*_Biped2D_*Flat-v0', {'samples': 0.5e6}),
-    ('*_Run_*', {'samples': 1e6, **RUNS}),
+    ('*_Run_*', {'samples': 1e6, **RUNS, **ENOUGH}),
     ('*_Raptor2D_*', RUNS),
     ('*_Dog2D_*', {'samples': 1.6e6, **RUNS}),
     ('PD_Dog2D_LLC_*', {'samples': 1.2e6}),
@@ -125,15 +148,19 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
     # From flat ground to all others.
-    ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0'}),
+    ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0', **ENOUGH}),
     *(
         row
         for name in ('Dog2D', 'Raptor2D')
         for row in (
-            (f'PD_{name}_*_Terrain-v0', {'samples': 0.8e6, 'start': f'PD_{name}_Flat_Terrain-v0'}),
+            (
+                f'PD_{name}_*_Terrain-v0',
+                {'samples': 0.6e6, 'start': f'PD_{name}_Flat_Terrain-v0', **ENOUGH},
+            ),
             (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
         )
     ),
+    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'samples': 1e6}),
     *(
         (f'PD_{name}_Slopes_Mixed_Terrain-v0', {'start': f'PD_{name}_Slopes_Terrain-v0'})
         for name in ('Biped2D', 'Dog2D', 'Raptor2D')
@@ -142,10 +169,14 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
     *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
     ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'view': (2.5, 1.0)}),
-    ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS}),
+    ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_Symetric_Step-v0', {'mirrored': False}),  # its observation is
+    ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
+    *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
+    # Its observation is mirrored.
+    ('PD_Biped3D_LLC_Symetric_Step-v0', {'samples': 2e6, 'mirrored': False}),
+    ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, 'samples': 2e6, 'lessons': LESSONS[:2]}),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
 )
@@ -530,6 +561,10 @@ class Trainer:
             self.best = found['fraction']
             policies.save(policy, folder / 'policy.npz')
 
+    def has_learnt(self) -> bool:
+        last = [point['fraction'] for point in self.curve[-2:]]
+        return len(last) == 2 and min(last) >= self.settings.enough
+
     def save(self, folder: pathlib.Path) -> None:
         """Writes checkpoint and curve."""
         state = {name: getattr(self, name) for name in _STATE}
@@ -602,7 +637,7 @@ def train(
         total=total, initial=trainer.samples, unit='sample', disable=None if progress else True
     ) as bar:
         bar.set_description(id_)
-        while trainer.samples < total:
+        while trainer.samples < total and not trainer.has_learnt():
             if trainer.lesson != trainer.current:
                 trainer.environments.close()
                 trainer.begin_lesson()

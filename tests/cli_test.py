@@ -59,8 +59,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '111 environments')
-        self.assertLen(lines, 113)
+        self.assertEqual(lines[-1], '117 environments')
+        self.assertLen(lines, 119)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -69,7 +69,7 @@ class ListTest(CommandTest):
 
     @parameterized.parameters(
         (('--domain', 'imitation'), 27),
-        (('--domain', 'deeploco'), 13),
+        (('--domain', 'deeploco'), 19),
         (('--domain', 'plaid'), 28),
         (('--domain', 'terrainrl'), 43),
         (('--actuation', 'gait'), 43),
@@ -78,11 +78,12 @@ class ListTest(CommandTest):
         (('--actuation', 'muscle'), 4),
         (('--character', 'raptor'), 23),
         (('--terrain', 'gaps_humanoid'), 3),
-        (('--tag', 'original'), 78),
-        (('--tag', 'spatial'), 26),
-        (('--tag', 'hierarchical'), 7),
+        (('--tag', 'original'), 82),
+        (('--tag', 'spatial'), 32),
+        (('--tag', 'hierarchical'), 8),
+        (('--tag', 'flat_control'), 5),
         (('--character', 'biped3d'), 13),
-        (('--terrain', 'plane'), 8),
+        (('--terrain', 'plane'), 9),
         (('--tag', 'original', '--domain', 'terrainrl'), 32),
         (('--tag', 'blind'), 4),
         (('--domain', 'plaid', '--character', 'dog', '--tag', 'original'), 6),

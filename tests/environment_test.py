@@ -70,7 +70,11 @@ def expected_blocks(id_):
     figure = id_.split('_')[1]
     if is_high(id_):
         ground = id_.split('_', 3)[3].removesuffix('-v0')
-        sizes = {'terrain': 1024} if ground in ('LargeBlocks', 'Forest', 'PathFollowing') else {}
+        sizes = (
+            {'terrain': 1024}
+            if ground in ('LargeBlocks', 'Forest', 'PathFollowing', 'PathFollowing_Run')
+            else {}
+        )
         if ground in ('DynamicsObstacles', 'Conveyors', 'Conveyors_Wide'):
             sizes = {'surface': 2048}
         ball = {'ball': 9} if ground == 'Soccer' else {}
@@ -79,6 +83,12 @@ def expected_blocks(id_):
         links = 16 if 'FULL' in id_ else 8
         sizes = {'terrain': 1024} if '_Terrain-' in id_ else {}
         sizes |= {'pose': 7 * links + 1, 'velocity': 6 * links}
+        if '_Hard' in id_:
+            return (
+                sizes | {'phase': 5, 'goal': 2, 'ball': 9}
+                if 'Soccer' in id_
+                else {'terrain': 1024} | sizes | {'phase': 5, 'goal': 2}
+            )
         if '_Imitate' in id_ and 'FULL' not in id_:
             track = 'Track' in id_
             return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}

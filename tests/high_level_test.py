@@ -96,7 +96,7 @@ def moved(task, walker=(0, 0), ball=None, each=None):
         rows = np.arange(world.n) if rows is None else rows
         world.qpos[rows[:, None], pose[:2]] += np.array(walker) / 30
         if ball is not None:
-            world.qpos[rows[:, None], task._ball_qpos[:3]] += np.array(ball) / 30
+            world.qpos[rows[:, None], task.ball.qpos[:3]] += np.array(ball) / 30
         if each is not None:
             each()
         if np.any(walker) or ball is not None or each is not None:
@@ -489,7 +489,7 @@ class BallTest(parameterized.TestCase):
         environment, _ = started(SOCCER)
         rows.reset()
         for task in (environment.task, rows.task):
-            world, qpos, dof = task.world, task._ball_qpos, task._ball_dof
+            world, qpos, dof = task.world, task.ball.qpos, task.ball.dof
             world.qpos[:, qpos[:3]] = 0, 0, 60
             world.qvel[:, dof] = 2, -1, 0, 6, 3, -2
             world.forward(np.arange(world.n))
@@ -554,7 +554,7 @@ class BallTest(parameterized.TestCase):
         rows.reset()
         task = rows.task
         root = task.world.xpos[:, task.figure.kinematics.links[0], :2]
-        ball = task.world.qpos[:, task._ball_qpos]
+        ball = task.world.qpos[:, task.ball.qpos]
         away, shot = ball[:, :2] - root, task.goal[:, :2] - ball[:, :2]
         uniform(np.hypot(*away.T), 0.7, 10)
         uniform(np.hypot(*shot.T), 0, 10)
@@ -562,7 +562,7 @@ class BallTest(parameterized.TestCase):
             uniform(np.arctan2(way[:, 1], way[:, 0]), -np.pi, np.pi)
         np.testing.assert_allclose(ball[:, 2], 0.2)
         np.testing.assert_array_equal(task.goal[:, 2], 0)
-        np.testing.assert_array_equal(task.world.qvel[:, task._ball_dof], 0)
+        np.testing.assert_array_equal(task.world.qvel[:, task.ball.dof], 0)
 
     def test_blocks(self):
         environment, _ = started(SOCCER, controller=idle)
@@ -597,7 +597,7 @@ class BallTest(parameterized.TestCase):
             for i in range(steps):
                 step = rows.step(np.zeros((n, 5)))
                 now += step.info['duration']
-                places = {'ball': task.world.qpos[:, task._ball_qpos[:2]], 'goal': task.goal.copy()}
+                places = {'ball': task.world.qpos[:, task.ball.qpos[:2]], 'goal': task.goal.copy()}
                 for name, place in places.items():
                     if i:
                         for row in np.flatnonzero((place != before[name]).any(1)):
@@ -862,7 +862,15 @@ class ScriptedTest(parameterized.TestCase):
     """The hand-written policy."""
 
     def test_walks_from_goal_to_goal(self):
-        rows = VectorEnvironment(PLANE, 6, 1, seed=0, step_limit=None, autoreset='disabled')
+        rows = VectorEnvironment(
+            PLANE,
+            6,
+            1,
+            seed=0,
+            step_limit=None,
+            autoreset='disabled',
+            task_kwargs={'goal_distance': (3, 5)},
+        )
         policy, observation, rewards = scripted.scripted(rows), rows.reset(), []
         fell = np.zeros(6, bool)
         for _ in range(60):  # half a minute
@@ -872,7 +880,7 @@ class ScriptedTest(parameterized.TestCase):
             observation = rows.reset(step.terminated) if step.terminated.any() else step.observation
         self.assertLessEqual(fell.sum(), 1)
         self.assertGreaterEqual(step.info['goals_reached'][~fell].mean(), 3)
-        self.assertGreater(np.mean(rewards), 0.5)  # standing still earns 0.38
+        self.assertGreater(np.mean(rewards), 0.8)  # standing still earns 0.38
 
     @parameterized.parameters(*IDS)
     def test_on_every_row(self, id_):
@@ -889,29 +897,38 @@ class ScriptedTest(parameterized.TestCase):
     @parameterized.parameters(RIGHT, LEFT)
     def test_plans(self, stance):
         ways = np.array([0.0, 0.3, -0.3, 2.0])
-        plans = scripted.steps(ways, np.full(4, 5.0), np.full(4, stance))
+        room = np.array([np.inf, 1.0, np.inf, np.inf])
+        plans = scripted.steps(ways, np.full(4, 5.0), room, np.full(4, stance), 0.5)
         side = -1 if stance == LEFT else 1  # of the foot that swings
         first, second = plans[:, :2], plans[:, 2:4]
         self.assertAlmostEqual(first[0, 1], side * 0.075)
         self.assertAlmostEqual(second[0, 1], -side * 0.075)
-        self.assertAlmostEqual(second[0, 0] - first[0, 0], 0.5)
-        np.testing.assert_allclose(np.sign(plans[:, 4]), [0, 1, -1, 1])
-        self.assertLess(np.abs(plans[:, 4]).max(), 0.5)
+        lengths = (second - first) @ np.array([1, 0])
+        self.assertAlmostEqual(lengths[0], 1.3 * 0.5)
+        self.assertLess(lengths[1], 0.3)  # something is near
+        np.testing.assert_allclose(plans[:, 4], [0, 0.3, -0.3, 1.2])
 
     def test_goes_around_what_it_sees(self):
         x = np.tile(np.linspace(-1, 10, 32), 32).reshape(32, 32)
         y = np.repeat(np.linspace(5.5, -5.5, 32), 32).reshape(32, 32)
         wall = (x > 1.5) & (x < 2.5) & (y > -0.9) & (y < 3)  # more of it to the left
         parts = {'terrain': np.stack([2.0 * wall.ravel(), np.zeros(1024)])}
-        ways = scripted.free_way(parts, np.zeros(2), np.full(2, 8.0))
+        ways, room = scripted.free_way(parts, np.zeros(2), np.full(2, 8.0))
+        np.testing.assert_array_equal(room, np.inf)
         self.assertLess(ways[0], -0.3)
         self.assertAlmostEqual(ways[1], 0)
         moving = np.stack([0.4 * wall.ravel(), np.zeros(1024)])[None].reshape(1, 2048)
-        found = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
+        found, _ = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
         self.assertLess(found[0], -0.3)
         # What lies behind the goal is in nobody's way.
-        near = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
+        near, room = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
         np.testing.assert_allclose(near, 0)
+        np.testing.assert_array_equal(room, np.inf)
+        # Where there is no way at all, it is told how far one gets.
+        around = (np.hypot(x, y) > 1.7).reshape(1, 1024)
+        everywhere = {'terrain': 2.0 * around}
+        _, room = scripted.free_way(everywhere, np.zeros(1), np.full(1, 8.0))
+        self.assertBetween(room[0], 1.2, 2.1)
 
     def test_gets_behind_the_ball(self):
         ball = np.zeros((2, 9))
@@ -1036,7 +1053,11 @@ class PictureTest(parameterized.TestCase):
         environment.step(AHEAD)
         task = environment.task
         *plan, flag = task.markers(0)
-        self.assertEqual([marker.shape for marker in plan], ['box', 'box', 'arrow'])
+        trace = plan[3:]
+        self.assertEqual([marker.shape for marker in plan[:3]], ['box', 'box', 'arrow'])
+        # Every 5 of the 15 control steps; the last of them now.
+        self.assertEqual([marker.shape for marker in trace], ['sphere'] * 3)
+        np.testing.assert_allclose(trace[-1].position, com_of(environment), atol=1e-6)
         for marker, place in zip(plan[:2], task.landing[0], strict=True):
             self.assertLess(np.hypot(*(marker.position - place)[:2]), 0.06)
             self.assertAlmostEqual(marker.yaw, task.heading[0])
@@ -1053,6 +1074,8 @@ class PictureTest(parameterized.TestCase):
         self.assertEqual((disc.shape, disc.size[0]), ('cylinder', 0.5))
         self.assertLess(disc.size[1], 0.02)
         np.testing.assert_array_equal(disc.position, environment.task.goal[0])
+        small = started(SOCCER, goal_reached=0.3)[0].task.markers(0)[-1]
+        self.assertEqual(small.size[0], 0.3)
 
     @parameterized.parameters(('plan', 2, 27), ('frame', 3, 3))
     def test_thirty_pictures_a_second(self, interface, steps, count):

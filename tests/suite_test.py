@@ -101,6 +101,13 @@ SPATIAL = {
 }
 # Above a controller: id -> terrain, which maps are seen, phases of the start, original.
 _EITHER, _ZERO = (0.1, 0.6), (0.0,)
+HARD = {  # id: terrain
+    'PD_Biped3D_Terrain_Trail_Hard-v0': 'trail3d1',
+    'PD_Biped3D_Terrain_Forest_Hard-v0': 'pillars3d',
+    'PD_Biped3D_Terrain_Blocks_Hard-v0': 'obstacles3d',
+    'PD_Biped3D_Terrain_Dyanmics_Obs_Hard-v0': 'dynamic_obstacles3d',
+    'PD_Biped3D_Terrain_Soccer_Hard-v0': 'plane',
+}
 HIGH_LEVEL = {
     f'PD_Biped3D_HLC_{name}-v0': values
     for name, values in {
@@ -111,6 +118,7 @@ HIGH_LEVEL = {
         'Conveyors': ('conveyor3d', ('velocity',), _ZERO, True),
         'Conveyors_Wide': ('conveyor3d_wide', ('velocity',), _ZERO, True),
         'PathFollowing': ('trail3d1', ('height',), _EITHER, False),
+        'PathFollowing_Run': ('trail3d_wide', ('height',), _ZERO, False),
     }.items()
 }
 
@@ -170,7 +178,8 @@ class CatalogueTest(parameterized.TestCase):
     def test_three_dimensions(self):
         self.assertCountEqual([*ids_of('imitation3d'), *ids_of('footsteps')], SPATIAL)
         self.assertCountEqual(
-            [row.id for row in catalogue.ROWS if 'spatial' in row.tags], [*SPATIAL, *HIGH_LEVEL]
+            [row.id for row in catalogue.ROWS if 'spatial' in row.tags],
+            [*SPATIAL, *HIGH_LEVEL, *HARD],
         )
         for id_, (task, ground, character, clip, original) in SPATIAL.items():
             row = suite.find(id_)
@@ -200,7 +209,6 @@ class CatalogueTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
     def test_high_level(self):
-        self.assertEqual(list(suite.ALL_IDS[-7:]), list(HIGH_LEVEL))
         self.assertCountEqual([*ids_of('hike'), *ids_of('soccer')], HIGH_LEVEL)
         self.assertEqual(ids_of('soccer'), ['PD_Biped3D_HLC_Soccer-v0'])
         for id_, (ground, _, _, original) in HIGH_LEVEL.items():
@@ -208,8 +216,9 @@ class CatalogueTest(parameterized.TestCase):
             self.assertEqual(
                 (row.domain, row.terrain, row.actuation), ('deeploco', ground, 'position')
             )
-            self.assertEqual((row.character, row.clip), ('biped3d_mocap', 'biped3d_mocap'))
-            self.assertEqual(row.step_limit, 400)
+            character = 'biped3d_mocap_run' if id_.endswith('_Run-v0') else 'biped3d_mocap'
+            self.assertEqual((row.character, row.clip), (character, character))
+            self.assertEqual(row.step_limit, 667 if character.endswith('run') else 400)  # 200 s
             self.assertEqual(
                 row.tags, {'spatial', 'hierarchical', 'original' if original else 'completion'}
             )
@@ -224,14 +233,33 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual('surface' in environment.blocks, 'velocity' in sight)
         self.assertEqual('ball' in environment.blocks, 'Soccer' in id_)
         self.assertEqual(task.interface, 'plan')
-        self.assertEqual(environment.step_limit, 400)
-        self.assertAlmostEqual(environment.control_timestep(), 0.5)
+        run = id_.endswith('_Run-v0')
+        self.assertEqual(environment.step_limit, 667 if run else 400)
+        self.assertAlmostEqual(environment.control_timestep(), 0.3 if run else 0.5)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
         found = set()
         for _ in range(8):
             environment.reset()
             found.add(round(float(task.phase[0]), 9))
         self.assertEqual(found, set(phases))
+
+    @parameterized.parameters(*HARD)
+    def test_without_hierarchy(self, id_):
+        row, environment = suite.find(id_), suite.make(id_, {'random': 0})
+        original = 'Soccer' not in id_
+        self.assertEqual(row.domain, 'deeploco')
+        self.assertEqual(
+            row.tags, {'spatial', 'flat_control', 'original' if original else 'completion'}
+        )
+        task = environment.task
+        self.assertEqual(
+            (task.arena.terrain.name, task.character.row.name), (HARD[id_], 'biped3d_mocap')
+        )
+        self.assertEqual('terrain' in environment.blocks, original)
+        self.assertEqual('ball' in environment.blocks, not original)
+        self.assertEqual(environment.step_limit, 256)
+        self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
+        self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
     def test_other_names_of_rows_in_three_dimensions(self):
         for name, id_ in (
@@ -241,6 +269,7 @@ class CatalogueTest(parameterized.TestCase):
             ('imitation/pd_biped3d', 'PD_Biped3D_Imitate-v0'),
             ('PD_Biped3D_HLC_DynamicObstacles-v0', 'PD_Biped3D_HLC_DynamicsObstacles-v0'),
             ('deeploco/hlc_soccer', 'PD_Biped3D_HLC_Soccer-v0'),
+            ('PD_Biped3D_Terrain_Dynamic_Obs_Hard-v0', 'PD_Biped3D_Terrain_Dyanmics_Obs_Hard-v0'),
         ):
             self.assertEqual(suite.find(name).id, id_)
 
@@ -298,8 +327,8 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(
             {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()},
             # Of imitation 14 in the plane and 13 in three dimensions.
-            # Of deeploco 6 of footsteps and 7 above them.
-            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 13},
+            # Of deeploco 6 of footsteps, 8 above them and 5 without them.
+            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 19},
         )
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)

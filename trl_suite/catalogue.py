@@ -274,26 +274,27 @@ _STEPS = (
 )  # fmt: skip
 
 HIKE_LIMIT = 400  # plans after which an episode is cut: 200 s
+RUN_LIMIT = 667  # the same of a run, whose footsteps last 0.3 s
 
 
 def _hike(
-    name: str, preset: str, words: str, *, original: bool = True, rules: str = 'hike',
-    aliases: tuple[str, ...] = (), **options: Any,
+    name: str, preset: str, words: str, *, character: str = 'biped3d_mocap', original: bool = True,
+    rules: str = 'hike', limit: int = HIKE_LIMIT, aliases: tuple[str, ...] = (), **options: Any,
 ) -> Row:  # fmt: skip
     return Row(
         id=f'PD_Biped3D_HLC_{name}-v0',
         domain='deeploco',
         task=f'hlc_{name.lower()}',
-        character='biped3d_mocap',
+        character=character,
         actuation='position',
         terrain=preset,
         rules=rules,
-        clip='biped3d_mocap',
+        clip=character,
         options=MappingProxyType(options),
         description=f'The 3D biped {words}; an action plans its next two footsteps.',
         tags=frozenset({'spatial', 'hierarchical', 'original' if original else 'completion'}),
         aliases=aliases,
-        step_limit=HIKE_LIMIT,
+        step_limit=limit,
     )
 
 
@@ -319,6 +320,47 @@ _HIKES = (
         sight=('velocity',), start_phases=_FROM_ZERO,
     ),
     _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', original=False),
+    _hike(
+        'PathFollowing_Run', 'trail3d_wide', 'runs along a wide trail between hills',
+        character='biped3d_mocap_run', original=False, limit=RUN_LIMIT,
+        controller='PD_Biped3D_LLC_Run_FootStep-v0', start_phases=_FROM_ZERO, step_length=1.0,
+        target_speed=3.0, goal_reached=2.0,
+    ),
+)  # fmt: skip
+
+
+def _hard(
+    name: str, preset: str, words: str, *, original: bool = True, rules: str = 'journey',
+    aliases: tuple[str, ...] = (), **options: Any,
+) -> Row:  # fmt: skip
+    return Row(
+        id=f'PD_Biped3D_Terrain_{name}_Hard-v0',
+        domain='deeploco',
+        task=f'{name.lower()}_hard',
+        character='biped3d_mocap',
+        actuation='position',
+        terrain=preset,
+        rules=rules,
+        clip='biped3d_mocap_walk',
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}, without hierarchy: by PD targets 30 times a second.',
+        tags=frozenset({'spatial', 'flat_control', 'original' if original else 'completion'}),
+        aliases=aliases,
+    )
+
+
+_JOURNEYS = (
+    _hard('Trail', 'trail3d1', 'follows a winding trail between hills'),
+    _hard('Forest', 'pillars3d', 'goes from goal to goal between the pillars of a forest'),
+    _hard('Blocks', 'obstacles3d', 'goes from goal to goal among large blocks'),
+    _hard(
+        'Dyanmics_Obs', 'dynamic_obstacles3d', 'goes from goal to goal among moving boxes',
+        aliases=('PD_Biped3D_Terrain_Dynamic_Obs_Hard-v0',),
+    ),
+    _hard(
+        'Soccer', 'plane', 'dribbles a ball to a goal', original=False, rules='ball_journey',
+        terrain_map=False,
+    ),
 )  # fmt: skip
 
 _BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
@@ -358,6 +400,7 @@ ROWS: tuple[Row, ...] = (
     _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
     *_STEPS,
     *_HIKES,
+    *_JOURNEYS,
 )  # fmt: skip
 
 BY_ID: dict[str, Row] = {row.id: row for row in ROWS}

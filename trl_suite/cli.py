@@ -5,6 +5,10 @@
     trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy clip --video dog.mp4 --ghost
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite terrain slopes_mixed --output slopes.png
+    trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
+    trl-suite doctor
+    trl-suite bench PD_Dog2D_Gaps_Terrain-v0
+    trl-suite gallery --only 'Dog2D*strip'
 
 Bad input ends with one line on stderr and exit status 2. The engine is imported only by the
 commands that need it.
@@ -25,14 +29,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 import trl_suite
-from trl_suite import catalogue, describe, errors, policies, rendering
+from trl_suite import acting, catalogue, describe, errors, files, rendering, terrain
 
 if TYPE_CHECKING:
     import dm_env
 
     from trl_suite.environment import Environment
 
-POLICIES = ('reference', 'clip', 'scripted', 'zero', 'random')  # or a file
 SHOWN_EPISODES = 8  # episodes that a rollout prints one by one
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
 _ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
@@ -47,11 +50,12 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
       prog: name of the program in the help.
 
     Returns:
-      The exit status: 0; 2 after an error, with one line on stderr; 130 after an interrupt.
+      The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
+      error, with one line on stderr; 130 after an interrupt.
     """
     try:
         arguments = _parser(prog).parse_args(argv)
-        arguments.command(arguments)
+        status = arguments.command(arguments) or 0
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
@@ -64,7 +68,7 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     except (ValueError, ImportError, RuntimeError, OSError) as error:
         print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    return 0
+    return status
 
 
 class _Parser(argparse.ArgumentParser):
@@ -79,7 +83,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser.add_argument('--version', action='version', version=f'trl-suite {trl_suite.__version__}')
     commands = parser.add_subparsers(required=True, metavar='command', parser_class=_Parser)
 
-    def add(name: str, function: Callable[[Any], None], text: str) -> argparse.ArgumentParser:
+    def add(name: str, function: Callable[[Any], int | None], text: str) -> argparse.ArgumentParser:
         command = commands.add_parser(
             name, help=text, description=text[0].upper() + text[1:] + '.',
             formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -90,7 +94,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     def add_policy(command: argparse.ArgumentParser, default: str) -> None:
         command.add_argument(
             '--policy', default=default, type=_policy_name, metavar='POLICY',
-            help=f'{", ".join(POLICIES)}, or an .npz file; the reference is the trained one shipped',
+            help=f'{", ".join(acting.POLICIES)}, or an .npz file; the reference is the trained one shipped',
         )  # fmt: skip
 
     command = add('list', _list, 'list the environments of the catalogue')
@@ -121,7 +125,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
     command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
 
-    command = add('terrain', _terrain, 'plot draws of a terrain')
+    command = add('terrain', _terrain, 'plot draws of a terrain, or write one as a mesh')
     command.add_argument(
         'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
     )
@@ -129,7 +133,50 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
     command.add_argument('--seed', type=int, default=0, help='of the draws')
     command.add_argument('--blend', type=float, default=0.0, help='which of the parameter sets')
-    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a .png')
+    command.add_argument(
+        '--output', type=pathlib.Path, metavar='FILE',
+        help='a .png; or a mesh of the first draw, .obj, .glb or .stl',
+    )  # fmt: skip
+
+    command = add('clip', _clip, 'carry a motion file over to a character, and check it')
+    command.add_argument(
+        'file', metavar='FILE', type=pathlib.Path,
+        help='a .bvh, .amc, .json (TerrainRL, DeepMimic) or .npz',
+    )  # fmt: skip
+    command.add_argument('--character', required=True, help='name of a character')
+    command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')
+    command.add_argument(
+        '--map', type=pathlib.Path, metavar='FILE',
+        help="a .json of joints: the character's to the motion's; by usual names",
+    )  # fmt: skip
+    command.add_argument('--scale', type=float, help='of lengths; by the length of limbs')
+    command.add_argument(
+        '--cycle', nargs='*', type=float, metavar='TIME',
+        help='cut one cycle out, from a time to another (s); without times, where it fits best',
+    )  # fmt: skip
+    command.add_argument('--frames', action='store_true', help='print every fault in every frame')
+    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
+    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+
+    add('doctor', _doctor, 'look at the installation; say what is wrong and what to do')
+
+    command = add('bench', _bench, 'measure the speed of this machine against raw MuJoCo')
+    command.add_argument(
+        'id', metavar='ID', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0', help="or 'domain/task'"
+    )
+    command.add_argument('--rows', type=_positive, default=64, help='of the vector environment')
+    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument('--seconds', type=float, default=2.0, help='of each of four measurements')
+    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
+
+    command = add('gallery', _gallery, 'make pictures of all environments and characters')
+    command.add_argument(
+        '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='where to'
+    )
+    command.add_argument(
+        '--only', default='*', metavar='PATTERN', help="part of a name, as 'Dog2D*strip'"
+    )
+    command.add_argument('--again', action='store_true', help='also what is there already')
     return parser
 
 
@@ -141,9 +188,10 @@ def _positive(text: str) -> int:
 
 
 def _policy_name(text: str) -> str:
-    if text not in POLICIES and not text.endswith('.npz'):
-        raise argparse.ArgumentTypeError(errors.unknown('policy', text, (*POLICIES, 'FILE.npz')))
-    return text
+    try:
+        return acting.check(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -200,10 +248,10 @@ def _rollout(arguments: argparse.Namespace) -> None:
         (arguments.trajectory, ('.npz',)),
     ):
         if path is not None:  # before the work rather than after it
-            rendering.check_path(path, suffixes)
+            files.check_path(path, suffixes)
     suite = _suite()
     environment = suite.make(arguments.id, {'random': arguments.seed})
-    policy = _policy(arguments.policy, environment, arguments.id, arguments.seed)
+    policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
     width, height = arguments.size
     in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
     pictures: list[np.ndarray] = []
@@ -232,7 +280,7 @@ def _rollout(arguments: argparse.Namespace) -> None:
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
     if arguments.trajectory is not None:
-        with rendering.replacing(arguments.trajectory) as part:
+        with files.replacing(arguments.trajectory) as part:
             np.savez_compressed(
                 part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
             )
@@ -248,36 +296,6 @@ def _suite() -> Any:
     except (AttributeError, ImportError) as error:
         raise RuntimeError(rendering.no_gl(error)) from error
     return suite
-
-
-def _trained(name: str, id: str) -> policies.Policy:
-    return policies.reference(id) if name == 'reference' else policies.load(name)
-
-
-def _policy(name: str, environment: Environment, id: str, seed: int) -> rendering.Policy:
-    size = len(environment.action_map)
-    if name == 'zero':
-        return lambda time_step: np.zeros(size)
-    if name == 'random':
-        generator = np.random.default_rng(seed)
-        return lambda time_step: generator.uniform(-1, 1, size)
-    if name == 'scripted':
-        from trl_suite.scripted import scripted
-
-        walk = scripted(environment)
-
-        def act(time_step: dm_env.TimeStep) -> np.ndarray:
-            return walk(np.concatenate(list(time_step.observation.values()))[None])[0]
-
-        return act
-    if name != 'clip':
-        trained = _trained(name, id)
-        trained.check(environment)
-        return lambda time_step: trained(time_step.observation)
-    task: Any = environment.task
-    if not hasattr(task, 'clip_action'):
-        raise ValueError(f'{id} has no clip to follow')
-    return lambda time_step: np.clip(task.clip_action(0), -1, 1)
 
 
 def _run(
@@ -368,19 +386,17 @@ class _Record:
 
 def _evaluate(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
-        rendering.check_path(arguments.json, ('.json',))
+        files.check_path(arguments.json, ('.json',))
     row = _suite().find(arguments.id)
     from trl_suite import evaluation
 
     baseline = evaluation.BASELINES.get(arguments.policy)
     result = evaluation.evaluate(
-        row, baseline or _trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
+        row, baseline or acting.trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
         arguments.threads, factory=baseline is not None,
     )  # fmt: skip
     if arguments.json is not None:
-        with rendering.replacing(arguments.json) as part:
-            text = json.dumps({**result, 'policy': arguments.policy}, indent=1, allow_nan=False)
-            part.write_text(f'{text}\n', encoding='utf-8')
+        _write_json({**result, 'policy': arguments.policy}, arguments.json)
     interval = result['return_interval']
     lines = (
         ('policy', arguments.policy),
@@ -408,8 +424,122 @@ def _terrain(arguments: argparse.Namespace) -> None:
     name = pathlib.Path(arguments.terrain)
     known = name.name if name.suffix not in ('.json', '.txt') else name.stem
     output = arguments.output or pathlib.Path(f'terrain_{known}.png')
+    if output.suffix.lower() in terrain.WRITTEN:
+        _terrain_mesh(arguments, output)
+        return
     rendering.plot_terrain(
         arguments.terrain, output, arguments.draws, arguments.length, arguments.seed,
         arguments.blend,
     )  # fmt: skip
     print(output)
+
+
+def _terrain_mesh(arguments: argparse.Namespace, output: pathlib.Path) -> None:
+    source = terrain.load(arguments.terrain)
+    draw = terrain.Ground if source.spatial else terrain.Strip
+    # As the first of the plots.
+    ground = draw(source, np.random.SeedSequence((arguments.seed, 0)), blend=arguments.blend)
+    low, high = (-2.0, arguments.length)
+    if source.spatial:
+        low, high = -0.5 * arguments.length, 0.5 * arguments.length
+    terrain.save_mesh(ground, output, low, high)
+    print(output)
+
+
+# clip
+
+
+def _clip(arguments: argparse.Namespace) -> None:
+    for path, suffixes in (
+        (arguments.output, ('.npz',)),
+        (arguments.strip, rendering.IMAGE_SUFFIXES),
+    ):
+        if path is not None:
+            files.check_path(path, suffixes)
+    if arguments.cycle and len(arguments.cycle) != 2:
+        raise ValueError(f'--cycle: {len(arguments.cycle)} times; expected none or two')
+    _suite()
+    from trl_suite import clip_check, retargeting
+    from trl_suite.mannequin import Mannequin
+
+    chosen = None
+    if arguments.map is not None:
+        chosen = json.loads(files.existing(arguments.map, ('.json',)).read_text(encoding='utf-8'))
+    name = arguments.character
+    motion = retargeting.read(arguments.file, name, arguments.skeleton)
+    clip = retargeting.retarget(motion, name, chosen, arguments.scale)
+    if arguments.cycle is not None:
+        clip = retargeting.cycle(clip, *arguments.cycle)
+    report = clip_check.check(clip, name)
+    print(report)
+    for fault in report.faults if arguments.frames else ():
+        print(
+            f'frame {fault.frame}, {fault.time:.3f} s: {fault.kind}, {fault.name}, '
+            f'{fault.amount:.3g} {fault.unit}'
+        )
+    if arguments.output is not None:
+        clip.save(arguments.output)
+        print(arguments.output)
+    if arguments.strip is not None:
+        image = Mannequin(name).film_strip(clip, height=240, width=320)
+        rendering.film_strip([image], arguments.strip)
+        print(arguments.strip)
+
+
+# doctor
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from trl_suite import doctor
+
+    found = []
+    for finding in doctor.findings():  # some take seconds
+        found.append(finding.state)
+        print('\n'.join(doctor.report([finding])), flush=True)
+    failed = found.count(doctor.FAILED)
+    print(f'\n{failed} thing{"" if failed == 1 else "s"} to mend' if failed else '\nall is well')
+    return int(failed > 0)
+
+
+# bench
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    if arguments.json is not None:
+        files.check_path(arguments.json, ('.json',))
+    _suite()
+    from trl_suite import bench
+
+    result = bench.bench(arguments.id, arguments.rows, arguments.threads, arguments.seconds)
+    if arguments.json is not None:
+        _write_json(result, arguments.json)
+    print(f'{result["id"]}, {result["rows"]} rows, {result["threads"]} threads, random actions')
+    print(f'  on {result["machine"]}')
+    for name, text in (
+        ('control steps', f'{result["control steps per second"]} per second, resets included'),
+        ('physics', f'{result["ratio to Batch.step"]:.2f} of the rate of raw mujoco.batch.Batch.step'),
+        ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
+        ('', f'{result["share of the physics"]:.0%} of the time is physics'),
+        ('reset', f'{result["reset"]:.2f} ms per row'),
+        ('alone', f'{result["single environment"]} control steps per second in a single environment'),
+    ):  # fmt: skip
+        print(f'  {name:<14} {text}')
+
+
+def _write_json(result: dict[str, Any], path: pathlib.Path) -> None:
+    with files.replacing(path) as part:
+        part.write_text(f'{json.dumps(result, indent=1, allow_nan=False)}\n', encoding='utf-8')
+
+
+# gallery
+
+
+def _gallery(arguments: argparse.Namespace) -> int:
+    _suite()
+    from trl_suite import gallery
+
+    written, failed = gallery.make(arguments.output, arguments.only, arguments.again)
+    for path, error in failed.items():
+        print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
+    print(f'{len(written)} pictures written to {arguments.output}, {len(failed)} failed')
+    return int(bool(failed))

@@ -112,10 +112,12 @@ _GAIT_UNITS = {
 }  # fmt: skip
 
 # What differs from the original, as (applies to a row?, sentence); docs/differences.md has reasons.
-_CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS, _HIGH = (
+_CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS, _HIGH, _HARD = (
     lambda row: row.rules == 'imitation', lambda row: row.rules == 'gait',
-    lambda row: row.rules in ('imitation3d', 'footsteps'), lambda row: row.rules == 'imitation3d',
+    lambda row: row.rules in ('imitation3d', 'footsteps', 'journey', 'ball_journey'),
+    lambda row: row.rules == 'imitation3d',
     lambda row: row.rules == 'footsteps', lambda row: row.rules in ('hike', 'soccer'),
+    lambda row: row.rules in ('journey', 'ball_journey'),
 )  # fmt: skip
 _SPACE = lambda row: _SPATIAL(row) or _HIGH(row)  # noqa: E731
 _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
@@ -127,7 +129,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (_GAIT, 'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at which they fall here'),
     (_CLIP3D, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
     (
-        lambda row: _STEPS(row) or _HIGH(row),
+        lambda row: _STEPS(row) or _HIGH(row) or _HARD(row),
         'MuJoCo at 300 Hz instead of Bullet at 1200 Hz; task option substeps',
     ),
     (
@@ -158,9 +160,18 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         'whether a goal is reached or its time over is looked at once a step',
     ),
     (lambda row: row.rules == 'soccer', 'the times of ball and goal are looked at once a step'),
+    (
+        lambda row: row.rules == 'journey',
+        'the reward leads to the goal, and a goal that is reached is drawn anew; that of the original is for '
+        'footsteps that nobody sees, and its goal stays; task option reward',
+    ),
+    (
+        lambda row: row.rules == 'ball_journey',
+        'there is a ball, and half of the reward is for it; the configuration of the original has none',
+    ),
     (_SPACE, 'axes are x forward, y left, z up; the original has y up and z to the right'),
     (
-        lambda row: row.rules in ('imitation', 'imitation3d', 'footsteps'),
+        lambda row: row.rules == 'imitation' or _SPATIAL(row),
         'actions are in [-1, 1] and clipped; the original takes physical units',
     ),
     (
@@ -253,7 +264,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         "the clip is our own, 1.2 m/s; the original's walks at 1.535 m/s",
     ),
     (
-        lambda row: row.rules == 'imitation3d' and row.clip != 'biped3d_walk',
+        lambda row: (row.rules == 'imitation3d' and row.clip != 'biped3d_walk') or _HARD(row),
         "the clip is our own, close to the original's in gait and speed",
     ),
     (
@@ -298,22 +309,24 @@ def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str
     from trl_suite.tasks.gait import GaitTask
     from trl_suite.tasks.high_level import HighLevel
     from trl_suite.tasks.imitation import Imitation
+    from trl_suite.tasks.journey import HiddenSteps, Journey
     from trl_suite.tasks.tracking3d import Tracking
 
     task: Any = environment.task
     gait, spatial = isinstance(task, GaitTask), isinstance(task, Tracking)
-    high = isinstance(task, HighLevel)
+    high, hard = isinstance(task, HighLevel), isinstance(task, Journey | HiddenSteps)
     known = gait or spatial or isinstance(task, Imitation)
     if known:
         yield from _character(environment)
     if gait:
         yield from _gait(task)
     meanings = _gait_blocks(task) if gait else _spatial_blocks(task) if spatial else _BLOCKS
-    if high:
-        meanings = {
-            **_HIGH_BLOCKS,
-            **({'target': _TARGET_OF_BALL} if 'ball' in task.blocks else {}),
-        }
+    if high or hard:
+        meanings = dict(_HIGH_BLOCKS)
+        if 'ball' in task.blocks:
+            meanings['target'] = _TARGET_OF_BALL
+        if hard:
+            meanings['goal'] = meanings['target']
     size = max(part.stop for part in environment.blocks.values())
     axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
     yield (
@@ -515,6 +528,8 @@ def _spatial_parts(task: Any) -> Iterator[tuple[str, str]]:
 
 
 def _spatial_rules(task: Any) -> Iterator[tuple[str, str]]:
+    from trl_suite.tasks import ball, journey
+
     row, motion = task.character.row, task.motion
     steps = hasattr(task, 'plans')
     if steps:
@@ -533,18 +548,42 @@ def _spatial_rules(task: Any) -> Iterator[tuple[str, str]]:
             f'Clip: {motion.name}',
             f'  {motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
         )
+    if isinstance(task, journey.Journey):
+        yield _goal_and_ball() if 'ball' in task.blocks else _goal(task)
+    of_ball = _ball_terms(ball.SPEED, task._goal_reached) if 'ball' in task.blocks else ([], '')
     lines = [
         table(
             ('term', 'weight', 'scale'),
             (
                 (name, weight, scale if name != 'heading' else '')
                 for name, (weight, scale) in task.TERMS.items()
+                if name not in ball.SOCCER_TERMS or not of_ball[0]
             ),
         )
     ]
+    if 'heading' in task.TERMS:
+        aim = 'of the planned heading' if steps else 'of the heading from the way to go'
+        lines.append(_fold(f'heading: weight * ((1 + cos error) / 2)^4, error {aim}'))
+    if 'proximity' in task.TERMS:
+        where = 'ball' if of_ball[0] else 'goal'
+        lines.append(
+            _fold(
+                f'the way to go is that to the {where}: the clip is turned that way; within '
+                f'{journey.NEAR:g} m neither velocity nor heading counts; proximity is of the distance over '
+                f'{journey.NEAR:g} m'
+            )
+        )
+    if of_ball[0]:
+        weights = [weight for name, (weight, _) in task.TERMS.items() if name in ball.SOCCER_TERMS]
+        lines += [
+            table(
+                ('term', 'weight', 'times'),
+                zip(ball.SOCCER_TERMS, weights, of_ball[0], strict=True),
+            ),
+            _fold(of_ball[1]),
+        ]
     if steps:
         lines += [
-            _fold('heading: weight * ((1 + cos error) / 2)^4, error of the planned heading'),
             _fold(
                 'end_effector: in the second half of a step, that of the swing foot is the way to its '
                 'landing place'
@@ -609,6 +648,41 @@ def _high_action(task: Any) -> tuple[str, str]:
     )  # fmt: skip
 
 
+def _goal(task: Any) -> tuple[str, str]:
+    from trl_suite.tasks import high_level
+
+    times = _seconds(high_level.GOAL_LASTS)
+    return 'Goal', _fold(f'drawn anew within {task._goal_reached:g} m of it, or after {times}')
+
+
+def _goal_and_ball() -> tuple[str, str]:
+    from trl_suite.tasks import ball, high_level
+
+    low, high = ball.BALL_AWAY
+    return 'Goal and ball', _fold(
+        f'a ball of {ball.RADIUS:g} m and {ball.MASS:g} kg lies {low:g} to {high:g} m from the walker, the '
+        f'goal up to {ball.GOAL_AWAY[1]:g} m from the ball; both are drawn anew, the ball after '
+        f'{_seconds(ball.BALL_LASTS)}, the goal after {_seconds(high_level.GOAL_LASTS)}'
+    )
+
+
+def _ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
+    """Returns formulas of the terms that are about a ball, and when they are full."""
+    from trl_suite.tasks import ball
+
+    speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
+    formulas = [
+        f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
+        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: from where it was to the ball, m',
+        f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
+        f'exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball to the goal, m',
+    ]
+    return formulas, (
+        f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '
+        'the walker'
+    )
+
+
 def _high_rules(task: Any) -> Iterator[tuple[str, str]]:
     from trl_suite.tasks import high_level, soccer
 
@@ -619,38 +693,15 @@ def _high_rules(task: Any) -> Iterator[tuple[str, str]]:
         ),
     )
     if isinstance(task, soccer.Soccer):
-        yield (
-            'Goal and ball',
-            _fold(
-                f'a ball of {soccer.RADIUS:g} m and {soccer.MASS:g} kg lies {soccer.BALL_AWAY[0]:g} to '
-                f'{soccer.BALL_AWAY[1]:g} m from the walker, the goal up to {soccer.GOAL_AWAY:g} m from the ball; '
-                f'both are drawn anew, the ball after {_seconds(soccer.BALL_LASTS)}, the goal after '
-                f'{_seconds(high_level.GOAL_LASTS)}'
-            ),
-        )
-        speeds = f'exp(-{soccer.SPEED_SHARPNESS:g} min(0, v - {soccer.SPEED:g})^2)'
-        formulas: tuple[str, ...] = (
-            f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
-            f'exp(-{soccer.BALL_SHARPNESS:g} d^2), d: from where it was to the ball, m',
-            f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
-            f'exp(-{soccer.GOAL_SHARPNESS:g} d), d: from the ball to the goal, m',
-        )
-        full = (
-            f'all are full while the ball is within {soccer.AT_GOAL:g} m of the goal and within '
-            f'{soccer.NEAR:g} m of the walker'
-        )
+        yield _goal_and_ball()
+        formulas, full = _ball_terms(task._target_speed, task._goal_reached)
     else:
-        yield (
-            'Goal',
-            _fold(
-                f'drawn anew within {task._goal_reached:g} m of it, or after {_seconds(high_level.GOAL_LASTS)}'
-            ),
-        )
-        formulas = (
+        yield _goal(task)
+        formulas = [
             f'exp(-{high_level.SPEED_SHARPNESS:g} min(0, v - {task._target_speed:g})^2), v: speed of the '
             'centre of mass towards the goal, m/s',
             '1',
-        )
+        ]
         full = f'speed is full where a step begins within {task._goal_reached:g} m of the goal'
     terms = zip(task.TERMS.items(), formulas, strict=True)
     yield (

@@ -10,7 +10,7 @@ print(result['return'], result['return_interval'], result['fraction'])
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ def evaluate(
     environment: str | Row,
     policy: Callable[[Any], Any],
     episodes: int = 50,
-    seed: int = 0,
+    seed: int | Sequence[int] = 0,
     num_threads: int = 0,
     task_kwargs: Mapping[str, Any] | None = None,
     *,
@@ -46,14 +46,15 @@ def evaluate(
       policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and rows whose
         episode has ended go on with another that does not count.
       episodes: how many.
-      seed: of them all.
+      seed: of them all; or a sequence of as many seeds as episodes.
       num_threads: threads that step the physics; 0 takes all cores.
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
       factory: `policy` is not a policy but makes one: `VectorEnvironment` -> policy. So can a
         policy see more than observations; the values of `BASELINES` are such.
 
     Returns:
-      What JSON can hold. Settings: 'id', 'episodes', 'seed', 'step_limit'. Summary: 'return' (mean),
+      What JSON can hold. Settings: 'id', 'episodes', 'seed' (None for a sequence),
+      'step_limit'. Summary: 'return' (mean),
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
       standard errors; None for a single episode), 'fraction' (mean return over the step limit; no
       step has a reward above 1), 'full' (share of episodes that last until the step limit),
@@ -65,9 +66,14 @@ def evaluate(
     """
     if int(episodes) != episodes or episodes < 1:
         raise ValueError(f'episodes is {episodes}; expected a positive integer')
-    if int(seed) != seed or seed < 0:
+    if isinstance(seed, Sequence):
+        seeds = list(map(int, seed))
+        if len(seeds) != episodes:
+            raise ValueError(f'{len(seeds)} seeds for {episodes} episodes')
+    elif int(seed) != seed or seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
-    seeds = np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
+    else:
+        seeds = np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
     chunks = []
     for start in range(0, len(seeds), CHUNK):
         chunk = seeds[start : start + CHUNK]
@@ -93,7 +99,7 @@ def evaluate(
     return {
         'id': row.id,
         'episodes': len(seeds),
-        'seed': int(seed),
+        'seed': None if isinstance(seed, Sequence) else int(seed),
         'step_limit': step_limit,
         'return': mean,
         'return_interval': interval,

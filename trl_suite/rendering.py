@@ -20,7 +20,6 @@ import contextlib
 import importlib
 import operator
 import os
-import pathlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
@@ -30,6 +29,7 @@ import numpy as np
 
 from trl_suite import errors
 from trl_suite import terrain as terrains
+from trl_suite.files import Path, check_path, replacing
 from trl_suite.terrain.surroundings import AHEAD, SAMPLES
 
 if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
@@ -49,8 +49,6 @@ MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
 MAP_POINTS = 400  # at most, along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
-
-Path = str | os.PathLike[str]
 
 
 def frame(
@@ -434,36 +432,6 @@ def height_map(
         with replacing(check_path(path, IMAGE_SUFFIXES)) as file:
             imageio.imwrite(file, image)
     return image
-
-
-def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
-    """Returns a path that can be written, so that nobody waits for a file that cannot be.
-
-    Raises:
-      ValueError: the suffix is none of the given ones.
-      OSError: the folder does not exist, or the path is a folder.
-    """
-    path = pathlib.Path(path)
-    if path.suffix not in suffixes:
-        raise ValueError(
-            f'{path}: unknown suffix {path.suffix!r}; expected {" or ".join(suffixes)}'
-        )
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f'{path}: the folder {str(path.parent)!r} does not exist')
-    if path.is_dir():
-        raise IsADirectoryError(f'{path}: is a folder')
-    return path
-
-
-@contextlib.contextmanager
-def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary path beside `path` that takes its place once all went well."""
-    part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
-    try:
-        yield part
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _image(image: np.ndarray) -> np.ndarray:

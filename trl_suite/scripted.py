@@ -16,10 +16,13 @@ from trl_suite.tasks.high_level import PLAN_NAMES, HighLevel
 from trl_suite.tasks.soccer import Soccer
 from trl_suite.terrain.surroundings import AHEAD, ASIDE, SAMPLES
 
-LENGTH, SHORT = 0.5, 0.3  # m; of a step, and of one near the goal
-ANKLE = 0.12  # m; how far behind the root's middle the standing ankle is left at a switch
+LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
+CAUTIOUS = 0.5  # the same of one with something close ahead
+ROOM = 2.0  # m; what is close
+ANKLE = 0.2  # m; how far ahead of the root's middle the foot stands that has just landed
 WIDTH = 0.15  # m; between the feet
-TURN = 0.4  # rad; the most that a plan turns
+TURN = 1.2  # rad; the most that a plan turns
+SHARP = 0.8  # rad; turns from here on are made with short steps
 NEAR = 1.0  # m; where steps become short
 CANDIDATES = np.linspace(-1.4, 1.4, 29)  # rad; ways that are looked along
 LOOK = np.arange(0.4, 3.0, 0.3)  # m; how far
@@ -52,8 +55,8 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     def policy(observation: np.ndarray) -> np.ndarray:
         parts = {name: observation[:, part] for name, part in blocks.items()}
         bearing, distance = towards_ball(parts) if isinstance(task, Soccer) else parts['target'].T
-        way = free_way(parts, bearing, distance)
-        plan = steps(way, distance, task.stance)
+        way, room = free_way(parts, bearing, distance)
+        plan = steps(way, distance, room, task.stance, task.step_length)
         return np.clip(task.action_map.action(plan), -1, 1)
 
     return policy
@@ -77,8 +80,12 @@ def direction(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def free_way(parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """The bearing nearest to that of the goal on which the maps show nothing, (n,) rad."""
+def free_way(
+    parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The bearing nearest to that of the goal on which the maps show nothing, (n,) rad; or next to
+    nothing: then also how far away that is, (n,) m.
+    """
     n = len(bearing)
     blocked = np.zeros((n, SAMPLES, SAMPLES), bool)  # lines from the left, along them ahead
     if 'terrain' in parts:
@@ -87,9 +94,9 @@ def free_way(parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.nda
         moving = np.abs(parts['surface'].reshape(n, 2, SAMPLES, SAMPLES)).max(1)
         blocked |= moving > MOVING
     if not blocked.any():
-        return bearing
+        return bearing, np.full(n, np.inf)
     ways = np.clip(CANDIDATES[None] + np.clip(bearing, -1.4, 1.4)[:, None], -np.pi, np.pi)
-    along, cost = LOOK, np.zeros(ways.shape)
+    along, cost, room = LOOK, np.zeros(ways.shape), np.full(ways.shape, np.inf)
     for aside in (-CLEARANCE, 0.0, CLEARANCE):
         x = along * np.cos(ways)[..., None] - aside * np.sin(ways)[..., None]
         y = along * np.sin(ways)[..., None] + aside * np.cos(ways)[..., None]
@@ -100,18 +107,23 @@ def free_way(parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.nda
         hit &= along < np.maximum(distance, along[0])[:, None, None]
         first = np.where(hit.any(2), along[hit.argmax(2)], np.inf)
         cost += 1.0 / first
+        room = np.minimum(room, first)
     cost += 0.15 * np.abs(ways - bearing[:, None])
-    return ways[np.arange(n), cost.argmin(1)]
+    best = np.arange(n), cost.argmin(1)
+    return ways[best], room[best]
 
 
-def steps(way: np.ndarray, distance: np.ndarray, stance: np.ndarray) -> np.ndarray:
-    """Plans (n, 5) in physical units that walk along a bearing (n,)."""
+def steps(
+    way: np.ndarray, distance: np.ndarray, room: np.ndarray, stance: np.ndarray, step_length: float
+) -> np.ndarray:
+    """Plans (n, 5) in physical units that walk along a bearing (n,), so far and with so much room."""
     turn = np.clip(way, -TURN, TURN)
-    length = np.where((distance < NEAR) | (np.abs(way) > 2 * TURN), SHORT, LENGTH)
+    short = (distance < NEAR) | (np.abs(way) > SHARP)
+    length = np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH)) * step_length
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)
-    first = (length - ANKLE)[:, None] * forward + side[:, None] * left
-    second = (2 * length - ANKLE)[:, None] * forward - side[:, None] * left
+    first = (ANKLE + length)[:, None] * forward + side[:, None] * left
+    second = (ANKLE + 2 * length)[:, None] * forward - side[:, None] * left
     plan = np.zeros((len(way), len(PLAN_NAMES)))
     plan[:, :2], plan[:, 2:4], plan[:, 4] = first, second, turn
     return plan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -13,13 +14,16 @@ from trl_suite import terrain as terrains
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
+from trl_suite.tasks import composed
 from trl_suite.tasks.footsteps import Footsteps
 from trl_suite.tasks.gait import GaitTask
 from trl_suite.tasks.high_level import HighLevel
 from trl_suite.tasks.imitation import Imitation
 from trl_suite.tasks.imitation3d import SpatialImitation
+from trl_suite.tasks.journey import BallJourney, journey
 from trl_suite.tasks.soccer import Soccer
 from trl_suite.tasks.task import Task
+from trl_suite.tasks.walk import WALK, Walk
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
 ALL_TASKS: tuple[tuple[str, str], ...] = tuple(catalogue.BY_TASK)
@@ -86,6 +90,10 @@ def _footsteps(row: Row, options: dict[str, Any]) -> Task:
 
 def _high_level(cls: type[HighLevel]) -> Callable[[Row, dict[str, Any]], Task]:
     def make(row: Row, options: dict[str, Any]) -> Task:
+        if row.actuation != 'position':
+            raise ValueError(
+                f'{row.task}: a footstep controller drives joints by position, not by {row.actuation}'
+            )
         steps = (
             row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
         )
@@ -94,15 +102,61 @@ def _high_level(cls: type[HighLevel]) -> Callable[[Row, dict[str, Any]], Task]:
     return make
 
 
-_RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], type[Task]]] = {
+def _journey(row: Row, options: dict[str, Any]) -> Task:
+    original = options.get('reward') == 'original'
+    return journey(
+        characters.make(row.character), _spatial(row), _clip(row),
+        motion.load_steps(_character(row.character).name) if original else None,
+        actuation_model=row.actuation, **options,
+    )  # fmt: skip
+
+
+def _ball_journey(row: Row, options: dict[str, Any]) -> Task:
+    return BallJourney(
+        characters.make(row.character), _spatial(row), _clip(row), actuation_model=row.actuation,
+        **options,
+    )  # fmt: skip
+
+
+def _arena(row: Row) -> PlanarTerrain | SpatialTerrain:
+    if _character(row.character).spatial:
+        return _spatial(row)
+    return PlanarTerrain(terrains.load(row.terrain))
+
+
+def _walk(row: Row, options: dict[str, Any]) -> Task:
+    return Walk(
+        characters.make(row.character), _arena(row), actuation_model=row.actuation, **options
+    )
+
+
+def _of_the_user(row: Row, options: dict[str, Any]) -> Task:
+    make: Any = row.rules
+    tracked = {} if row.clip is None else {'clip': _clip(row)}
+    return make(
+        characters.make(row.character), _arena(row), actuation_model=row.actuation, **tracked,
+        **options,
+    )  # fmt: skip
+
+
+# How a row's rules make a task, and what has the task's options as keyword arguments.
+_RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], Callable[..., Task]]] = {
     'imitation': (_imitation, Imitation),
     'gait': (_gait, GaitTask),
     'imitation3d': (_imitation3d, SpatialImitation),
     'footsteps': (_footsteps, Footsteps),
     'hike': (_high_level(HighLevel), HighLevel),
     'soccer': (_high_level(Soccer), Soccer),
+    'journey': (_journey, journey),
+    'ball_journey': (_ball_journey, BallJourney),
+    'walk': (_walk, Walk),
 }
-TASKS = ('imitation', 'footsteps', 'gait')  # as `build` names rules
+# As `build` names rules.
+TASKS = ('imitation', 'footsteps', 'hike', 'soccer', 'journey', 'gait', 'walk')
+_SPATIAL = {  # what is for one kind of character only
+    'footsteps': True, 'hike': True, 'soccer': True, 'journey': True, 'gait': False,
+}  # fmt: skip
+_OF_STEPS = ('footsteps', 'hike', 'soccer')  # tasks whose motion is a library of steps
 _DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
@@ -161,7 +215,7 @@ def build(
     character: str | characters.CharacterRow,
     actuation: str | None = None,
     terrain: Any = None,
-    task: str = 'imitation',
+    task: str | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
@@ -169,30 +223,56 @@ def build(
     """Builds a combination that the catalogue does not name.
 
     Args:
-      character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
-      actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
-        joints by itself and takes none.
-      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
-        dimensions as the character has. By default level ground.
-      task: the rules: 'imitation', 'footsteps' (in three dimensions) or 'gait' (in the plane).
-      clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
-        footsteps the same of a library of steps, `Steps`. By default the character's own. A gait
-        takes none.
+      character, actuation, terrain, task, clip: as for `combine`.
       task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
       environment_kwargs: as for `load`.
 
     Raises:
       ValueError: unknown names, options, or parts that do not fit each other.
     """
-    if task not in TASKS:
-        raise ValueError(errors.unknown('task', task, TASKS))
+    row = combine(character, actuation, terrain, task, clip)
+    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+
+
+def combine(
+    character: str | characters.CharacterRow,
+    actuation: str | None = None,
+    terrain: Any = None,
+    task: str | Callable[..., Task] = 'imitation',
+    clip: str | motion.Clip | motion.Steps | None = None,
+) -> Row:
+    """Returns the row of a combination: what `VectorEnvironment` and Gymnasium take.
+
+    Args:
+      character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
+        joints by itself and takes none.
+      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
+        dimensions as the character has. By default level ground.
+      task: the rules: 'imitation'; in three dimensions 'footsteps', 'hike' or 'soccer' (above a
+        footstep controller) or 'journey' (from goal to goal without one); 'gait' (in the plane), or 'walk', which needs neither clip nor controller. Or
+        a class or function of the user's, called as task(character, arena, actuation_model=...),
+        with clip=... if one is given, and with the task's options by keyword; it returns a `Task`.
+      clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
+        footsteps the same of a library of steps, `Steps`. By default the character's own. A gait
+        or a walk takes none.
+
+    Raises:
+      ValueError: unknown names, or parts that do not fit each other.
+    """
+    own = not isinstance(task, str)
+    title = task if isinstance(task, str) else str(getattr(task, '__name__', 'task'))
+    if own and not callable(task):
+        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
+    if not own and title not in TASKS:
+        raise ValueError(errors.unknown('task', title, TASKS))
     name = character if isinstance(character, str) else character.name
     if isinstance(character, str) and character not in characters.CHARACTERS:
         raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
     spatial = _character(character).spatial
-    if spatial is not (task == 'footsteps') and task != 'imitation':
+    if not own and spatial is not _SPATIAL.get(title, spatial):
         raise ValueError(
-            f'character {name!r} is {_DIMENSIONS[spatial]}; the task {task!r} is for '
+            f'character {name!r} is {_DIMENSIONS[spatial]}; the task {title!r} is for '
             f'{_DIMENSIONS[not spatial]} characters'
         )
     if task == 'gait':
@@ -205,23 +285,24 @@ def build(
         actuation = 'position' if actuation is None else actuation
         if actuation not in actuation_models.ACTUATIONS:
             raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
-        if clip is None:
-            clip = _own_motion(name, task)
+        if task == 'walk' and clip is not None:
+            raise ValueError('a walk tracks nothing: it takes no clip')
+        if clip is None and not own and task != 'walk':
+            clip = _own_motion(name, title)
     if terrain is None:
         terrain = 'plane' if spatial else 'flat'
-    row = Row(
-        id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{task}',
+    return Row(
+        id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{title}',
         domain='custom',
-        task=task,
+        task=title,
         character=character,  # type: ignore[arg-type]
         actuation=actuation,
         terrain=terrain,
-        rules='imitation3d' if task == 'imitation' and spatial else task,
+        rules='imitation3d' if task == 'imitation' and spatial else task,  # type: ignore[arg-type]
         clip=clip,  # type: ignore[arg-type]
-        options=MappingProxyType({}),
+        options=MappingProxyType({'rewards': WALK} if task == 'walk' else {}),
         description='A combination of the user.',
     )
-    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def _character(character: str | characters.CharacterRow) -> characters.CharacterRow:
@@ -230,9 +311,11 @@ def _character(character: str | characters.CharacterRow) -> characters.Character
 
 def _own_motion(name: str, task: str) -> str:
     """Returns the name of a character's own clip, or of its library of steps."""
-    if task == 'imitation':
+    if task not in _OF_STEPS:
         if name not in DEFAULT_CLIPS:
-            raise ValueError(f'character {name!r} has no clip of its own; give clip=')
+            raise ValueError(
+                f"character {name!r} has no clip of its own; give clip=, or task='walk', which needs none"
+            )
         return DEFAULT_CLIPS[name]
     known = motion.steps_names()
     if name not in known:
@@ -264,24 +347,27 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
 
     Args:
       row: a row of the catalogue.
-      options: keyword arguments of the task class that override those of the row.
+      options: keyword arguments of the task class that override those of the row; besides those
+        every task takes `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
 
     Raises:
       ValueError: an unknown option; the message has the closest matches. Or a terrain with other
         dimensions than the character.
     """
-    make_task, cls = _RULES[row.rules]
+    make_task, takes = (_of_the_user, row.rules) if callable(row.rules) else _RULES[row.rules]
     merged = {**row.options, **(options or {})}
     known = [
         name
-        for name, parameter in inspect.signature(cls.__init__).parameters.items()
+        for name, parameter in inspect.signature(takes).parameters.items()
         if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
     ]
+    parts = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     for name in merged:
         if name not in known:
-            raise ValueError(errors.unknown(f'option of {row.id}', name, [*known, 'random']))
+            choices = [*known, *composed.OPTIONS, 'random']
+            raise ValueError(errors.unknown(f'option of {row.id}', name, choices))
     _check_dimensions(row)
-    return make_task(row, merged)
+    return composed.compose(make_task(row, merged), parts)
 
 
 def build_row(
@@ -302,3 +388,9 @@ def build_row(
     environment = Environment(task, **options)
     environment._recipe = (build_row, (row, task_kwargs, environment_kwargs))
     return environment
+
+
+def __getattr__(name: str) -> Any:
+    if name == 'sequences':  # it runs environments, and so imports this module
+        return importlib.import_module('trl_suite.sequences')
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

@@ -249,8 +249,8 @@ def _bound(fields: Sequence[str]) -> tuple[str, ...]:
 def light_model(root: mjcf.RootElement) -> mujoco.MjModel:
     """Compiles a tree without textures and materials: the same physics, a hundredth of the size."""
     spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
-    for geom in spec.geoms:
-        geom.material = ''  # one that is still referred to cannot be deleted
+    for item in (*spec.geoms, *spec.sites, *spec.tendons, *spec.skins):
+        item.material = ''  # one that is still referred to cannot be deleted
     for item in (*spec.materials, *spec.textures):
         spec.delete(item)
     return spec.compile()

@@ -9,12 +9,13 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import boxes, stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.terrain import SPACING, Strip, Terrain
+from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain
 from trl_suite.world import World
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
 PROBES = 6  # draws by which the pool of boxes is sized
+LINE_PROBES = 10  # windows to each side, 240 m, by which it is where ground is a function of x
 SPARE = 1.3  # times the most boxes of any probe
 COARSEST = 0.1  # m; tolerance up to which pieces are merged if the pool should not suffice
 
@@ -185,11 +186,14 @@ class PlanarTerrain(composer.Arena):
 
 def _pool_size(terrain: Terrain) -> int:
     """How many boxes a window of a terrain may take, from a few fixed draws."""
+    generator, windows = GENERATORS.get(terrain.type), range(PROBES)
+    if generator is not None and generator.line is not None:
+        windows = range(-LINE_PROBES, LINE_PROBES)  # it is always the same, and nowhere alike
     most = 0
     for blend in range(max(1, len(terrain.parameter_sets))):
-        for seed in range(PROBES):
-            window = Strip(terrain, seed, blend=blend).window(seed * _WINDOW, _WINDOW)
-            most = max(most, len(boxes.from_profile(seed * _WINDOW, *window).position))
+        for k in windows:
+            window = Strip(terrain, abs(k), blend=blend).window(k * _WINDOW, _WINDOW)
+            most = max(most, len(boxes.from_profile(k * _WINDOW, *window).position))
     return round(SPARE * most) + PROBES
 
 

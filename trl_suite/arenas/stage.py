@@ -29,6 +29,7 @@ def _decorate(root: mjcf.RootElement) -> None:
     getattr(root.visual, 'global').offwidth = 1920
     getattr(root.visual, 'global').offheight = 1080
     root.statistic.extent = 3  # m; of what is looked at, not of the ground: shadows stay sharp
+    root.visual.map.shadowclip = 4  # extents; ground farther off than it is speckled with shadow
     root.visual.map.znear = 0.01
     root.visual.headlight.set_attributes(
         ambient=(0.35, 0.35, 0.35), diffuse=(0.45, 0.45, 0.45), specular=(0.1, 0.1, 0.1)

@@ -10,6 +10,7 @@ from trl_suite.characters.character import (
     body_figures,
     fingerprint,
 )
+from trl_suite.characters.own import from_file
 from trl_suite.characters.rows import CHARACTERS
 
 __all__ = (
@@ -19,6 +20,7 @@ __all__ = (
     'Joint',
     'body_figures',
     'fingerprint',
+    'from_file',
     'make',
 )
 

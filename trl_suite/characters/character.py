@@ -58,6 +58,11 @@ class CharacterRow:
       root_weight: weight of the root in the imitation reward.
       path: MJCF file of a user's own character; by default xml/<name>.xml of the suite.
       spatial: whether its root is free in three dimensions, instead of moving in the x-z plane.
+      xml, assets: MJCF text instead of a file, and its meshes and pictures by name.
+      bodies: names of the links, root first, where they are not 'root' and those of the joints.
+      solids: names of the geoms that can touch the ground; by default one for each link, of its
+        name, unless its default class is group0.
+      notes: what was assumed about the character, for people.
     """
 
     name: str
@@ -69,15 +74,22 @@ class CharacterRow:
     root_weight: float = 1.0
     path: str | None = None
     spatial: bool = False
+    xml: str | None = None
+    assets: Mapping[str, bytes] = dataclasses.field(default_factory=dict, repr=False)
+    bodies: tuple[str, ...] | None = None
+    solids: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def links(self) -> tuple[str, ...]:
         """Names of all links, root first, in the order of every per-link block."""
-        return ('root', *self.joints)
+        return ('root', *self.joints) if self.bodies is None else self.bodies
 
     @property
     def mirror(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of right and left joints."""
+        """Pairs of right and left joints, which are links too; none of a character with `bodies`."""
+        if self.bodies is not None:
+            return ()
         return tuple(
             (name, name.replace('right_', 'left_', 1))
             for name in self.joints
@@ -86,7 +98,7 @@ class CharacterRow:
 
     @functools.cached_property
     def weights(self) -> np.ndarray:
-        """Normalised reward weights of root and joints, shape (number of links,)."""
+        """Normalised reward weights of root and joints, shape (1 + number of joints,)."""
         raw = np.array([self.root_weight, *(joint.weight for joint in self.joints.values())])
         return raw / raw.sum()
 
@@ -100,8 +112,11 @@ class Character(composer.Entity):
 
     def _build(self, row: CharacterRow, name: str | None = None) -> None:  # type: ignore[override]
         self.row = row
-        path = row.path or str(resources.directory('xml') / f'{row.name}.xml')
-        self._mjcf_root = mjcf.from_path(path)
+        if row.xml is not None:
+            self._mjcf_root = mjcf.from_xml_string(row.xml, assets=dict(row.assets))
+        else:
+            path = row.path or str(resources.directory('xml') / f'{row.name}.xml')
+            self._mjcf_root = mjcf.from_path(path)
         if name is not None:
             self._mjcf_root.model = name
 
@@ -133,7 +148,7 @@ class Character(composer.Entity):
 
     @property
     def root_body(self) -> mjcf.Element:
-        return self._mjcf_root.find('body', 'root')
+        return self._find('body', self.row.links[0])
 
     @property
     def bodies(self) -> list[mjcf.Element]:
@@ -151,7 +166,9 @@ class Character(composer.Entity):
 
     @property
     def collision_geoms(self) -> list[mjcf.Element]:
-        """The geoms that can touch the ground, one per link that has any."""
+        """The geoms that can touch the ground; of the suite's own, one per link that has any."""
+        if self.row.solids is not None:
+            return [self._find('geom', name) for name in self.row.solids]
         geoms = [self._find('geom', name) for name in self.row.links]
         return [geom for geom in geoms if geom.dclass.dclass != 'group0']
 
@@ -253,7 +270,7 @@ def fingerprint(row: CharacterRow) -> str:
     Looks do not count, nor does how the MJCF is written.
     """
     model = mjcf.Physics.from_mjcf_model(Character(row).mjcf_model).model
-    solid = model.geom_group == GROUP_COLLISION
+    solid = _solid(row, model)
     figures = [
         model.body_mass, model.body_inertia, model.body_ipos, model.body_pos, model.body_quat,
         model.jnt_type, model.jnt_pos, model.jnt_axis, model.jnt_range, model.jnt_actfrcrange,
@@ -286,8 +303,7 @@ def body_figures(character: Character) -> dict[str, Any]:
         inertia += m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     lowest = min(
         lowest_point(data.geom_xpos[i], data.geom_xmat[i], model.geom_aabb[i, 3:])
-        for i in range(model.ngeom)
-        if model.geom_group[i] == GROUP_COLLISION
+        for i in np.flatnonzero(_solid(character.row, model))
     )
     return {
         'mass': float(mass.sum()),
@@ -295,6 +311,13 @@ def body_figures(character: Character) -> dict[str, Any]:
         'inertia': np.diag(inertia).copy(),
         'standing_height': -float(lowest),
     }
+
+
+def _solid(row: CharacterRow, model: Any) -> np.ndarray:
+    """Which geoms of a character compiled alone make its body, (geoms,) bool."""
+    if row.solids is None:
+        return model.geom_group == GROUP_COLLISION
+    return np.isin([model.id2name(i, 'geom') for i in range(model.ngeom)], row.solids)
 
 
 def lowest_point(position: np.ndarray, matrix: np.ndarray, half_size: np.ndarray) -> float:

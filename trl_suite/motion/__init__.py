@@ -1,5 +1,6 @@
 """Reference motions: clips and step libraries, their sampling, and readers. Pure NumPy."""
 
+from trl_suite.motion.capture import Capture, read_amc, read_bvh
 from trl_suite.motion.clip import Clip, load, names
 from trl_suite.motion.layout import Layout, Mirror
 from trl_suite.motion.readers import (
@@ -17,6 +18,7 @@ from trl_suite.motion.steps import names as steps_names
 __all__ = [
     'DOG3D',
     'HUMANOID3D',
+    'Capture',
     'Clip',
     'Layout',
     'Mirror',
@@ -24,6 +26,8 @@ __all__ = [
     'load',
     'load_steps',
     'names',
+    'read_amc',
+    'read_bvh',
     'read_deepmimic',
     'read_terrainrl',
     'step_features',

@@ -47,6 +47,33 @@ def rotation_vector(q: np.ndarray) -> np.ndarray:
     return q[..., 1:] * np.where(sine < _SMALL, 2, angle / np.maximum(sine, _SMALL))
 
 
+def from_vector(vector: np.ndarray) -> np.ndarray:
+    """Returns the rotations of rotation vectors: axis times angle, rad, (..., 3) -> (..., 4)."""
+    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
+    # numpy's sinc is sin(pi x) / (pi x).
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
+
+
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the shortest turn of the direction `a` into `b`, both (..., 3), any length."""
+    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    across = np.cross(a, b)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
+    # Opposite directions have no shortest turn; any one across them will do.
+    other = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    flat = sine < _SMALL
+    axis = np.where(flat, other, across)
+    return from_vector(angle * axis / np.linalg.norm(axis, axis=-1, keepdims=True))
+
+
+def angle_about(q: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Returns by how much rotations (..., 4) turn about an axis (3,), rad in (-pi, pi]; (...)."""
+    angle = 2 * np.arctan2(q[..., 1:] @ np.asarray(axis, float), q[..., 0])
+    return np.pi - (np.pi - angle) % (2 * np.pi)
+
+
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Returns vectors (..., 3) after rotations (..., 4); leading axes broadcast."""
     w, axis = q[..., :1], q[..., 1:]

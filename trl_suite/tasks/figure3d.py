@@ -205,8 +205,9 @@ class SpatialFigure:
         geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
         self._bodies = model.geom_bodyid[geoms]
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
+        boxes = model.geom_aabb[geoms, None]  # middle and half sides, in the geoms' frames
         corners = quaternion.rotate(
-            model.geom_quat[geoms, None], signs * model.geom_size[geoms, None]
+            model.geom_quat[geoms, None], boxes[..., :3] + signs * boxes[..., 3:]
         )
         self._corners = model.geom_pos[geoms, None] + corners  # (G, 8, 3), in the links' frames
         self._surface = self.arena.surface_velocity if self.arena.surroundings.moving else None
@@ -305,6 +306,12 @@ def stacked(
             for name, arrays in zip(names, zip(*rows, strict=True), strict=True)
         }
     )
+
+
+def polar(way: np.ndarray, found: SimpleNamespace) -> np.ndarray:
+    """Returns bearing (rad to the left) and length of ways (n, 1, 2) in the heading frame, (n, 2)."""
+    x, y = turn(way, found.cosine, found.sine)[:, 0].T.copy()
+    return np.stack([np.arctan2(y, x), np.sqrt(x * x + y * y)], axis=1)
 
 
 def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:

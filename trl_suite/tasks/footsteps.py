@@ -18,10 +18,7 @@ from trl_suite.motion import Steps, quaternion, step_features
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import turn
 from trl_suite.tasks.plans import (
-    ROOT_LENGTH,
-    ROOT_TURN,
     ROOT_TURN_LIMIT,
-    ROOT_WIDTH,
     Plans,
     Pushes,
     options,
@@ -126,8 +123,12 @@ class Footsteps(Tracking):
         super().__init__(
             character, arena, steps, actuation_model=actuation_model, substeps=substeps,
             centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
-            mirrored=mirrored, blend=blend, phase=True, extras={'contact': 2, 'plan': 13},
+            mirrored=mirrored, blend=blend, phase=True, extras=self._extra_blocks(),
         )  # fmt: skip
+
+    def _extra_blocks(self) -> dict[str, int]:
+        """Blocks, with their sizes, of what is touched and planned."""
+        return {'contact': 2, 'plan': 13}
 
     def _typical_poses(self) -> np.ndarray:
         return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
@@ -274,11 +275,12 @@ class Footsteps(Tracking):
         plans, random = self.plans, self._random[row]
         stance = int(self.stance[row])
         if plans.from_root and random.uniform() < plans.from_root:
-            off = np.clip(random.normal(0, ROOT_TURN), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            off = np.clip(random.normal(0, plans.root_turn), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
             self.heading[row] = found.heading[row] + off
             place = found.feet[row, stance, :2]
             for which, foot in enumerate((1 - stance, stance)):
-                step = random.uniform(*ROOT_LENGTH), SIDE[foot] * random.uniform(*ROOT_WIDTH)
+                ahead = random.uniform(*plans.root_length)
+                step = ahead, SIDE[foot] * random.uniform(*plans.root_width)
                 place = place + quaternion.turned(np.array(step), self.heading[row])
                 self._lay(row, which, place)
             return

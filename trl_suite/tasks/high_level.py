@@ -20,9 +20,10 @@ from trl_suite.characters import Character
 from trl_suite.controllers import llc
 from trl_suite.motion import Steps, quaternion
 from trl_suite.tasks import rewards
-from trl_suite.tasks.figure3d import turn
+from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed
+from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed, drawn_way
+from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
 from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
@@ -30,9 +31,11 @@ from trl_suite.world import World
 
 INTERFACES = ('plan', 'frame')
 SIGHTS = ('height', 'velocity')
-# What action 0 means, and what 1 adds: x and y of both landing places, m; turn of the heading, rad.
+# What action 0 means, in step lengths, and what 1 adds: x and y of both landing places, m; turn of the
+# heading, rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
-PLAN_CENTRE = np.array([0.5, 0.0, 1.0, 0.0, 0.0])
+PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
+STEP_LENGTH = 0.5  # m
 PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # reward for being on one's feet
@@ -61,6 +64,7 @@ class HighLevel(Footsteps):
     """
 
     TERMS = HIKE_TERMS
+    GOAL_REACHED = GOAL_REACHED  # m; by default
 
     watch: Callable[[], None] | None = None  # called at every 1/30 s of the first simulation
 
@@ -73,8 +77,10 @@ class HighLevel(Footsteps):
         controller: Any = llc.DEFAULT,
         interface: str = 'plan',
         sight: Collection[str] = ('height',),
+        step_length: float = STEP_LENGTH,
         target_speed: float = 1.0,
-        goal_reached: float = GOAL_REACHED,
+        goal_reached: float | None = None,
+        goal_distance: tuple[float, float] | None = None,
         start_phases: Sequence[float] = (0.1, 0.6),
         substeps: int = SUBSTEPS,
         blend: float = 0.0,
@@ -89,8 +95,11 @@ class HighLevel(Footsteps):
           interface: 'plan', or 'frame': a step is 1/30 s, and behind the plan, which counts when it
             begins a footstep, an action has that of the footstep controller.
           sight: which maps are observed, of 'height' and 'velocity'.
+          step_length: of the steps that action 0 means, m.
           target_speed: m/s towards the goal from which on the reward is full.
-          goal_reached: m; nearer, a goal is drawn anew.
+          goal_reached: m; nearer, a goal is drawn anew. By default `GOAL_REACHED`.
+          goal_distance: m; the least and the most from the walker, in any direction, at which goals
+            are drawn: for open ground. By default they are where the terrain has them.
           start_phases: of the clock, one of which every episode starts with.
           substeps: physics steps per 1/30 s.
           blend: which mixture of the terrain's parameter sets to draw from.
@@ -104,22 +113,31 @@ class HighLevel(Footsteps):
         for each in sight:
             if each not in SIGHTS:
                 raise ValueError(errors.unknown('sight', each, SIGHTS))
-        for name, value in (('target_speed', target_speed), ('goal_reached', goal_reached)):
+        goal_reached = self.GOAL_REACHED if goal_reached is None else goal_reached
+        for name, value in (
+            ('step_length', step_length), ('target_speed', target_speed),
+            ('goal_reached', goal_reached),
+        ):  # fmt: skip
             if not 0 < value < np.inf:
                 raise ValueError(f'{name} is {value}; expected a positive number')
+        if goal_distance is not None and not 0 < goal_distance[0] <= goal_distance[1] < np.inf:
+            raise ValueError(
+                f'goal_distance is {goal_distance}; expected the least and the most, m'
+            )
         if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
             raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
         self._furnish(arena)
         super().__init__(character, arena, steps, substeps=substeps, blend=blend)
         self.controller = llc.load(controller)
         self.controller.check(self)
-        self.interface, self.sight = interface, sight
+        self.interface, self.sight, self.step_length = interface, sight, step_length
         self._target_speed, self._goal_reached = target_speed, goal_reached
+        self._goal_distance = goal_distance
         self._start_phases = tuple(start_phases)
         self._frame = substeps
         self.mirror = None
         low = max(part.stop for part in self._full.values())
-        centre, half_range, names = PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
+        centre, half_range, names = step_length * PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
         if interface == 'frame':
             drive = self._drive
             names = (*names, *drive.names)
@@ -154,6 +172,8 @@ class HighLevel(Footsteps):
         self._down = np.zeros(n)  # running share of samples with a fall link on the ground
         self._due = np.zeros(n, int)  # control step of the episode at which the goal is drawn anew
         self.goals_reached = np.zeros(n, int)  # in the episode
+        self.trace = Trace(n)  # of the centre of mass
+        self._places = self.trace.places
         self._speed = np.zeros(n)  # m/s towards the goal, in the last step
 
     # Episodes.
@@ -175,6 +195,7 @@ class HighLevel(Footsteps):
         self.landed[rows] = False
         self._lasted[rows] = self.goals_reached[rows] = 0
         self._speed[rows] = 0.0
+        self.trace.begin(rows)
         found = self.figure.measure()
         for row in rows.tolist():
             self._begin_goal(row, found)
@@ -189,9 +210,18 @@ class HighLevel(Footsteps):
         self._draw_goal(row, found.root[row, :2])
 
     def _draw_goal(self, row: int, place: np.ndarray) -> None:
-        self.goal[row] = self.arena.goal(row, self._random[row], place)
+        self.goal[row] = self._goal_drawn(row, place)
         lasts = self._random[row].uniform(*GOAL_LASTS)
         self._due[row] = self._count[row] + round(lasts / CONTROL_TIMESTEP)
+
+    def _goal_drawn(self, row: int, place: np.ndarray) -> np.ndarray:
+        """Returns a goal for a walker at a place, (3,) m."""
+        random = self._random[row]
+        if self._goal_distance is None:
+            return self.arena.goal(row, random, place)
+        x, y = place + drawn_way(random, *self._goal_distance)
+        height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([row]))
+        return np.array([x, y, height[0, 0]])
 
     # A step.
 
@@ -225,6 +255,7 @@ class HighLevel(Footsteps):
             self._lasted[going] += 1
             found = self.figure.measure()
             over = self._account(going, found)
+            self.trace.follow(going, self._count[going], found.com[going])
             if self.watch is not None:
                 self.watch()
             going = going[~over] if by_plan else going[:0]
@@ -368,16 +399,15 @@ class HighLevel(Footsteps):
     reference_pose = None  # type: ignore[assignment]  # nothing is tracked
 
     def markers(self, row: int) -> list[Marker]:
-        """The plan, and the goal."""
-        middle = self.goal[row] + (0, 0, FLAG[1])
-        return [*super().markers(row), Marker('cylinder', middle, FLAG, GOAL_COLOUR)]
+        """The plan, the way of the centre of mass, and the goal."""
+        return [*super().markers(row), *self.trace.markers(row), flag(self.goal[row])]
 
     _KEPT = (
         *Footsteps._KEPT, '_lasted', '_from', '_down', '_due', 'goals_reached', '_speed', '_action',
+        '_places',
     )  # fmt: skip
 
 
-def polar(way: np.ndarray, found: SimpleNamespace) -> np.ndarray:
-    """Returns bearing (rad to the left) and length of ways (n, 1, 2) in the heading frame, (n, 2)."""
-    x, y = turn(way, found.cosine, found.sine)[:, 0].T.copy()
-    return np.stack([np.arctan2(y, x), np.sqrt(x * x + y * y)], axis=1)
+def flag(goal: Any) -> Marker:
+    """Returns what stands at a goal (3,), m."""
+    return Marker('cylinder', np.add(goal, (0, 0, FLAG[1])), FLAG, GOAL_COLOUR)

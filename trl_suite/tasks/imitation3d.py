@@ -14,7 +14,7 @@ from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, quaternion
 from trl_suite.tasks import rewards
-from trl_suite.tasks.figure3d import turn
+from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.reference3d import SpatialReference
 from trl_suite.tasks.task import drawn_seed
 from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
@@ -94,12 +94,16 @@ class SpatialImitation(Tracking):
             )
         self.clip, self.period, self._target = clip, clip.duration, target
         links = len(character.row.links)
+        extras = {'target': 1 + 6 * links if target else 0, **self._goal_blocks()}
         super().__init__(
             character, arena, clip, actuation_model=actuation_model, substeps=substeps,
             centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
-            mirrored=mirrored, blend=blend, phase=not target,
-            extras={'target': 1 + 6 * links if target else 0, 'goal': 2},
+            mirrored=mirrored, blend=blend, phase=not target, extras=extras,
         )  # fmt: skip
+
+    def _goal_blocks(self) -> dict[str, int]:
+        """Blocks, with their sizes, that say where to go."""
+        return {'goal': 2}
 
     def _typical_poses(self) -> np.ndarray:
         return self.clip.pose(np.linspace(0, self.period, CYCLE_SAMPLES, endpoint=False))
@@ -132,25 +136,29 @@ class SpatialImitation(Tracking):
         return poses, self.clip.velocity(times), np.zeros((len(rows), 3))
 
     def _compare(self, found: SimpleNamespace) -> None:
-        kinematics = self.figure.kinematics
-        reference = self.reference.features(self.phase)
-        self._reference_now = reference
-        error = kinematics.compare(found.features, reference[:, : found.features.shape[1]])
+        self._reference_now = self.reference.features(self.phase)
+        rewards.imitation(self._errors(found, self._reference_now), out=self.reward_terms)
+
+    def _errors(self, found: SimpleNamespace, reference: np.ndarray) -> np.ndarray:
+        """Returns the squared errors of the terms of imitation, (n, 5)."""
+        error = self.figure.kinematics.compare(
+            found.features, reference[:, : found.features.shape[1]]
+        )
         error *= error
         # Row by row, so that a row's sums do not depend on how many rows there are.
-        errors = np.matmul(error[:, None], self._contributions)[:, 0]
-        rewards.imitation(errors, out=self.reward_terms)
+        return np.matmul(error[:, None], self._contributions)[:, 0]
 
     def _write_extras(self, found: SimpleNamespace) -> None:
         if self._target:
             target = self._observation[:, self._full['target']]
             self._reference_now.take(self._target_columns, 1, target, 'clip')
+        self._write_goal(found)
+
+    def _write_goal(self, found: SimpleNamespace) -> None:
         goal = self._observation[:, self._full['goal']]
         way = np.full((len(goal), 1, 2), GOAL_AHEAD)
         way[:, 0, 1] = self._origin[:, 1] - found.root[:, 1]
-        x, y = turn(way, found.cosine, found.sine)[:, 0].T.copy()
-        goal[:, 0] = np.arctan2(y, x)
-        goal[:, 1] = np.sqrt(x * x + y * y)
+        goal[...] = polar(way, found)
 
     def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         assert name == 'goal', name  # mirrored observations have no target

@@ -10,9 +10,7 @@ import numpy as np
 
 from trl_suite import errors
 
-# Plans made from the root, as a high-level controller makes them.
-ROOT_TURN, ROOT_TURN_LIMIT = 0.3, 0.8  # rad; spread of the turn off the present heading, its end
-ROOT_LENGTH, ROOT_WIDTH = (0.2, 0.7), (0.08, 0.28)  # m
+ROOT_TURN_LIMIT = 0.8  # rad; the most that a plan made from the root turns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,9 +27,10 @@ class Plans:
       change: probability that a step has other length and width than the one before.
       turn: spread of the change of heading from one step to the next, rad.
       sharp: probability of a sharp turn instead, anything between -pi and pi.
-      from_root: probability that a plan is made anew from where the body is and heads, with lengths
-        from 0.2 to 0.7 m, widths from 0.08 to 0.28 m and turns up to 0.8 rad, as a high-level
-        controller makes plans.
+      from_root: probability that a plan is made anew from where the body is and heads, as a
+        high-level controller makes plans.
+      root_length, root_width: of the steps of such a plan, m: least and most.
+      root_turn: spread of its turn off the present heading, rad; cut at 0.8.
     """
 
     length: tuple[float, float] = (0.5, 0.5)
@@ -40,14 +39,18 @@ class Plans:
     turn: float = 0.25
     sharp: float = 0.1
     from_root: float = 0.0
+    root_length: tuple[float, float] = (0.2, 0.7)
+    root_width: tuple[float, float] = (0.08, 0.28)
+    root_turn: float = 0.3
 
     def __post_init__(self) -> None:
-        _check_ranges(self, ('length', 'width'), 'm')
+        _check_ranges(self, ('length', 'width', 'root_length', 'root_width'), 'm')
         for name in ('change', 'sharp', 'from_root'):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f'{name} is {getattr(self, name)}; expected a probability')
-        if not 0 <= self.turn < np.inf:
-            raise ValueError(f'turn is {self.turn}; expected radians, 0 or more')
+        for name in ('turn', 'root_turn'):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f'{name} is {getattr(self, name)}; expected radians, 0 or more')
 
 
 @dataclasses.dataclass(frozen=True)

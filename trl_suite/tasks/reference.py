@@ -81,7 +81,7 @@ class Reference:
             [np.diff(table, axis=0), np.full_like(phase, 1 / SAMPLES), np.zeros_like(quarter)],
             axis=1,
         )
-        joints, bodies = len(links) - 1, 2 * len(links)
+        joints, bodies = len(pose_qpos) - 3, 2 * len(links)
         sizes = {
             'angles': joints + 1, 'rates': joints + 1, 'effectors': 2 * len(effectors),
             'com_velocity': 2, 'height': 1, 'positions': bodies, 'velocities': bodies, 'root_rate': 2, 'extents': 3 * len(geoms), 'phase': 1,
@@ -141,8 +141,7 @@ def link_extents(
     Returns:
       Centres in x, half lengths in x, and lowest points, shape (3, geoms).
     """
-    centre = data.geom_xpos[geoms][:, ::2] - root
-    half = (np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3)) * model.geom_aabb[geoms, None, 3:]).sum(
-        2
-    )
+    frames, boxes = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms, None]
+    centre = (data.geom_xpos[geoms] + (frames * boxes[..., :3]).sum(2))[:, ::2] - root
+    half = (np.abs(frames) * boxes[..., 3:]).sum(2)
     return np.stack([centre[:, 0], half[:, 0], centre[:, 1] - half[:, 2]])

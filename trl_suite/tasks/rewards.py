@@ -25,6 +25,18 @@ STEP_TERMS: dict[str, tuple[float, float]] = {
     'root': (0.1 / 1.05, 10.0),
     'heading': (0.1 / 1.05, 0.0),
 }
+# Imitation on the way to a goal, as the original's scenario with a goal means it: velocity and heading
+# count towards the goal, and `proximity` is of the squared distance over that within which they no
+# longer do.
+JOURNEY_TERMS: dict[str, tuple[float, float]] = {
+    'pose': (0.5 / 1.15, 2.0),
+    'velocity': (0.05 / 1.15, 0.005),
+    'end_effector': (0.15 / 1.15, 40.0),
+    'com': (0.2 / 1.15, 10.0),
+    'root': (0.1 / 1.15, 10.0),
+    'heading': (0.05 / 1.15, 0.0),
+    'proximity': (0.1 / 1.15, 4.0),
+}
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
 _WEIGHTS = np.array([[weight for weight, _ in IMITATION_TERMS.values()]])

@@ -174,6 +174,12 @@ class Task(composer.Task):
         return self._task_observables
 
 
+def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarray:
+    """Draws a way on the ground in any direction, of any length from low to high, (2,) m."""
+    angle = random.uniform(-np.pi, np.pi)
+    return random.uniform(low, high) * np.array([np.cos(angle), np.sin(angle)])
+
+
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
     """Draws the seed of a stream of its own, for what goes on to draw during an episode."""
     return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32))

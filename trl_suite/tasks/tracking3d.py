@@ -91,6 +91,11 @@ class Tracking(Task):
             raise ValueError(
                 f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
             )
+        if mirrored and not row.mirror:
+            raise ValueError(
+                f'character {row.name!r} has no pairs of right and left links; mirrored observations '
+                'need them'
+            )
         if mirrored and not phase:
             raise ValueError('mirrored observations need the phase, which tells left from right')
         self.character, self.arena, self.motion = character, arena, motion
@@ -105,7 +110,7 @@ class Tracking(Task):
         self._drive = self.action_map  # from actions to the actuators
         full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
         self._full = consecutive(full)
-        self._reflection = self._mirror() if phase else None
+        self._reflection = self._mirror() if phase and row.mirror else None
         self.mirrored = mirrored
         # How a policy may reflect what it observes; what is mirrored already has nothing to reflect.
         self.mirror = None if mirrored else self._reflection

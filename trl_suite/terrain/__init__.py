@@ -18,14 +18,19 @@ sorted(terrain.PRESETS3D), sorted(terrain.GENERATORS3D)  # `register3d` adds a t
 around = terrain.Surroundings(1, terrain.capacity(terrain.load('pillars3d')))  # of n characters
 around.begin(0, forest, (x, y))
 around.height_map(np.array([[x, y]]), np.array([heading]))  # (1, 1024), 32 x 32 samples
+
+terrain.from_mesh('canyon.glb')  # also from_image, from_heights, from_function
+terrain.save_mesh(forest, 'forest.obj', low=-20, high=20)
 """
 
 from trl_suite.terrain.generators import GENERATORS, SPACING, Profile, register
 from trl_suite.terrain.ground import Ground
 from trl_suite.terrain.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
+from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
 from trl_suite.terrain.spatial import GENERATORS3D, register3d
 from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.surface import from_function, from_heights, from_image, from_mesh
 from trl_suite.terrain.surroundings import Surroundings, capacity
 
 __all__ = [
@@ -35,6 +40,7 @@ __all__ = [
     'PRESETS',
     'PRESETS3D',
     'SPACING',
+    'WRITTEN',
     'Belts',
     'Boxes',
     'Grid',
@@ -47,7 +53,13 @@ __all__ = [
     'Terrain',
     'boxes',
     'capacity',
+    'from_function',
+    'from_heights',
+    'from_image',
+    'from_mesh',
     'load',
     'register',
     'register3d',
+    'save_mesh',
+    'to_mesh',
 ]

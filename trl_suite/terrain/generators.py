@@ -36,6 +36,7 @@ import numpy as np
 from trl_suite.errors import unknown
 
 SPACING = 0.025  # m between vertices
+STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
 LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
 LONGEST = 1e6  # m; most ground asked for at once
 
@@ -81,6 +82,8 @@ LIMITS = {
     'ObstacleDensity': (0.0, 2.0),
     'ObstacleSpeedLerpPow': (0.0, 100.0),
     'Slope': (-10.0, 10.0),
+    # Of ground that is a function of the place.
+    'StartSpan': (0.0, 1e5),
 }
 
 
@@ -104,10 +107,15 @@ Function = Callable[[Parameters, float, np.random.Generator], Profile]
 
 
 class Generator(NamedTuple):
-    """A terrain type: its function, and its parameters with their defaults."""
+    """A terrain type: its function, and its parameters with their defaults.
+
+    Ground that is the same in every episode has a `line` besides, heights (k,) at x (k,), m; a
+    `Strip` then takes its vertices from there.
+    """
 
     function: Function
     defaults: Mapping[str, float]
+    line: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 _generators: dict[str, Generator] = {}
@@ -174,6 +182,17 @@ def register(
         return function
 
     return add
+
+
+def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Registers planar ground whose heights are a function of x; replaces what has that name."""
+
+    def ahead(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        heights = line(SPACING * np.arange(cells(length) + 1))
+        rises = np.diff(heights)
+        return Profile(heights[1:] - heights[0], np.abs(rises) > STEEP * SPACING)
+
+    _generators[type_name] = Generator(ahead, types.MappingProxyType({'StartSpan': 0.0}), line)
 
 
 def draw(

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.terrain.generators import GENERATORS, LONGEST, SPACING, Profile, cells, draw, flat
+from trl_suite.terrain.generators import (
+    GENERATORS,
+    LONGEST,
+    SPACING,
+    STEEP,
+    Profile,
+    cells,
+    draw,
+    flat,
+)
 from trl_suite.terrain.parameters import Terrain
 
 STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
@@ -33,6 +42,9 @@ class Strip:
     original put the centre elsewhere; then either a feature ends exactly at the centre behind the
     character (centre in (-1, 0]), or one ends at the centre in front of it and the flat ground
     lies 20 m behind (centre > 0).
+
+    Ground that is a function of x (see `from_function`) has neither stretches nor a flat start: its
+    heights are those of the function, from where the seed has put the origin if starts are spread.
 
     Attributes:
       type: the terrain type.
@@ -82,6 +94,13 @@ class Strip:
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
         self._sequence = seed_sequence(seed)
+        self._offset = 0.0  # m; where the origin lies on a line
+        if self._line is not None:
+            self._low = 0
+            span = self.parameters['StartSpan']
+            if span:
+                self._offset = float(np.random.default_rng(self._sequence).uniform(-span, span))
+            self._heights = self._on_line(0, 1)
 
     @functools.cached_property
     def _streams(self) -> tuple[np.random.Generator, np.random.Generator]:
@@ -150,6 +169,7 @@ class Strip:
             'vertical': self._vertical.copy(),
             'right': self._streams[0].bit_generator.state,
             'left': self._streams[1].bit_generator.state,
+            'offset': self._offset,
         }
 
     @classmethod
@@ -167,6 +187,25 @@ class Strip:
         self._low = state['low']
         self._heights, self._vertical = state['heights'].copy(), state['vertical'].copy()
         self._streams = right, left
+        self._offset = state.get('offset', 0.0)
+
+    @property
+    def _line(self) -> Callable[[np.ndarray], np.ndarray] | None:
+        """What the ground is, if it is a function of x."""
+        generator = GENERATORS.get(self.type)
+        return None if generator is None else generator.line
+
+    def _on_line(self, first: int, count: int) -> np.ndarray:
+        """Heights of vertices of a line, (count,) m."""
+        assert self._line is not None
+        x = (first + np.arange(count)) * SPACING + self._offset
+        heights = np.asarray(self._line(x), dtype=float)
+        if heights.shape != x.shape or not np.isfinite(heights).all():
+            raise ValueError(
+                f'the function of terrain {self.type!r} must return finite heights of shape '
+                f'{x.shape}, as its argument has; it returned an array of shape {heights.shape}'
+            )
+        return heights
 
     def _cell(self, x: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the height left of x, the rise over the cell, and where in the cell x lies."""
@@ -187,6 +226,9 @@ class Strip:
         """Draws stretches until the vertices from low to high are there."""
         heights, vertical = [self._heights], [self._vertical]
         end, height = self._low + len(self._heights) - 1, self._heights[-1]
+        if self._line is not None:
+            self._extend_line(min(low, self._low), max(high, end))
+            return
         while end < high:
             profile = self._stretch(end, 0)
             heights.append(height + profile.heights)
@@ -206,6 +248,19 @@ class Strip:
         if len(heights) > 1:
             self._low = start
             self._heights, self._vertical = np.concatenate(heights), np.concatenate(vertical)
+
+    def _extend_line(self, low: int, high: int) -> None:
+        """Takes the vertices from low to high that are missing, and some more, from the line."""
+        end, more = self._low + len(self._heights) - 1, cells(STRETCH)
+        parts = [self._heights]
+        if low < self._low:
+            parts.insert(0, self._on_line(low - more, self._low - low + more))
+            self._low = low - more
+        if high > end:
+            parts.append(self._on_line(end + 1, high - end + more))
+        if len(parts) > 1:
+            self._heights = np.concatenate(parts)
+            self._vertical = np.abs(np.diff(self._heights)) > STEEP * SPACING
 
     def _stretch(self, begin: int, side: int) -> Profile:
         """Draws a stretch that begins at a vertex; if it covers x = 0, after flat ground."""

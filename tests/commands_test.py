@@ -1,0 +1,252 @@
+"""The commands doctor, bench, gallery and clip, and what is behind them."""
+
+import importlib.metadata
+import json
+import pathlib
+from unittest import mock
+
+import cli_test
+import numpy as np
+from absl.testing import absltest, parameterized
+from PIL import Image
+
+from trl_suite import (
+    acting,
+    bench,
+    catalogue,
+    characters,
+    doctor,
+    gallery,
+    machine,
+    motion,
+    policies,
+    suite,
+)
+
+GAPS = cli_test.GAPS
+CommandTest, run = cli_test.CommandTest, cli_test.run
+
+
+class DoctorTest(CommandTest):
+    def test_this_installation_runs(self):
+        """The part that everything else needs: a process of its own steps and draws."""
+        (found,) = doctor.self_test(())
+        self.assertEqual((found.state, found.remedy), (doctor.OK, ''))
+        self.assertRegex(found.text, r'runs: \d+ steps per second, first picture after \d')
+
+    def test_versions(self):
+        needed = ['numpy>=2.0', 'mujoco>=99', 'no-such-thing', 'torch>99; extra == "train"']
+        with mock.patch.object(importlib.metadata, 'requires', return_value=needed):
+            python, *found = doctor.versions()
+        self.assertStartsWith(python.text, 'Python 3')
+        self.assertEqual([f.state for f in found], [doctor.OK, doctor.FAILED, doctor.FAILED])
+        self.assertEqual(found[1].remedy, "pip install 'mujoco>=99'")
+        self.assertIn('no-such-thing is missing', found[2].text)
+        # What the suite itself asks for is here.
+        self.assertEqual({finding.state for finding in doctor.versions()}, {doctor.OK})
+
+    def test_a_process_says_why_it_failed(self):
+        # At exit, a half-loaded library may complain at length.
+        code = 'import atexit; atexit.register(lambda: print(1 / 0)); import no_such_module'
+        status, _, error = doctor._end(doctor._start(code))
+        self.assertEqual(
+            (status, error), (1, "ModuleNotFoundError: No module named 'no_such_module'")
+        )
+        with mock.patch.object(doctor, 'TIMEOUT', 0.1):
+            status, _, error = doctor._end(doctor._start('import time; time.sleep(60)'))
+        self.assertEqual((status, error), (1, 'no answer within 0.1 s'))
+
+    @parameterized.parameters(
+        ((1, '["9 steps per second"]', 'FatalError: no GL'), ('egl',), 'export MUJOCO_GL=egl'),
+        (
+            (1, '["9 steps per second"]', 'FatalError: no GL'),
+            (),
+            'MUJOCO_GL=disable if you need no',
+        ),
+        ((1, '', 'ImportError: mujoco'), (), 'see what failed above'),
+    )
+    def test_remedies(self, end, works, remedy):
+        with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):
+            *_, found = doctor.self_test(works)
+        self.assertEqual(found.state, doctor.FAILED)
+        self.assertIn(end[2], found.text)
+        self.assertIn(remedy, found.remedy)
+
+    def test_backends(self):
+        ends = {'egl': (0, 'llvmpipe', ''), 'osmesa': (1, '', 'no library'), 'glfw': (0, '', '')}
+        with (
+            mock.patch.object(doctor, '_start', lambda code, name: name),
+            mock.patch.object(doctor, '_end', ends.get),
+        ):
+            found = dict(doctor.backends())
+        self.assertEqual(found['egl'].text, 'MUJOCO_GL=egl draws, llvmpipe')
+        self.assertEqual((found['osmesa'].state, found['glfw'].state), (doctor.NOTE, doctor.OK))
+        self.assertIn('libosmesa6', found['osmesa'].remedy)
+
+    def test_fewer_cores_than_there_are(self):
+        with (
+            mock.patch.object(machine, 'cores', return_value=2),
+            mock.patch.object(doctor.os, 'cpu_count', return_value=8),
+        ):
+            found = doctor.cores()
+        self.assertStartsWith(found.text, '2 of 8 cores usable')
+        self.assertIn('num_threads=2', found.remedy)
+
+    def test_exit_status(self):
+        good, bad = doctor.Finding('ok', 'fine'), doctor.Finding('FAILED', 'no engine', 'mend it')
+        for found, status, last in (
+            ([good], 0, 'all is well'),
+            ([good, bad], 1, '1 thing to mend'),
+        ):
+            with mock.patch.object(doctor, 'findings', lambda found=found: iter(found)):
+                code, out, _ = run('doctor')
+            self.assertEqual((code, out.splitlines()[-1]), (status, last))
+        self.assertIn('\nFAILED  no engine\n        -> mend it\n', out)
+
+
+class BenchTest(CommandTest):
+    def test_measures(self):
+        out = self.output(
+            'bench', 'plaid/dog_gaps', '--rows', '3', '--threads', '1', '--seconds', '0.05',
+            '--json', 'bench.json',
+        )  # fmt: skip
+        self.assertStartsWith(out, 'PD_Dog2D_Gaps_Terrain-v0, 3 rows, 1 threads, random actions\n')
+        found = json.loads(pathlib.Path('bench.json').read_text())
+        self.assertIn(found['machine'], out)
+        self.assertIn(f'mujoco {machine.version("mujoco")}', found['machine'])
+        self.assertBetween(found['share of the physics'], 0.1, 1)
+        for name in ('ratio to Batch.step', 'ratio to mj_step', 'reset', 'single environment'):
+            self.assertGreater(found[name], 0, name)
+
+    def test_counts_physics_steps(self):
+        """Also of a gait, whose steps last differently."""
+        self.enterContext(mock.patch.object(bench, 'WARM', 0.1))
+        found = bench.vector('FSM_Hopper2D_Terrain_Gaps-v0', 2, 1, 0.05)
+        self.assertGreater(found['physics'], 50 * found['control'])
+        found = bench.vector('PD_Dog2D_Flat-v0', 2, 1, 0.05)
+        self.assertAlmostEqual(found['physics'] / found['control'], 10, delta=2)
+
+    def test_refusals(self):
+        self.assert_refused("did you mean 'PD_Dog2D_Gaps", 'bench', 'PD_Dog_Gaps_Terrain-v0')
+        self.assert_refused('seconds is 0', 'bench', '--seconds', '0')
+        self.assert_refused('folder', 'bench', '--json', 'no/bench.json')
+        self.assert_only()
+
+
+class GalleryTest(CommandTest):
+    def test_everything_has_its_pictures(self):
+        paths = [item.path for item in gallery.items()]
+        self.assertLen(set(paths), len(characters.CHARACTERS) + 2 * len(catalogue.ROWS))
+        self.assertIn('environments/PD_Dog2D_Gaps_Terrain-v0.terrain.png', paths)
+        self.assertIn('environments/PD_Biped3D_HLC_Soccer-v0.terrain.jpg', paths)
+
+    def test_pictures(self):
+        out = self.output('gallery', '--only', 'Hopper2D_Terrain_Gaps-', '--output', 'g')
+        self.assertEqual(out, '2 pictures written to g, 0 failed\n')
+        self.output('gallery', '--only', 'characters/hopper', '--output', 'g')
+        files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
+        self.assertCountEqual(files, [
+            'hopper.jpg', 'FSM_Hopper2D_Terrain_Gaps-v0.terrain.png',
+            'FSM_Hopper2D_Terrain_Gaps-v0.strip.jpg',
+        ])  # fmt: skip
+        for path in files.values():
+            self.assertBetween(path.stat().st_size, 1000, gallery.LARGEST)
+            with Image.open(path) as image:
+                self.assertGreater(np.asarray(image.convert('RGB')).std(), 5)
+        with Image.open(files['FSM_Hopper2D_Terrain_Gaps-v0.strip.jpg']) as image:
+            height, width = gallery.STRIP_SIZE
+            self.assertEqual(image.size, (6 * width + 5 * 4, height))
+
+    def test_what_is_there_stays(self):
+        old = pathlib.Path('characters')
+        old.mkdir()
+        (old / 'dog.jpg').write_text('mine')
+        out = self.output('gallery', '--only', 'characters/dog', '--output', '.')
+        self.assertEqual(out, '0 pictures written to ., 0 failed\n')
+        self.assertEqual((old / 'dog.jpg').read_text(), 'mine')
+        self.output('gallery', '--only', 'characters/dog', '--output', '.', '--again')
+        self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
+
+    def test_one_that_fails_stops_no_other(self):
+        def draw():
+            raise ValueError('no such\nthing')
+
+        items = [
+            gallery.Item('a.png', draw),
+            gallery.Item('b.png', lambda: np.zeros((9, 9, 3), 'u1')),
+        ]
+        with mock.patch.object(gallery, 'items', lambda: iter(items)):
+            status, out, err = run('gallery', '--output', 'g')
+        self.assertEqual((status, out), (1, '1 pictures written to g, 1 failed\n'))
+        self.assertEqual(err, 'a.png: no such thing\n')
+        self.assertEqual([path.name for path in pathlib.Path('g').iterdir()], ['b.png'])
+        self.assert_refused("no picture matches 'cat'", 'gallery', '--only', 'cat')
+
+    def test_noise_becomes_small(self):
+        noise = np.random.default_rng(0).integers(0, 255, (150, 200, 3)).astype(np.uint8)
+        gallery.save(noise, 'noise.jpg')
+        self.assertLess(pathlib.Path('noise.jpg').stat().st_size, gallery.LARGEST)
+        with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'"):
+            gallery.save(noise, 'noise.gif')
+
+
+class ActingTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ('PD_Dog2D_Flat-v0', 'clip'), ('Torque_Dog2D_LLC_Imitate_Flat-v0', 'zero'),
+        ('FSM_Hopper2D_Terrain_Gaps-v0', 'zero'), ('PD_Biped3D_HLC_Soccer-v0', 'scripted'),
+    )  # fmt: skip
+    def test_the_best_there_is(self, id_, name):
+        environment = suite.make(id_, {'random': 0})
+        with mock.patch.object(policies, 'reference', side_effect=FileNotFoundError):
+            found, policy = acting.best(environment, id_)
+        self.assertEqual(found, name)
+        self.assertEqual(policy(environment.reset()).shape, environment.action_spec().shape)
+
+    def test_a_shipped_one_is_best(self):
+        environment = suite.make(GAPS, {'random': 0})
+        self.assertEqual(acting.best(environment, GAPS)[0], 'reference')
+
+
+class ClipTest(CommandTest):
+    def setUp(self):
+        super().setUp()
+        motion.write_terrainrl(motion.load('raptor_run_050'), 'run.json')
+
+    def test_reads_checks_and_writes(self):
+        out = self.output(
+            'clip', 'run.json', '--character', 'raptor', '--output', 'run.npz', '--strip', 'run.png'
+        )
+        self.assertEqual(out, 'run: 121 frames, 0.5 s, no faults\nrun.npz\nrun.png\n')
+        found, own = motion.load('run.npz'), motion.load('raptor_run_050')
+        self.assertTrue(found.loop)
+        np.testing.assert_allclose(found.poses[:, 3:], own.poses[:, 3:], atol=1e-9)
+        with Image.open('run.png') as image:
+            self.assertEqual(image.size, (8 * 320 + 7 * 4, 240))
+
+    def test_a_map_and_every_frame(self):
+        """The raptor's run on the legs of a biped, whose knees bend the other way."""
+        pathlib.Path('map.json').write_text(
+            json.dumps({'root': 'root', 'right_knee': 'right_ankle', 'left_knee': 'left_ankle'})
+        )
+        run_json = ('clip', 'run.json', '--character', 'biped2d', '--map', 'map.json')
+        # It is a file of the raptor's.
+        self.assert_refused('frame 0 has 26 numbers, the layout of 6 joints needs 14', *run_json)
+        motion.load('raptor_run_050').save('run.npz')
+        out = self.output('clip', 'run.npz', *run_json[2:], '--frames')
+        self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
+        self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
+
+    def test_refusals_leave_nothing_behind(self):
+        here = [path.name for path in self.folder.iterdir()]
+        for message, *arguments in (
+            ("unknown character 'cat'", 'run.json', '--character', 'cat'),
+            ('no such file; did you mean', 'rum.json', '--character', 'raptor'),
+            ('--cycle: 1 times', 'run.json', '--character', 'raptor', '--cycle', '1'),
+            ("unknown suffix '.txt'", 'run.json', '--character', 'raptor', '--output', 'a.txt'),
+        ):
+            self.assert_refused(message, 'clip', *arguments)
+        self.assert_only(*here)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,250 @@
+"""Tests of going from goal to goal without hierarchy: observation, reward, goals, ball, the original."""
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import suite
+from trl_suite.tasks import rewards
+from trl_suite.vector import VectorEnvironment
+
+TRAIL, FOREST, BLOCKS, MOVERS, SOCCER = (
+    f'PD_Biped3D_Terrain_{name}_Hard-v0'
+    for name in ('Trail', 'Forest', 'Blocks', 'Dyanmics_Obs', 'Soccer')
+)
+GROUNDS = (TRAIL, FOREST, BLOCKS, MOVERS)
+SIZES = {'terrain': 1024, 'pose': 57, 'velocity': 48, 'phase': 5, 'goal': 2}
+
+
+def started(id_, **options):
+    environment = suite.make(id_, {'random': 3, **options})
+    return environment, environment.reset()
+
+
+def sizes(environment):
+    return {name: part.stop - part.start for name, part in environment.blocks.items()}
+
+
+def root_of(environment):
+    """Place (3,) m and heading (rad) of the root."""
+    named, name = environment.physics.named.data, environment.task.character.row.name
+    ahead = named.xmat[f'{name}/root'].reshape(3, 3)[:, 0]
+    return named.xpos[f'{name}/root'].copy(), np.arctan2(ahead[1], ahead[0])
+
+
+def bearing_and_distance(way, heading):
+    return (np.arctan2(way[1], way[0]) - heading + np.pi) % (2 * np.pi) - np.pi, np.hypot(*way[:2])
+
+
+def set_goal(environment, ahead, aside=0.0):
+    """Puts the goal so far ahead and to the left of the root; returns an observation of it."""
+    task = environment.task
+    place, heading = root_of(environment)
+    along = np.array([np.cos(heading), np.sin(heading), 0.0])
+    left = np.array([-along[1], along[0], 0.0])
+    task.goal[0] = [*(place + ahead * along + aside * left)[:2], 0.0]
+    task.observe()
+    return task.observation[0, task.blocks['goal']]
+
+
+def terms(environment):
+    """Terms of the reward as they would be of the state of now, by name."""
+    task = environment.task
+    task.observe()
+    return dict(zip(task.TERMS, task.reward_terms[0].copy(), strict=True))
+
+
+class ObservationTest(parameterized.TestCase):
+    @parameterized.parameters(*GROUNDS)
+    def test_blocks(self, id_):
+        """1136 numbers; the original has them in this order."""
+        environment, time_step = started(id_)
+        self.assertEqual(sizes(environment), SIZES)
+        place, heading = root_of(environment)
+        expected = bearing_and_distance(environment.task.goal[0] - place, heading)
+        np.testing.assert_allclose(time_step.observation['goal'], expected, atol=1e-9)
+
+    def test_ball(self):
+        environment, time_step = started(SOCCER)
+        self.assertEqual(
+            sizes(environment), {'pose': 57, 'velocity': 48, 'phase': 5, 'goal': 2, 'ball': 9}
+        )
+        place, heading = root_of(environment)
+        ball = environment.physics.named.data.xpos['ball'].copy()
+        seen = time_step.observation['ball']
+        np.testing.assert_allclose(seen[:2], bearing_and_distance(ball - place, heading), atol=1e-9)
+        self.assertAlmostEqual(seen[2], 0.2)  # it lies on the ground
+        np.testing.assert_allclose(seen[3:], 0, atol=1e-9)
+        way = environment.task.goal[0] - ball
+        np.testing.assert_allclose(
+            time_step.observation['goal'], bearing_and_distance(way, heading), atol=1e-9
+        )
+
+    def test_the_map_is_of_the_ground(self):
+        """In a forest some pillar rises at least 2 m within the map of most starts."""
+        environments = VectorEnvironment(FOREST, 16, seed=0)
+        maps = environments.reset()[:, environments.blocks['terrain']]
+        self.assertGreater((maps.max(1) > 2).mean(), 0.9)
+        # Clear of them where the walker stands: its own sample is at 0.
+        self.assertEqual(np.abs(maps.reshape(16, 32, 32)[:, 15:17, 2:4]).max(), 0)
+
+    @parameterized.parameters(TRAIL, SOCCER)
+    def test_reflections(self, id_):
+        """Twice is once; what is to the left is to the right."""
+        environment, time_step = started(id_)
+        mirror, blocks = environment.task.mirror, environment.blocks
+        flat = np.concatenate([np.ravel(v) for v in time_step.observation.values()])[None]
+        once = mirror.observation(flat)
+        np.testing.assert_allclose(mirror.observation(once), flat, atol=1e-12)
+        goal = blocks['goal']
+        np.testing.assert_allclose(once[0, goal], flat[0, goal] * (-1, 1))
+
+
+class RewardTest(parameterized.TestCase):
+    def test_weights(self):
+        """0.5, 0.05, 0.15, 0.2, 0.1, 0.05 and 0.1 over 1.15."""
+        weights = [weight for weight, _ in rewards.JOURNEY_TERMS.values()]
+        expected = np.array([0.5, 0.05, 0.15, 0.2, 0.1, 0.05, 0.1]) / 1.15
+        np.testing.assert_allclose(weights, expected)
+        environment, _ = started(SOCCER)
+        self.assertAlmostEqual(sum(weight for weight, _ in environment.task.TERMS.values()), 1)
+
+    def test_far_away_a_start_towards_the_goal_is_all_but_full(self):
+        """The clip's own pose and velocity, straight towards a goal 10 m ahead."""
+        environment, _ = started(TRAIL)
+        set_goal(environment, 10.0)
+        found = terms(environment)
+        for name, (weight, _) in rewards.JOURNEY_TERMS.items():
+            # Heading and way differ by what the pelvis turns in a step.
+            least = 0.0 if name == 'proximity' else 0.95 * weight
+            self.assertBetween(found[name], least, weight + 1e-12, name)
+        self.assertAlmostEqual(
+            found['proximity'], 0.1 / 1.15 * np.exp(-100 / (0.25 * 9)), delta=1e-12
+        )
+
+    def test_the_wrong_way(self):
+        environment, _ = started(TRAIL)
+        set_goal(environment, -10.0)
+        found = terms(environment)
+        # 1.3 m/s one way instead of the other: the error is 0.1 times 2.6 squared.
+        weight = 0.2 / 1.15
+        self.assertAlmostEqual(found['com'], weight * np.exp(-10 * 0.1 * 2.6**2), delta=1e-3)
+        self.assertLess(found['heading'], 1e-6)
+
+    @parameterized.parameters((2.9, True), (3.1, False))
+    def test_near_the_goal_neither_speed_nor_heading_counts(self, distance, full):
+        environment, _ = started(TRAIL)
+        set_goal(environment, -distance)
+        found = terms(environment)
+        self.assertEqual(found['com'] == 0.2 / 1.15, full)
+        self.assertEqual(found['heading'] == 0.05 / 1.15, full)
+        expected = 0.1 / 1.15 * np.exp(-(distance**2) / (0.25 * 9))
+        self.assertAlmostEqual(found['proximity'], expected, delta=1e-9)
+
+    def test_a_ball_that_rolls_to_its_goal(self):
+        """Half of the reward is the ball's: its speed along the way to the goal counts from 0 on."""
+        environment, _ = started(SOCCER)
+        task = environment.task
+        action = task.clip_action(0)
+        for speed, dribble in ((1.2, 1.0), (-1.2, 0.0)):
+            environment.reset()
+            ball = environment.physics.named.data.xpos['ball'].copy()
+            task.goal[0] = ball[0] + 8.0, ball[1], 0.0
+            environment.physics.named.data.qvel['ball'][:3] = speed, 0, 0
+            environment.step(action)
+            found = environment.info['reward_terms']
+            self.assertAlmostEqual(found['dribble'], dribble * 0.5 * 0.4 / 1.2, delta=2e-3)
+
+
+class GoalTest(parameterized.TestCase):
+    def test_it_is_drawn_anew_within_half_a_metre(self):
+        environment, _ = started(TRAIL)
+        for ahead, reached in ((0.7, 0), (0.3, 1)):
+            environment.reset()
+            set_goal(environment, ahead)
+            before = environment.task.goal[0].copy()
+            environment.step(environment.task.clip_action(0))
+            self.assertEqual(environment.info['goals_reached'], reached)
+            self.assertEqual((environment.task.goal[0] != before).any(), bool(reached))
+
+    def test_of_a_trail_it_lies_on_the_next_segment(self):
+        environments = VectorEnvironment(TRAIL, 32, seed=0)
+        environments.reset()
+        task = environments.task
+        way = (
+            task.goal[:, :2] - environments.task.world.xpos[:, task.figure.kinematics.links[0], :2]
+        )
+        self.assertLess(np.hypot(*way.T).max(), 6)  # segments are 2 m long
+        np.testing.assert_allclose(task.goal[:, 2], 0, atol=1e-6)  # the path is level
+
+    def test_a_ball_at_its_goal_is_counted_and_stays(self):
+        environment, _ = started(SOCCER)
+        ball = environment.physics.named.data.xpos['ball'].copy()
+        environment.task.goal[0] = ball
+        environment.step(environment.task.clip_action(0))
+        self.assertTrue(environment.info['at_goal'])
+        self.assertEqual(environment.info['goals_reached'], 1)
+        np.testing.assert_array_equal(environment.task.goal[0], ball)
+
+    def test_reached_distance_is_an_option(self):
+        environment, _ = started(TRAIL, goal_reached=1.0)
+        set_goal(environment, 0.7)
+        environment.step(environment.task.clip_action(0))
+        self.assertEqual(environment.info['goals_reached'], 1)
+
+    def test_the_way_is_traced(self):
+        environment, _ = started(TRAIL)
+        for _ in range(12):
+            environment.step(environment.task.clip_action(0))
+        *trace, flag = environment.task.markers(0)
+        self.assertLen(trace, 2)  # every 5 control steps
+        self.assertEqual((flag.shape, {m.shape for m in trace}), ('cylinder', {'sphere'}))
+
+
+class OriginalTest(parameterized.TestCase):
+    def test_it_rewards_hidden_footsteps_and_keeps_its_goal(self):
+        environment, _ = started(FOREST, reward='original')
+        self.assertEqual(sizes(environment), SIZES)
+        self.assertEqual(list(environment.task.TERMS), list(rewards.STEP_TERMS))
+        self.assertAlmostEqual(environment.task.plans.length[0], 0.4)
+        goal = environment.task.goal[0].copy()
+        time_step = environment.step(np.zeros(environment.action_spec().shape))
+        place, heading = root_of(environment)
+        np.testing.assert_allclose(
+            time_step.observation['goal'], bearing_and_distance(goal - place, heading), atol=1e-9
+        )
+
+    def test_observations_are_those_of_the_default(self):
+        """The same seed draws the same terrain."""
+        ours, original = (started(BLOCKS, reward=r)[0] for r in ('goal', 'original'))
+        self.assertEqual(ours.blocks, original.blocks)
+        np.testing.assert_array_equal(
+            ours.task.mirror.observation_index, original.task.mirror.observation_index
+        )
+        np.testing.assert_array_equal(
+            ours.task.mirror.observation_sign, original.task.mirror.observation_sign
+        )
+
+    @parameterized.parameters(
+        ({'reward': 'orignal'}, "'orignal'.*original"),
+        ({'reward': 'original', 'goal_reached': 1.0}, 'goal_reached is an option'),
+        ({'goal_reached': 0.0}, 'goal_reached is 0'),
+        ({'goal_reach': 1.0}, 'goal_reached'),
+    )
+    def test_wrong_options(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            suite.make(FOREST, options)
+
+
+class BuildTest(absltest.TestCase):
+    def test_any_character_and_ground(self):
+        environment = suite.build('biped3d', terrain='hills3d', task='journey')
+        time_step = environment.reset()
+        self.assertEqual(time_step.observation['goal'].shape, (2,))
+
+    def test_not_in_the_plane(self):
+        with self.assertRaisesRegex(ValueError, "'dog' is planar; the task 'journey'"):
+            suite.build('dog', task='journey')
+
+
+if __name__ == '__main__':
+    absltest.main()

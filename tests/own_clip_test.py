@@ -1,0 +1,450 @@
+"""Motions of the user's own: files in four formats, carried over, cut to a cycle, checked."""
+
+import contextlib
+import dataclasses
+import importlib.util
+import io
+import json
+import pathlib
+import tempfile
+
+import numpy as np
+from absl.testing import absltest, parameterized
+from scipy.spatial.transform import Rotation
+
+from trl_suite import clip_check, motion, retargeting, suite
+from trl_suite.mannequin import Mannequin
+from trl_suite.motion import quaternion
+
+FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # ours from a file with y up, z forward
+EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
+FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
+
+
+def in_file(rotation):
+    """A rotation of ours in a file's frame."""
+    return Rotation.from_matrix(FILE_AXES.T @ rotation.as_matrix() @ FILE_AXES)
+
+
+def rotations(quaternions):
+    return Rotation.from_quat(np.asarray(quaternions)[:, [1, 2, 3, 0]])
+
+
+class Figure:
+    """What a capture of a character's own motion would hold."""
+
+    def __init__(self, character, clip, frames, spread_arms=False):
+        mannequin = Mannequin(character)
+        self.names = ('root', *mannequin.layout.joints)
+        self.parents = mannequin.parents()
+        self.offsets = mannequin.places()
+        self.offsets[1:] -= self.offsets[self.parents[1:]]
+        self.times = np.linspace(0, clip.duration, frames)
+        self.poses = clip.pose(self.times)
+        turned = []
+        for pose in self.poses:
+            mannequin.put(pose)
+            turned.append(mannequin.orientations())
+        world = [rotations(column) for column in np.swapaxes(turned, 0, 1)]
+        # Arms that point sideways at rest turn by so much less in all poses.
+        self.rest = [Rotation.identity()] * len(self.names)
+        if spread_arms:
+            for i, name in enumerate(self.names):
+                if name.endswith(('shoulder', 'elbow', 'wrist')):
+                    side = 1 if name.startswith('left') else -1
+                    self.rest[i] = Rotation.from_euler('x', 90 * side, degrees=True)
+                    if not name.endswith('shoulder'):
+                        self.offsets[i] = self.rest[i].apply(self.offsets[i])
+        world = [turn * rest.inv() for turn, rest in zip(world, self.rest, strict=True)]
+        self.local = [
+            turn if parent < 0 else world[parent].inv() * turn
+            for turn, parent in zip(world, self.parents, strict=True)
+        ]
+
+    def children(self, i):
+        return [j for j, parent in enumerate(self.parents) if parent == i]
+
+
+BVH_NAMES = {
+    'root': 'Hips', 'torso': 'Spine1', 'neck': 'Neck', 'head': 'Head', 'hip': 'UpLeg',
+    'knee': 'Leg', 'ankle': 'Foot', 'shoulder': 'Arm', 'elbow': 'ForeArm', 'wrist': 'Hand',
+}  # fmt: skip
+
+
+def bvh_name(name):
+    side, _, part = name.rpartition('_')
+    return f'{side.capitalize()}{BVH_NAMES[part]}'
+
+
+def write_bvh(figure, path, order='ZXY', unit=0.01):
+    lines, columns = ['HIERARCHY'], [100 * figure.poses[:, :3] @ FILE_AXES]
+
+    def block(i, depth):
+        offset = ' '.join(f'{x / unit:.6f}' for x in figure.offsets[i] @ FILE_AXES)
+        kind = 'ROOT' if i == 0 else 'JOINT'
+        place = 'Xposition Yposition Zposition ' if i == 0 else ''
+        turns = ' '.join(f'{axis}rotation' for axis in order)
+        lines.extend([
+            f'{kind} {bvh_name(figure.names[i])}', '{', f'OFFSET {offset}',
+            f'CHANNELS {6 if i == 0 else 3} {place}{turns}',
+        ])  # fmt: skip
+        columns.append(in_file(figure.local[i]).as_euler(order, degrees=True))
+        for child in figure.children(i):
+            block(child, depth + 1)
+        if not figure.children(i):
+            lines.extend(['End Site', '{', 'OFFSET 0 1 0', '}'])
+        lines.append('}')
+
+    block(0, 0)
+    frames = np.concatenate(columns, axis=1)
+    lines += ['MOTION', f'Frames: {len(frames)}', f'Frame Time: {figure.times[1]:.9f}']
+    lines += [' '.join(f'{x:.7f}' for x in frame) for frame in frames]
+    path.write_text('\n'.join(lines) + '\n')
+
+
+ASF_NAMES = {'root': 'root', 'torso': 'thorax', 'hip': 'femur', 'knee': 'tibia', 'ankle': 'foot'}
+
+
+def asf_name(name):
+    side, _, part = name.rpartition('_')
+    return f'{side[:1]}{ASF_NAMES[part]}'
+
+
+def write_acclaim(figure, skeleton, path, length=0.45):
+    """Bones with frames of their own; each begins where one without degrees of freedom ends."""
+    random = np.random.default_rng(0)
+    unit = 0.0254 / length
+    bones, hierarchy = [], []
+    place = figure.poses[:, :3] @ FILE_AXES / unit
+    turn = in_file(figure.local[0]).as_euler('xyz', degrees=True)
+    columns = {'root': np.concatenate([place, turn], axis=1)}
+    for i, name in enumerate(figure.names[1:], 1):
+        way = figure.offsets[i] @ FILE_AXES / unit
+        far = np.linalg.norm(way)
+        axis = random.uniform(-90, 90, 3)
+        parent = asf_name(figure.names[figure.parents[i]])
+        to, own = f'to_{asf_name(name)}', asf_name(name)
+        bones += [
+            'begin', f'id {2 * i}', f'name {to}', f'direction {" ".join(map(str, way / far))}',
+            f'length {far}', 'axis 0 0 0 XYZ', 'end',
+            'begin', f'id {2 * i + 1}', f'name {own}', 'direction 0 -1 0', 'length 0',
+            f'axis {" ".join(map(str, axis))} XYZ', 'dof rx ry rz',
+            'limits (-180.0 180.0)', '(-180.0 180.0)', '(-180.0 180.0)', 'end',
+        ]  # fmt: skip
+        hierarchy += [f'{parent} {to}', f'{to} {own}']
+        frame = Rotation.from_euler('xyz', axis, degrees=True)
+        columns[own] = (frame.inv() * in_file(figure.local[i]) * frame).as_euler(
+            'xyz', degrees=True
+        )
+    skeleton.write_text('\n'.join([
+        '# a comment', ':version 1.10', ':name test', ':units', 'mass 1.0', f'length {length}',
+        'angle deg', ':documentation', 'none', ':root', 'order TX TY TZ RX RY RZ', 'axis XYZ',
+        'position 0 0 0', 'orientation 0 0 0', ':bonedata', *bones, ':hierarchy', 'begin',
+        *hierarchy, 'end', '',
+    ]))  # fmt: skip
+    lines = ['#!OML:ASF test.asf', ':FULLY-SPECIFIED', ':DEGREES']
+    for i in range(len(figure.times)):
+        lines.append(str(i + 1))
+        lines += [f'{name} {" ".join(map(str, column[i]))}' for name, column in columns.items()]
+    path.write_text('\n'.join(lines) + '\n')
+
+
+class FolderTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def assert_same_poses(self, clip, expected, places=1e-5):
+        """Also the same rotations, of which quaternions have two."""
+        self.assertEqual(clip.poses.shape, expected.shape)
+        change = clip.layout.change(clip.poses, expected)
+        np.testing.assert_allclose(change, 0, atol=places)
+
+
+class ReadingTest(FolderTest):
+    @parameterized.parameters('ZXY', 'XYZ', 'ZYX')
+    def test_bvh_comes_back(self, order):
+        """A walk of ours, arms at rest sideways, in centimetres, y up."""
+        figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
+        write_bvh(figure, self.folder / 'walk.bvh', order)
+        capture = retargeting.read(self.folder / 'walk.bvh', FULL)
+        self.assertEqual(capture.joints[:2], ('Hips', 'Spine1'))
+        np.testing.assert_allclose(capture.positions, figure.poses[:, :3], atol=1e-6)
+        clip = retargeting.retarget(capture, FULL)
+        self.assertEqual((clip.name, clip.loop), ('walk', False))
+        self.assertAlmostEqual(clip.duration, figure.times[-1], places=5)
+        # Its feet touch the ground before and after, so that its height is the same.
+        self.assert_same_poses(clip, figure.poses, 1e-3)
+        angles = [column for column in range(clip.poses.shape[1]) if column > 2]
+        self.assertLess(np.abs(np.abs(clip.poses) - np.abs(figure.poses))[:, angles].max(), 1e-5)
+
+    def test_acclaim_comes_back(self):
+        figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 25)
+        write_acclaim(figure, self.folder / 'a.asf', self.folder / 'walk.amc')
+        capture = retargeting.read(
+            self.folder / 'walk.amc', PLAIN, self.folder / 'a.asf', rate=24.0
+        )
+        np.testing.assert_allclose(capture.positions, figure.poses[:, :3], atol=1e-6)
+        clip = retargeting.retarget(capture, PLAIN)
+        self.assert_same_poses(clip, figure.poses, 1e-3)
+        np.testing.assert_allclose(clip.times, np.arange(25) / 24)
+
+    def test_another_heading_size_and_place(self):
+        """Twice as large, turned to the left and set aside: the same clip in the end."""
+        figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 25)
+        expected = figure.poses.copy()
+        turn = Rotation.from_euler('z', 2.0)
+        figure.offsets *= 2
+        figure.poses[:, :3] = turn.apply(2 * figure.poses[:, :3]) + np.array([3, 4, 5])
+        figure.local[0] = turn * figure.local[0]
+        write_bvh(figure, self.folder / 'walk.bvh')
+        clip = retargeting.retarget(retargeting.read(self.folder / 'walk.bvh', PLAIN), PLAIN)
+        self.assert_same_poses(clip, expected, 2e-3)
+
+    def test_the_two_kinds_of_json(self):
+        clip = motion.load('biped2d_walk')
+        motion.write_terrainrl(clip, self.folder / 'terrainrl.json')
+        found = retargeting.read(self.folder / 'terrainrl.json', 'biped2d')
+        np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
+        self.assertTrue(found.loop)
+
+        walk, angle = motion.load('biped3d_mocap_walk'), 0.3
+        frame = [0.1, 0, 0.9, 0, 1, 0, 0, 0]
+        for name, size in motion.HUMANOID3D.items():
+            bent = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # about their z, our -y
+            value = [angle if name == 'left_knee' else 0] if size == 1 else [1, 0, 0, 0]
+            frame += bent if name in ('chest', 'right_hip') else value
+        ahead = [*frame[:1], 0.5, *frame[2:]]
+        (self.folder / 'deepmimic.json').write_text(
+            json.dumps({'Loop': 'none', 'Frames': [frame, ahead]})
+        )
+        found = retargeting.read(self.folder / 'deepmimic.json', PLAIN)
+        clip = retargeting.retarget(found, PLAIN)
+        self.assertEqual(clip.joints, walk.joints)
+        bent = quaternion.from_vector(np.array([0, -angle, 0]))
+        for joint, expected in (
+            ('torso', bent), ('right_hip', bent), ('left_knee', [angle]), ('right_knee', [0]),
+            ('left_ankle', [1, 0, 0, 0]),
+        ):  # fmt: skip
+            column, _ = clip.layout.starts(joint)
+            np.testing.assert_allclose(
+                clip.poses[:, column : column + len(expected)], [expected] * 2, atol=1e-12
+            )
+        # The root as high as ours stands, and what it travels in proportion.
+        size = Mannequin(PLAIN).standing()[2] / 0.9
+        np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
+
+    def test_refusals(self):
+        for name, text in (
+            ('a.bvh', 'HIERARCHY\n'), ('a.json', '{'), ('a.asf', ':root\norder TX\n'),
+            ('b.asf', ':bonedata\nbegin\nname x\nlength far\nend\n'), ('a.amc', '1\nroot 1\n'),
+        ):  # fmt: skip
+            (self.folder / name).write_text(text)
+        for message, name, skeleton in (
+            (r'a\.bvh: ', 'a.bvh', None), (r'a\.json: not JSON', 'a.json', None),
+            (r'a\.asf: expected the sections', 'a.amc', 'a.asf'),
+            (r"b\.asf, line 4: 'length far'", 'a.amc', 'b.asf'),
+            (r'a skeleton \(\.asf\) belongs', 'a.amc', None),
+            (r'a skeleton \(\.asf\) belongs', 'a.bvh', 'a.asf'),
+            ('unknown suffix', 'a.asf', None),
+        ):  # fmt: skip
+            with self.subTest(name), self.assertRaisesRegex(ValueError, message):
+                skeleton = skeleton and self.folder / skeleton
+                retargeting.read(self.folder / name, PLAIN, skeleton)
+        with self.assertRaisesRegex(FileNotFoundError, "did you mean 'a.bvh'"):
+            retargeting.read(self.folder / 'aa.bvh', PLAIN)
+        with self.assertRaisesRegex(ValueError, "forward is 'w'"):
+            motion.read_bvh(self.folder / 'a.bvh', forward='w')
+        with self.assertRaisesRegex(ValueError, 'expected two axes'):
+            motion.read_bvh(self.folder / 'a.bvh', forward='-y')
+
+
+class RetargetTest(FolderTest):
+    def test_from_space_to_the_plane(self):
+        """Hinges take the part of a rotation that is about their axis."""
+        figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
+        write_bvh(figure, self.folder / 'walk.bvh')
+        clip = retargeting.retarget(
+            retargeting.read(self.folder / 'walk.bvh', 'biped2d_full'), 'biped2d_full'
+        )
+        self.assertEqual((clip.root, set(clip.sizes)), ('planar', {1}))
+        source = motion.load('biped3d_full_walk')
+        column, _ = source.layout.starts('left_knee')
+        own, _ = clip.layout.starts('left_knee')
+        np.testing.assert_allclose(clip.poses[:, own], figure.poses[:, column], atol=1e-5)
+        own, _ = clip.layout.starts('left_shoulder')  # hangs, though it was sideways at rest
+        np.testing.assert_allclose(clip.poses[:, own], 0, atol=0.2)
+        self.assertGreater(clip.speed, 0.8 * source.speed)
+        # Who turns around on the way moves its joints all the same.
+        ramp = Rotation.from_euler('z', np.linspace(0, 3, 31)[:, None])
+        figure.local[0] = ramp * figure.local[0]
+        write_bvh(figure, self.folder / 'turn.bvh')
+        turned = retargeting.retarget(
+            retargeting.read(self.folder / 'turn.bvh', 'biped2d_full'), 'biped2d_full'
+        )
+        np.testing.assert_allclose(turned.poses[:, 2:], clip.poses[:, 2:], atol=1e-5)
+
+    def test_usual_names(self):
+        ours = ('root', *motion.load('biped3d_full_walk').joints)
+        for theirs in (
+            [bvh_name(name) for name in ours],
+            [f'mixamorig:{bvh_name(name)}' for name in ours],
+            ['root', *motion.HUMANOID3D],
+        ):
+            found = retargeting.guess_map(theirs, ours)
+            self.assertContainsSubset(
+                ('root', 'torso', 'left_hip', 'right_knee', 'left_ankle', 'right_shoulder'), found
+            )
+            self.assertContainsSubset(found.values(), theirs)
+            self.assertIn('eft', found['left_hip'])
+        cmu = ['root', 'lowerback', 'thorax', 'lfemur', 'ltibia', 'lfoot', 'rhumerus', 'rradius']
+        found = retargeting.guess_map(cmu, ours)
+        self.assertEqual(found['torso'], 'thorax')
+        self.assertEqual((found['left_knee'], found['right_elbow']), ('ltibia', 'rradius'))
+        self.assertNotIn('right_hip', found)
+
+    def test_refusals(self):
+        clip = motion.load('biped2d_walk')
+        with self.assertRaisesRegex(ValueError, "unknown joint of the character 'left_nee'"):
+            retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_nee': 'left_knee'})
+        with self.assertRaisesRegex(ValueError, "joint of the motion 'knee'; did you mean"):
+            retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_knee': 'knee'})
+        with self.assertRaisesRegex(ValueError, 'no root, or nothing else'):
+            retargeting.retarget(clip, 'dog')
+        with self.assertRaisesRegex(ValueError, 'scale is 0'):
+            retargeting.retarget(clip, 'raptor', scale=0)
+
+
+class CycleTest(absltest.TestCase):
+    def unrolled(self, name, cycles=2.6, noise=0.0):
+        clip = motion.load(name)
+        times = np.linspace(0, cycles * clip.duration, 201)
+        poses = clip.pose(times)
+        if clip.root == 'planar':
+            poses[:, 2:] += noise * np.sin(np.linspace(0, 3, 201))[:, None]
+        return dataclasses.replace(clip, times=times, poses=poses, loop=False)
+
+    def test_the_period_is_found(self):
+        for name in ('biped2d_walk', 'raptor_run_050', 'biped3d_mocap_walk'):
+            clip, source = retargeting.cycle(self.unrolled(name)), motion.load(name)
+            self.assertTrue(clip.loop)
+            # Several cycles are as alike as one.
+            cycles = clip.duration / source.duration
+            self.assertAlmostEqual(cycles, round(cycles), delta=0.03, msg=name)
+            self.assertAlmostEqual(clip.speed, source.speed, delta=0.05 * source.speed)
+
+    def test_the_ends_meet(self):
+        for name, noise in (('biped2d_walk', 0.1), ('biped3d_mocap_walk', 0.0)):
+            loose = self.unrolled(name, noise=noise)
+            clip = retargeting.cycle(loose, 0.12, 1.1)
+            change = clip.layout.change(clip.poses[0], clip.poses[-1])
+            flat = len(clip.displacement) - 1
+            np.testing.assert_allclose(change[flat:], 0, atol=1e-12)
+            np.testing.assert_array_equal(clip.poses[0, :flat], 0)
+            # Nothing moved by more than the gap.
+            gap = np.abs(clip.layout.change(loose.pose(0.12), loose.pose(1.1))[flat:]).max()
+            moved = clip.layout.change(clip.poses, loose.pose(0.12 + clip.times))[:, flat:]
+            self.assertLessEqual(np.abs(moved).max(), gap + 1e-9)
+
+    def test_refusals(self):
+        clip = self.unrolled('biped2d_walk')
+        with self.assertRaisesRegex(ValueError, 'both or none'):
+            retargeting.cycle(clip, start=0.1)
+        with self.assertRaisesRegex(ValueError, 'expected 0 <= start < end <= 2.6 s'):
+            retargeting.cycle(clip, 0.5, 3.0)
+        with self.assertRaisesRegex(ValueError, 'lasts 0.2 s'):
+            retargeting.cycle(self.unrolled('biped2d_walk', 0.2))
+
+
+class CheckTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ('biped2d_walk', 'biped2d'), ('dog_bound', 'dog'), ('biped3d_run', 'biped3d'),
+    )  # fmt: skip
+    def test_our_own_have_no_faults(self, name, character):
+        report = clip_check.check(motion.load(name), character)
+        self.assertEmpty(report.faults)
+        self.assertEndsWith(str(report), 'no faults')
+
+    def changed(self, column, amount, frames=slice(40, 60)):
+        clip = motion.load('biped2d_walk')
+        poses = clip.poses.copy()
+        poses[frames, column] += amount
+        return dataclasses.replace(clip, poses=poses)
+
+    def test_a_joint_beyond_its_limit(self):
+        clip = motion.load('biped2d_walk')
+        column, _ = clip.layout.starts('right_knee')
+        poses = clip.poses.copy()
+        poses[40, column] = 0.25  # its range ends at 0
+        report = clip_check.check(dataclasses.replace(clip, poses=poses), 'biped2d')
+        (fault,) = [fault for fault in report.faults if fault.kind == 'joint limit']
+        self.assertEqual((fault.frame, fault.name, fault.unit), (40, 'right_knee', 'rad'))
+        self.assertAlmostEqual(fault.amount, 0.25)
+        self.assertAlmostEqual(fault.time, clip.times[40])
+
+    def test_a_ball_joint_beyond_its_cone(self):
+        clip = motion.load('biped3d_walk')
+        column, _ = clip.layout.starts('torso')
+        poses = clip.poses.copy()
+        poses[7, column : column + 4] = quaternion.from_vector(np.array([0, 1.2, 0]))  # limit 1
+        report = clip_check.check(dataclasses.replace(clip, poses=poses), 'biped3d')
+        self.assertAlmostEqual(report.excess['torso'][7], 0.2)
+        self.assertEqual({(f.kind, f.name, f.frame) for f in report.faults},
+                         {('joint limit', 'torso', 7)})  # fmt: skip
+
+    def test_below_the_ground(self):
+        deep = clip_check.check(self.changed(1, -0.03), 'biped2d')
+        found = [fault for fault in deep.faults if fault.kind == 'penetration']
+        self.assertEqual({fault.frame for fault in found}, set(range(40, 60)))
+        self.assertContainsSubset({fault.name for fault in found}, {'right_ankle', 'left_ankle'})
+        self.assertAlmostEqual(max(fault.amount for fault in found), 0.03, delta=0.001)
+
+    def test_feet_that_slide(self):
+        """A walk on the spot: what stood slides back by what the body travelled."""
+        clip = motion.load('biped2d_walk')
+        poses = clip.poses.copy()
+        poses[:, 0] = 0
+        report = clip_check.check(dataclasses.replace(clip, poses=poses), 'biped2d')
+        self.assertEqual({fault.kind for fault in report.faults}, {'foot slide'})
+        self.assertBetween(max(fault.amount for fault in report.faults), 0.4, 1.5)
+        first = report.faults[0]
+        self.assertAlmostEqual(first.amount, 0.02, delta=0.02)  # not before it has travelled so far
+        self.assertIn('foot slide', str(report))
+
+    def test_a_clip_of_another_character(self):
+        with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*is none of 'raptor'"):
+            clip_check.check(motion.load('biped2d_walk'), 'raptor')
+
+
+class ImitationTest(FolderTest):
+    def test_it_can_be_imitated(self):
+        """From a file to an environment."""
+        walk = motion.load('biped2d_full_walk')
+        figure = Figure(FULL, motion.load('biped3d_full_walk'), 41)
+        write_bvh(figure, self.folder / 'walk.bvh')
+        clip = retargeting.cycle(
+            retargeting.retarget(retargeting.read(self.folder / 'walk.bvh', 'biped2d_full'),
+                                 'biped2d_full'), 0.0, figure.times[-1]
+        )  # fmt: skip
+        self.assertEqual(clip.joints, walk.joints)
+        environment = suite.build('biped2d_full', clip=clip, task_kwargs={'random': 0})
+        environment.reset()
+        time_step = environment.step(environment.task.clip_action(0))
+        self.assertGreater(time_step.reward, 0.5)
+
+    def test_the_example(self):
+        figure = Figure(FULL, motion.load('biped3d_full_walk'), 61)
+        write_bvh(figure, self.folder / 'walk.bvh')
+        spec = importlib.util.spec_from_file_location('own_clip', EXAMPLES / 'own_clip.py')
+        example = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(example)
+        out = io.StringIO()
+        with contextlib.chdir(self.folder), contextlib.redirect_stdout(out):
+            example.main(['walk.bvh', '--strip', 'walk.png'])
+        self.assertStartsWith(out.getvalue(), 'walk: ')
+        self.assertTrue(motion.load(self.folder / 'clip.npz').loop)
+        self.assertGreater((self.folder / 'walk.png').stat().st_size, 1000)
+
+
+if __name__ == '__main__':
+    absltest.main()

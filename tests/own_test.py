@@ -1,0 +1,545 @@
+"""Tests of what users make: characters from files, terrain from data, tasks from parts."""
+
+import contextlib
+import pathlib
+import pickle
+import re
+import runpy
+import sys
+import tempfile
+from unittest import mock
+
+import imageio.v3 as imageio
+import mujoco
+import numpy as np
+import trimesh
+from absl.testing import absltest, parameterized
+
+from trl_suite import characters, cli, gym, motion, suite, terrain, world
+from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.tasks import parts
+from trl_suite.tasks.walk import Walk
+from trl_suite.vector import VectorEnvironment
+
+EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
+LINK = """<link name="{}"><inertial><origin xyz="0 0 -.2"/><mass value="{}"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0 0 -.2"/><geometry><box size=".1 .1 .4"/></geometry></collision></link>"""
+URDF = f"""<robot name="two">{LINK.format('trunk', 5)}{LINK.format('leg', 2)}
+<joint name="hip" type="revolute"><parent link="trunk"/><child link="leg"/>
+<origin xyz="0 0 -.4"/><axis xyz="0 1 0"/>
+<limit lower="-0.7" upper="0.4" effort="35" velocity="9"/></joint></robot>"""
+# A planar two-legged figure with its own root joints, a floor, servos and a key frame.
+LEG = """<body name="{0}_thigh" pos="0 {1} 0"><joint name="{0}_hip" axis="0 -1 0" range="-60 60"/>
+<geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/>
+<body name="{0}_shin" pos="0 0 -.4"><joint name="{0}_knee" axis="0 -1 0" range="-120 0"/>
+<geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body>"""
+MJCF = f"""<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1"/><body name="trunk" pos="0 0 1">
+<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<joint name="p" axis="0 1 0"/><geom size=".15 .15 .2" type="box" pos="0 0 .2"/>
+{LEG.format('right', -0.1)}{LEG.format('left', 0.1)}</body></worldbody>
+<actuator><position joint="right_hip" kp="90" kv="3" forcerange="-70 70"/>
+<motor joint="right_knee" gear="50" ctrlrange="-1 1"/></actuator>
+<keyframe><key qpos="0 1 0 .2 -.3 .1 -.1"/></keyframe></mujoco>"""
+PLANAR = {'end_effectors': ('right_shin', 'left_shin'), 'fall_links': ('trunk',)}
+TWO = {'end_effectors': ('leg',), 'fall_links': ('trunk',), 'spatial': True}
+
+
+class Folder(parameterized.TestCase):
+    """Tests with a folder of their own."""
+
+    def setUp(self):
+        super().setUp()
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = pathlib.Path(folder.name)
+
+    def write(self, text, name='figure.xml'):
+        path = self.folder / name
+        path.write_text(text)
+        return path
+
+
+def compiled(row):
+    root = characters.make(row).mjcf_model
+    return mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+
+
+def rolled(environment, actions):
+    """Returns observations and rewards of a single environment, in flat rows."""
+    steps = [environment.reset(), *map(environment.step, actions)]
+    return np.array([s.observation['observations'] for s in steps]), [s.reward for s in steps[1:]]
+
+
+class CharacterTest(Folder):
+    """Characters from files."""
+
+    def planar(self, text=MJCF, **options):
+        return characters.from_file(self.write(text), **{**PLANAR, **options})
+
+    def test_urdf_keeps_masses_limits_and_efforts(self):
+        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        model = compiled(row)
+        np.testing.assert_array_equal(model.body_mass[1:], [5, 2])
+        np.testing.assert_array_equal(model.jnt_range, [[-0.7, 0.4]])
+        np.testing.assert_array_equal(model.jnt_actfrcrange, [[-35, 35]])
+        self.assertEqual(
+            (row.name, row.links, tuple(row.joints)), ('two', ('trunk', 'leg'), ('hip',))
+        )
+        self.assertEqual(row.joints['hip'].kp, 35)  # the file has no servo: all at 1 rad
+        self.assertLen(row.notes, 1)
+        self.assertIn('hip 35', row.notes[0])
+
+    def test_fixed_links_stay_as_end_effectors(self):
+        foot = '<link name="foot"/><joint name="f" type="fixed"><parent link="leg"/><child link="foot"/><origin xyz="0 0 -.4"/></joint></robot>'
+        path = self.write(URDF.replace('</robot>', foot), 'two.urdf')
+        row = characters.from_file(path, **{**TWO, 'end_effectors': ('foot',)})
+        self.assertEqual(row.links, ('trunk', 'leg'))  # what has no mass is no link
+        suite.build(row, task='walk').reset()
+
+    def test_actuators_key_frame_and_defaults(self):
+        row = self.planar()
+        self.assertFalse(row.spatial)
+        hip, knee, other = (row.joints[n] for n in ('right_hip', 'right_knee', 'left_hip'))
+        self.assertEqual((hip.kp, hip.kd, hip.target), (90, 3, 0.2))
+        self.assertEqual((knee.kp, knee.target), (50, -0.3))
+        model = compiled(row)
+        limits = dict(zip(row.joints, model.jnt_actfrcrange[:, 1], strict=True))
+        self.assertEqual((limits['right_hip'], limits['right_knee']), (70, 50))
+        # The weight at the end of the leg, 0.84 m below the hip.
+        self.assertAlmostEqual(limits['left_hip'], model.body_mass.sum() * 9.8 * 0.84, delta=1e-6)
+        self.assertAlmostEqual(other.kd, other.kp / 10)
+        self.assertEqual(model.nu + model.nkey + model.nsensor, 0)
+        np.testing.assert_allclose(model.jnt_range[1], [-2 * np.pi / 3, 0])
+        self.assertEqual(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, 'floor'), -1)
+
+    def test_own_figures_replace_those_found(self):
+        mine = characters.Joint(kp=10, kd=1, weight=0.5)
+        self.assertIs(self.planar(joints={'left_hip': mine}).joints['left_hip'], mine)
+
+    def test_meshes_travel_with_the_row(self):
+        trimesh.creation.icosphere(radius=0.2).export(self.folder / 'ball.obj')
+        text = MJCF.replace('<worldbody>', '<asset><mesh file="ball.obj"/></asset><worldbody>', 1)
+        text = text.replace('<geom size=".15 .15 .2" type="box"', '<geom type="mesh" mesh="ball"')
+        row = pickle.loads(pickle.dumps(self.planar(text)))
+        (self.folder / 'ball.obj').unlink()
+        row = pickle.loads(pickle.dumps(row))
+        trunk = compiled(row).body_mass[1]
+        self.assertAlmostEqual(trunk, 1000 * 4 / 3 * np.pi * 0.2**3, delta=0.05 * trunk)
+
+    def test_urdf_meshes_lie_in_their_package(self):
+        (self.folder / 'urdf').mkdir()
+        (self.folder / 'meshes').mkdir()
+        trimesh.creation.box((0.1, 0.1, 0.4)).export(self.folder / 'meshes' / 'leg.stl')
+        mesh = '<mesh filename="package://robot/meshes/leg.stl"/>'
+        looks = '<visual><geometry><mesh filename="package://robot/no.dae"/></geometry></visual>'
+        text = URDF.replace('<box size=".1 .1 .4"/>', mesh).replace(
+            '<collision>', looks + '<collision>'
+        )
+        row = characters.from_file(self.write(text, 'urdf/two.urdf'), **TWO)
+        self.assertLen(row.assets, 1)
+        np.testing.assert_allclose(compiled(row).geom_size[0], [0.05, 0.05, 0.2], atol=1e-6)
+
+    @parameterized.parameters('position', 'torque', 'velocity')
+    def test_it_starts_on_the_ground(self, actuation):
+        environment = suite.build(
+            self.planar(), actuation, 'gaps', 'walk', task_kwargs={'random': 1}
+        )
+        environment.reset()
+        data, model = environment.physics.data, environment.physics.model
+        shins = [i for i in range(model.nbody) if 'shin' in model.id2name(i, 'body')]
+        ends = data.xpos[shins] - 0.4 * data.xmat[shins].reshape(-1, 3, 3)[:, :, 2]
+        self.assertBetween(ends[:, 2].min() - 0.04, 0, 0.02)  # the box around a capsule is clear
+        environment.step(np.zeros(4))
+
+    @parameterized.parameters(*terrain.PRESETS3D)
+    def test_every_spatial_preset(self, preset):
+        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        environment = suite.build(row, terrain=preset, task='walk', task_kwargs={'random': 2})
+        environment.reset()
+        for _ in range(2):
+            self.assertTrue(np.isfinite(environment.step(np.ones(1)).reward))
+
+    @parameterized.parameters(*list(terrain.PRESETS)[::6])
+    def test_planar_presets(self, preset):
+        environment = suite.build(self.planar(), terrain=preset, task='walk')
+        environment.reset()
+        self.assertTrue(np.isfinite(environment.step(np.ones(4)).reward))
+
+    def test_imitation_of_a_clip(self):
+        row = self.planar()
+        poses = np.zeros((3, 7))
+        poses[:, 0], poses[:, 1], poses[1, 3:] = (0, 0.5, 1), 0.8, (0.3, -0.2, -0.3, -0.4)
+        clip = motion.Clip(
+            'steps', np.arange(3) / 2, poses, 'planar', tuple(row.joints), (1,) * 4, True
+        )
+        environment = suite.build(row, terrain='slopes', clip=clip, task_kwargs={'random': 0})
+        environment.reset()
+        reward = environment.step(environment.task.clip_action(0)).reward
+        self.assertBetween(reward, 0.5, 1)
+        with self.assertRaisesRegex(ValueError, "no clip of its own; give clip=, or task='walk'"):
+            suite.build(row)
+
+    def test_spatial_imitation_of_a_clip(self):
+        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        poses = np.tile([0.0, 0, 0.8, 1, 0, 0, 0, 0], (3, 1))
+        poses[1, -1] = 0.3
+        clip = motion.Clip('nod', np.arange(3) / 2, poses, 'free', ('hip',), (1,), True)
+        environment = suite.build(row, terrain='hills3d', clip=clip, task_kwargs={'random': 0})
+        environment.reset()
+        self.assertGreater(environment.step(environment.task.clip_action(0)).reward, 0.5)
+        with self.assertRaisesRegex(ValueError, 'no pairs of right and left'):
+            suite.build(row, clip=clip, task_kwargs={'mirrored': True})
+
+    @parameterized.named_parameters(
+        ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
+        ('inner_root', {'root': 'left_shin'}, "hangs on another body; did you mean 'trunk'"),
+        ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
+        ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
+        ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
+        ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
+        ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
+        ('name', {'name': 'dog'}, "may not be named 'dog'"),
+    )  # fmt: skip
+    def test_bad_names(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            self.planar(**options)
+
+    @parameterized.named_parameters(
+        ('twice', 'name="left_knee"', 'name="left_hip"', "repeated name 'left_hip' in joint"),
+        ('no_geoms', '<geom ', '<geom contype="0" conaffinity="0" ', 'no geom of the character can'),
+        ('no_root_joints', 'name="x" type="slide"', 'name="x"', 'has hinge, hinge, slide; expected'),
+        ('out_of_plane', 'name="left_knee" axis="0 -1 0"', 'name="left_knee" axis="1 0 0"', "hinge 'left_knee' .* leaves"),
+        ('free_slide', 'name="left_knee" axis="0 -1 0" range="-120 0"', 'name="left_knee" type="slide" axis="0 0 1"', "slide 'left_knee' has no limits"),
+        ('mass', '<geom type="capsule"', '<geom mass="0" type="capsule"', 'mass and inertia of moving bodies'),
+        ('turned', 'name="trunk" pos="0 0 1"', 'name="trunk" euler="0 0 90"', "root 'trunk' is turned"),
+        ('two_roots', '</worldbody>', '<body name="ball"><freejoint/><geom size="1"/></body></worldbody>', 'several bodies may be the root'),
+        ('broken', '</mujoco>', '', 'not a model'),
+        ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
+    )  # fmt: skip
+    def test_bad_files(self, before, after, message):
+        self.assertIn(before, MJCF)
+        with self.assertRaisesRegex(ValueError, f'figure.xml: .*{message}'):
+            self.planar(MJCF.replace(before, after))
+
+    def test_missing_file_and_what_a_urdf_does_not_tell(self):
+        path = self.write(URDF, 'two.urdf')
+        with self.assertRaisesRegex(FileNotFoundError, "did you mean 'two.urdf'"):
+            characters.from_file(self.folder / 'tow.urdf', **TWO)
+        with self.assertRaisesRegex(ValueError, 'spatial=True or spatial=False'):
+            characters.from_file(path, **{**TWO, 'spatial': None})
+        with self.assertRaisesRegex(ValueError, 'expected .xml or .mjcf or .urdf'):
+            characters.from_file('robot.usd', **TWO)
+
+
+def bowl(x, y):
+    """Heights, m."""
+    return 0.1 * (x**2 + y**2) / (1 + 0.1 * (x**2 + y**2))
+
+
+def vee(x):
+    """Heights, m."""
+    return 0.2 * np.abs(x)
+
+
+class TerrainTest(Folder):
+    """Terrain from functions, arrays, pictures and meshes; meshes from terrain."""
+
+    def rest(self, ground, x, y=0.0):
+        """Returns where a ball of 0.1 m comes to lie that is dropped onto a terrain, (3,) m."""
+        arena = (SpatialTerrain if ground.spatial else PlanarTerrain)(ground)
+        ball = arena.mjcf_model.worldbody.add('body', name='ball', pos=(x, y, 1.5))
+        ball.add('freejoint')
+        ball.add('geom', size=(0.1,), condim=6, friction=(1, 0.01, 0.005))
+        root = arena.mjcf_model
+        physics = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
+        batch = world.BatchWorld(physics, 1, 1)
+        arena.bind(batch)
+        arena.begin_episode(0, (terrain.Ground if ground.spatial else terrain.Strip)(ground, 0))
+        batch.step(5000)
+        return batch.qpos[0, :3].copy()
+
+    def test_a_ball_rests_on_a_mesh(self):
+        table = trimesh.creation.box(
+            (4, 4, 1), trimesh.transformations.translation_matrix((0, 0, 0))
+        )
+        table.export(self.folder / 'table.stl')
+        mine = terrain.from_mesh(self.folder / 'table.stl')
+        np.testing.assert_allclose(self.rest(mine, 0.7, 0.4)[2], 0.5 + 0.1, atol=0.003)
+
+    def test_a_ball_rolls_to_the_bottom_of_a_function(self):
+        x, y, z = self.rest(terrain.from_function(bowl), 0.6, 0.5)
+        self.assertLess(np.hypot(x, y), 0.4)
+        self.assertAlmostEqual(z, 0.1 + bowl(x, y), delta=0.01)
+
+    def test_a_ball_rests_on_a_line(self):
+        stair = terrain.from_heights([0.0, 0, 0, 1, 1, 1], 0.5, first=-2)
+        np.testing.assert_allclose(self.rest(stair, 1.0)[2], 1.1, atol=0.003)
+        np.testing.assert_allclose(self.rest(stair, -0.5)[2], 0.1, atol=0.003)
+
+    @parameterized.product(preset=list(terrain.PRESETS3D)[::3], suffix=('.obj', '.glb', '.stl'))
+    def test_a_written_mesh_read_again_has_the_same_heights(self, preset, suffix):
+        ground = terrain.Ground(terrain.load(preset), 3)
+        path = self.folder / f'ground{suffix}'
+        terrain.save_mesh(ground, path, -4, 4)
+        self.assertEqual([p.name for p in self.folder.iterdir()], [path.name])
+        again = terrain.Ground(terrain.from_mesh(path), 0)
+        i = 0.2 * np.arange(-19, 20)
+        x, y = np.meshgrid(i, i, indexing='ij')
+        # At an upright face a point may fall to either side.
+        near = [ground.height(x + dx, y + dy) for dx in (-1e-4, 1e-4) for dy in (-1e-4, 1e-4)]
+        found = again.height(x, y)
+        self.assertTrue((found >= np.min(near, 0) - 1e-3).all())
+        self.assertTrue((found <= np.max(near, 0) + 1e-3).all())
+
+    def test_a_strip_written_and_read_as_a_line(self):
+        strip = terrain.Strip(terrain.load('slopes_mixed'), 4)
+        terrain.save_mesh(strip, self.folder / 'strip.obj', -2, 12)
+        mine = terrain.from_mesh(self.folder / 'strip.obj', terrain.SPACING, line=0.0)
+        again = terrain.Strip(mine, 0)
+        x = np.arange(-60, 460) * terrain.SPACING
+        np.testing.assert_allclose(again.height(x), strip.height(x), atol=1e-4)
+        self.assertGreater(again.window(-60, 520)[1].sum(), 0)  # steep cells are faces
+
+    def test_the_command_line_writes_meshes(self):
+        path = self.folder / 'pillars.stl'
+        self.assertEqual(cli.main(['terrain', 'pillars3d', '--output', str(path)]), 0)
+        low, high = trimesh.load_mesh(path).bounds
+        np.testing.assert_allclose((low[:2], high[:2]), [[-20, -20], [20, 20]], atol=1e-4)
+        self.assertBetween(high[2], 6, 8)  # pillars are 2 to 8 m high
+
+    def test_image(self):
+        grey = np.zeros((5, 7), np.uint16)
+        grey[0, 5] = 65535  # ahead and to the left: x = 2, y = 2 pixels
+        imageio.imwrite(self.folder / 'hill.png', grey)
+        ground = terrain.Ground(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2), 0)
+        self.assertAlmostEqual(float(ground.height(0.4, 0.4)), 2)
+        self.assertAlmostEqual(float(ground.height(0.2, 0.4)), -1)
+        # Its rim goes on.
+        self.assertAlmostEqual(float(ground.height(0.4, 9)), 2)
+        line = terrain.Strip(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0)
+        np.testing.assert_allclose(line.height([0.4, 0.3, 0.2]), [2, 0.5, -1])
+
+    def test_starts_are_spread_by_the_seed(self):
+        for draw, mine, at in (
+            (terrain.Strip, terrain.from_function(vee, start_span=5), lambda g: g.height(0)),
+            (terrain.Ground, terrain.from_function(bowl, start_span=5), lambda g: g.height(0, 0)),
+        ):
+            heights = [float(at(draw(mine, seed))) for seed in range(20)]
+            self.assertGreater(np.ptp(heights), 0.4)
+            ground = draw(mine, 7)
+            self.assertEqual(heights[7], at(ground))
+            self.assertEqual(heights[7], at(draw.from_state(ground.state())))
+
+    def test_a_line_does_not_depend_on_when_it_is_asked(self):
+        mine = terrain.from_function(vee)
+        whole, piecewise = terrain.Strip(mine, 0), terrain.Strip(mine, 0)
+        for x in (0, 30, -30, 90, -55):
+            piecewise.height(x)
+        x = np.linspace(-60, 95, 500)
+        np.testing.assert_array_equal(whole.height(x), piecewise.height(x))
+        np.testing.assert_allclose(whole.height(x), vee(x), atol=0.2 * terrain.SPACING)
+
+    def test_terrain_crosses_processes(self):
+        mine = terrain.from_heights(np.random.default_rng(0).random((9, 9)), 0.3, start_span=1)
+        again = pickle.loads(pickle.dumps(mine))
+        self.assertEqual(again, mine)
+        grounds = [terrain.Ground(each, 5).height(0.3, 0.1) for each in (mine, again)]
+        self.assertEqual(*grounds)
+
+    @parameterized.parameters(('biped2d', vee), ('biped3d', bowl))
+    def test_a_batch_is_bit_for_bit_the_single_environments(self, character, function):
+        row = suite.combine(character, terrain=terrain.from_function(function, start_span=3))
+        many = VectorEnvironment(row, 3, seed=1)
+        actions = np.random.default_rng(0).uniform(-1, 1, (12, 3, len(many.action_map)))
+        first = many.reset()
+        seen = np.array([first, *(many.step(action).observation for action in actions)])
+        for i in (0, 2):
+            options = {'random': int(many.seeds[i])}
+            single = suite.build_row(row, options, {'flat_observation': True})
+            np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
+
+    @parameterized.named_parameters(
+        ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name of its own'),
+        ('taken', lambda _: terrain.from_function(np.abs, 'var2d_gaps'), 'exists; pass replace'),
+        ('arguments', lambda _: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
+        ('shape', lambda _: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
+        ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; those at \[1\]'),
+        ('spacing', lambda _: terrain.from_heights([0, 0], 0), 'spacing is 0'),
+        ('suffix', lambda _: terrain.from_mesh('hill.fbx'), "suffix '.fbx'; expected .obj or"),
+        ('away', lambda f: terrain.from_mesh(f / 'away.stl'), 'not over the origin'),
+        ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
+        ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
+        ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
+        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture'),
+        ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
+        ('large', lambda _: terrain.to_mesh(terrain.Ground(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
+        ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
+    )  # fmt: skip
+    def test_bad_input(self, make, message):
+        box = trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix((9, 0, 0)))
+        box.export(self.folder / 'away.stl')
+        self.write('nothing', 'broken.obj')
+        self.write('nothing', 'broken.png')
+        with self.assertRaisesRegex(ValueError, message):
+            make(self.folder)
+
+    def test_missing_files(self):
+        for make in (terrain.from_mesh, lambda path: terrain.from_image(path, 1)):
+            with self.assertRaisesRegex(FileNotFoundError, 'no such file'):
+                make(self.folder / ('a.obj' if make is terrain.from_mesh else 'a.png'))
+
+
+def tall(task):
+    """Rows whose root is high."""
+    return parts.height(task) > 0.5
+
+
+PARTS = {
+    'rewards': {'fast': (0.5, parts.speed), 'lazy': (-0.1, parts.effort)},
+    'observations': {'speed': (1, parts.speed), 'angles': (2, lambda t: parts.joint_angles(t)[:, :2])},
+    'failures': {'off': lambda task: parts.speed(task) > 1e3},
+}  # fmt: skip
+
+
+class Rise(Walk):
+    """A task of a user's."""
+
+    def finish_step(self, stepped=None):
+        super().finish_step(stepped)
+        self.reward[:] = parts.height(self)
+
+
+class TaskTest(parameterized.TestCase):
+    """Tasks from parts."""
+
+    @parameterized.parameters(
+        'PD_Biped2D_Gaps_Terrain-v0', 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
+    )
+    def test_parts_beside_a_task_of_the_suite(self, id):
+        many = VectorEnvironment(id, 3, seed=2, task_kwargs=PARTS)
+        plain = VectorEnvironment(id, 3, seed=2)
+        count = 2 if id.startswith('FSM') else 20  # whole cycles
+        actions = np.random.default_rng(0).uniform(-1, 1, (count, 3, len(many.action_map)))
+        seen, rewards = [many.reset()], []
+        np.testing.assert_array_equal(seen[0][:, :-3], plain.reset())
+        for action in actions:
+            step, other = many.step(action), plain.step(action)
+            seen.append(step.observation)
+            rewards.append(step.reward)
+            np.testing.assert_array_equal(step.observation[:, :-3], other.observation)
+            np.testing.assert_array_equal(step.terminated, other.terminated)
+            terms = step.info['reward_terms']
+            np.testing.assert_allclose(sum(terms.values()), step.reward, atol=1e-12)
+            np.testing.assert_allclose(
+                step.reward - terms['fast'] - terms['lazy'], other.reward, atol=1e-12
+            )
+            self.assertEqual(step.observation.shape[1], many.blocks['angles'].stop)
+        single = suite.make(id, {'random': int(many.seeds[1]), **PARTS}, {'flat_observation': True})
+        found, gained = rolled(single, actions[:, 1])
+        np.testing.assert_array_equal(found, np.array(seen)[:, 1])
+        np.testing.assert_array_equal([r or 0.0 for r in gained], np.array(rewards)[:, 1])
+
+    def test_values_are_what_they_say(self):
+        environment = suite.make('PD_Biped2D_Flat-v0', {'random': 1, **PARTS})
+        environment.reset()
+        data = environment.physics.named.data
+        for _ in range(3):
+            step = environment.step(np.full(11, 0.5))
+        self.assertEqual(step.observation['speed'][0], data.qvel['biped2d_full/root_x/'][0])
+        self.assertAlmostEqual(environment.info['reward_terms']['lazy'], -0.1 * 0.25)
+
+    def test_a_failure_ends_the_episode(self):
+        environment = suite.make('PD_Biped2D_Flat-v0', {'random': 1, 'failures': {'tall': tall}})
+        environment.reset()
+        step = environment.step(np.zeros(11))
+        self.assertTrue(step.last())
+        self.assertEqual(step.discount, 0)
+        self.assertFalse(environment.info['fell'])
+
+    def test_state_and_pickle(self):
+        own = {'rewards': {'fast': (0.5, parts.speed)}, 'observations': {'speed': (1, parts.speed)}}
+        environment = suite.build(
+            'dog', terrain='gaps', task='walk', task_kwargs={'random': 1, **own}
+        )
+        environment.reset()
+        environment.step(np.full(20, 0.1))
+        again = pickle.loads(pickle.dumps(environment))
+        for _ in range(3):
+            first, second = (e.step(np.full(20, -0.1)) for e in (environment, again))
+            self.assertEqual(first.reward, second.reward)
+            np.testing.assert_array_equal(first.observation['pose'], second.observation['pose'])
+
+    def test_gymnasium(self):
+        row = suite.combine('biped3d', terrain='hills3d', task='walk')
+        env = gym.SuiteEnv(row, task_kwargs=PARTS | {'terrain_view': True})
+        observation, _ = env.reset(seed=1)
+        self.assertEqual(observation.shape, (1024 + 57 + 48 + 2 + 3,))
+        envs = gym.SuiteVectorEnv(row, 2, task_kwargs=PARTS)
+        envs.reset(seed=1)
+        _, reward, *_ = envs.step(envs.action_space.sample())
+        self.assertEqual(reward.shape, (2,))
+
+    @parameterized.parameters('biped2d', 'biped3d')
+    def test_a_task_of_the_users(self, character):
+        row = suite.combine(character, task=Rise)
+        environment = suite.build(
+            character, task=Rise, task_kwargs={'random': 1, 'half_range': 1.0}
+        )
+        environment.reset()
+        height = environment.step(np.zeros(environment.action_spec().shape)).reward
+        self.assertBetween(height, 0.6, 1.0)
+        many = VectorEnvironment(row, 2, seed=0)
+        many.reset()
+        np.testing.assert_allclose(
+            many.step(np.zeros((2, len(many.action_map)))).reward, height, atol=0.05
+        )
+        with self.assertRaisesRegex(ValueError, "unknown option .*'half_rang'.*'half_range'"):
+            suite.build(character, task=Rise, task_kwargs={'half_rang': 1})
+
+    def test_walking_is_rewarded(self):
+        environment = suite.build('biped3d', task='walk', task_kwargs={'random': 1})
+        environment.reset()
+        action = np.zeros(environment.action_spec().shape)
+        standing = environment.step(action).reward
+        self.assertBetween(standing, 0.25, 0.4)
+        environment.physics.data.qvel[0] = environment.task.pace
+        self.assertBetween(environment.step(action).reward, 0.8, 1.0)
+
+    @parameterized.named_parameters(
+        ('shape', {'rewards': {'a': (1, parts.joint_angles)}}, r"reward 'a' has shape \(1, 11\)"),
+        ('finite', {'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is not finite"),
+        ('size', {'observations': {'a': (0, parts.speed)}}, 'size 0'),
+        ('taken', {'observations': {'pose': (1, parts.speed)}}, "block 'pose' already"),
+        ('pair', {'rewards': {'a': parts.speed}}, r'expected \(weight, function\)'),
+        ('function', {'failures': {'a': 1}}, 'expected a function'),
+        ('dict', {'rewards': [1]}, 'expected a dict'),
+        ('option', {'reward': {}}, "did you mean 'rewards'"),
+    )
+    def test_bad_parts(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            environment = suite.make('PD_Biped2D_Flat-v0', options)
+            environment.reset()
+            environment.step(np.zeros(11))
+
+
+class ExampleTest(Folder):
+    """The examples run and are short; so does the page."""
+
+    def test_page(self):
+        page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')
+        code = '\n'.join(re.findall('```python\n(.*?)```', page, re.DOTALL))
+        with contextlib.chdir(self.folder):
+            exec(compile(code, 'make_your_own.md', 'exec'), {'__name__': 'page'})
+
+    @parameterized.parameters('own_character', 'own_terrain', 'own_task')
+    def test_example(self, name):
+        path, output = EXAMPLES / f'{name}.py', self.folder / 'picture.png'
+        self.assertLess(len(path.read_text().splitlines()), 40)
+        with mock.patch.object(sys, 'argv', [name, '--output', str(output)]):
+            runpy.run_path(str(path), run_name='__main__')
+        self.assertGreater(imageio.imread(output).std(), 10)
+
+
+if __name__ == '__main__':
+    absltest.main()

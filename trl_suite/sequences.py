@@ -1,0 +1,376 @@
+"""Sequences of environments as benchmarks for multi-task and continual learning.
+
+    from trl_suite import sequences
+
+    sequence = sequences.get('plaid_biped')
+    result = sequences.run(sequence, learner, budget=200_000, path='result.json')
+    print(sequences.forgetting(result['scores']))
+
+A learner sees the environments one after the other and is scored on all of them after each. All
+environments of a sequence have the same observation and action, so that one network serves them.
+For multi-task learning take `sequence.ids` in any order and score the outcome with `scores`.
+
+Seeds below 2**31 are for training, those from 2**31 on for tests: `train_seeds` and `test_seeds` can
+never meet. An episode draws the 128-bit seed of its ground from the stream of its environment's
+seed, so that other seeds mean another ground. The runner tests with test seeds; a learner is
+expected to train with `VectorEnvironment(id, n, seed=train_seeds(n, seed))`.
+
+Metrics take a matrix R, R[i, j] the score on task j after training on tasks 0 to i.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import tqdm
+from numpy.typing import ArrayLike
+
+import trl_suite
+from trl_suite import catalogue, errors, evaluation, files
+
+FIRST_TEST_SEED = 2**31  # of 2**32; smaller ones are for training
+EPISODES = 32  # of every test
+SCORE = 'fraction'  # what counts of an evaluation: the mean return over the step limit
+_SETTINGS = ('sequence', 'ids', 'budget', 'episodes', 'seed')  # that a result must agree on
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """Environments in the order in which they are to be learnt.
+
+    Attributes:
+      name: name in `SEQUENCES`, or the user's own.
+      ids: of the environments, T of them, each once.
+      description: one line.
+
+    Raises:
+      ValueError: an id is unknown (the message has the closest matches) or occurs twice.
+    """
+
+    name: str
+    ids: tuple[str, ...]
+    description: str = ''
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'ids', tuple(catalogue.find(id).id for id in self.ids))
+        if len(self) < 2 or len(set(self.ids)) < len(self):
+            raise ValueError(
+                f'sequence {self.name!r}: expected two or more environments, each once; got '
+                f'{", ".join(self.ids)}'
+            )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+# The order of PLAiD (Berseth et al. 2018), and the family's other terrains behind it.
+_PLAID = ('Flat', 'Incline', 'Steps', 'Slopes', 'Gaps')
+_MORE = ('Walls', 'Mixed', 'Slopes_Mixed')
+# From level ground with single features to all of them on slopes.
+_GAITS = ('Steps', 'Walls', 'Gaps', 'Mixed', 'Slopes', 'Slopes_Mixed', 'Cliffs', 'Stairs_Rugged')
+_FAMILIES = (
+    ('plaid', 'PD_{}_{}_Terrain-v0', _PLAID, 'tracks a clip over'),
+    ('plaid_long', 'PD_{}_{}_Terrain-v0', _PLAID + _MORE, 'tracks a clip over'),
+    ('gaits', 'FSM_{}_Terrain_{}-v0', _GAITS, 'sets the gait of every cycle to cross'),
+)
+
+SEQUENCES: dict[str, Sequence] = {
+    f'{family}_{figure}': Sequence(
+        f'{family}_{figure}',
+        tuple(id.format(f'{figure.capitalize()}2D', terrain) for terrain in terrains),
+        f'The {figure} {words} {", ".join(terrains).lower()}.',
+    )
+    for family, id, terrains, words in _FAMILIES
+    for figure in ('biped', 'dog', 'raptor')
+}
+
+
+def get(name: str) -> Sequence:
+    """Returns a sequence by its name in `SEQUENCES`.
+
+    Raises:
+      ValueError: an unknown name; the message has the closest matches.
+    """
+    if name not in SEQUENCES:
+        raise ValueError(errors.unknown('sequence', name, SEQUENCES))
+    return SEQUENCES[name]
+
+
+def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
+    """Returns seeds for training, integers in [0, 2**31): as `VectorEnvironment` takes them.
+
+    Args:
+      count: how many.
+      seed: of the seeds, e.g. (run, stage).
+    """
+    return [number % FIRST_TEST_SEED for number in _drawn(count, seed)]
+
+
+def test_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
+    """Returns seeds for tests, integers in [2**31, 2**32): as `evaluation.evaluate` takes them.
+
+    Arguments are those of `train_seeds`.
+    """
+    return [FIRST_TEST_SEED + number for number in train_seeds(count, seed)]
+
+
+def _drawn(count: int, seed: int | tuple[int, ...]) -> list[int]:
+    return np.random.SeedSequence(seed).generate_state(count, np.uint32).tolist()
+
+
+# Metrics
+
+
+def average_performance(scores: ArrayLike) -> float:
+    """Mean score over all tasks after the last (Lopez-Paz & Ranzato 2017, ACC).
+
+    Args:
+      scores: R, (T, T), like all arguments of that name; entries that a metric does not need may be
+        NaN.
+
+    Raises:
+      ValueError: R is not square, has fewer than two tasks, or lacks an entry that is needed. So
+        do all metrics.
+    """
+    return _mean(_matrix(scores)[-1])
+
+
+def backward_transfer(scores: ArrayLike) -> float:
+    """What later tasks changed about earlier ones (Lopez-Paz & Ranzato 2017, BWT); < 0: forgotten.
+
+    The mean over j < T - 1 of R[T-1, j] - R[j, j].
+    """
+    found = _matrix(scores)
+    return _mean((found[-1] - np.diag(found))[:-1])
+
+
+def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
+    """What earlier tasks do for one not yet learnt (Lopez-Paz & Ranzato 2017, FWT).
+
+    The mean over j > 0 of R[j-1, j] - initial[j].
+
+    Args:
+      scores: R.
+      initial: scores before any training, (T,).
+    """
+    found, begin = _matrix(scores), np.asarray(initial, float)
+    if begin.shape != found.shape[:1]:
+        raise ValueError(f'initial: shape is {begin.shape}; expected {found.shape[:1]}')
+    return _mean(np.diag(found, 1) - begin[1:])
+
+
+def forgetting(scores: ArrayLike) -> float:
+    """How far tasks end below the best they ever were (Chaudhry et al. 2018); >= 0 is usual.
+
+    The mean over j < T - 1 of max over i < T - 1 of R[i, j], less R[T-1, j].
+    """
+    found = _matrix(scores)
+    return _mean((found[:-1].max(0) - found[-1])[:-1])
+
+
+def metrics(scores: ArrayLike, initial: ArrayLike) -> dict[str, float]:
+    """Returns all metrics by name; see each for its definition.
+
+    Lopez-Paz & Ranzato: Gradient Episodic Memory for Continual Learning. NeurIPS 2017. Chaudhry,
+    Dokania, Ajanthan & Torr: Riemannian Walk for Incremental Learning. ECCV 2018.
+    """
+    return {
+        'average_performance': average_performance(scores),
+        'forgetting': forgetting(scores),
+        'backward_transfer': backward_transfer(scores),
+        'forward_transfer': forward_transfer(scores, initial),
+    }
+
+
+def _matrix(scores: ArrayLike) -> np.ndarray:
+    found = np.asarray(scores, float)
+    if found.ndim != 2 or found.shape[0] != found.shape[1] or len(found) < 2:
+        raise ValueError(f'scores: shape is {found.shape}; expected (T, T) with T >= 2')
+    return found
+
+
+def _mean(values: np.ndarray) -> float:
+    if not np.isfinite(values).all():
+        raise ValueError(f'scores: an entry that is needed is not finite: {values.tolist()}')
+    return float(values.mean())
+
+
+# Runs
+
+
+class Learner(Protocol):
+    """What the runner needs of a learner."""
+
+    def learn(self, environment: str, budget: int) -> None:
+        """Goes on learning, in the environment of this id, for `budget` control steps."""
+
+    def policy(self, environment: str) -> Callable[[np.ndarray], np.ndarray]:
+        """Returns the present policy: observations (n, k) -> actions (n, a), without noise.
+
+        It is also asked before the first `learn`. Who must not be told the task ignores the id.
+        """
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """What a learner also has if a run shall go on after an interruption."""
+
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes everything that the future depends on into an empty folder."""
+
+    def load(self, folder: pathlib.Path) -> None:
+        """Takes over what `save` wrote there."""
+
+
+def scores(
+    sequence: Sequence,
+    learner: Learner,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    num_threads: int = 0,
+) -> list[float]:
+    """Tests the present policy of a learner on all tasks.
+
+    Args:
+      sequence: the tasks.
+      learner: whose policy is tested.
+      episodes: of every task, the same ones whenever it is called with this seed.
+      seed: of the test seeds.
+      num_threads: threads that step the physics; 0 takes all cores.
+
+    Returns:
+      Mean returns over the step limit, (T,).
+    """
+    seeds = test_seeds(episodes, seed)
+    return [
+        evaluation.evaluate(id, learner.policy(id), episodes, seeds, num_threads)[SCORE]
+        for id in sequence.ids
+    ]
+
+
+def run(
+    sequence: Sequence | str,
+    learner: Learner,
+    budget: int,
+    path: str | os.PathLike[str],
+    episodes: int = EPISODES,
+    seed: int = 0,
+    num_threads: int = 0,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Has a learner learn one environment after the other; tests it on all before and after each.
+
+    After every stage the result is written. If there is one at `path` of the same settings, the run
+    goes on behind its last stage, provided that the learner is `Resumable`: what it saved lies beside
+    the result, in a folder of its name that ends in .stageN. A finished result is returned as it is.
+
+    Args:
+      sequence: the tasks, or their name.
+      learner: see `Learner`.
+      budget: control steps for each task.
+      path: of the result; .json.
+      episodes: of every test.
+      seed: of the test seeds.
+      num_threads: threads that step the physics in tests; 0 takes all cores.
+      progress: show a bar.
+
+    Returns:
+      What the file holds: the settings 'sequence', 'ids', 'budget', 'episodes', 'seed'; 'initial',
+      scores before any training (T,); 'scores', R as far as it is known, a row per stage; and once
+      all are done 'metrics'.
+
+    Raises:
+      ValueError: bad arguments, a result of other settings, or a learner that cannot go on.
+      OSError: a file cannot be read or written.
+    """
+    sequence = get(sequence) if isinstance(sequence, str) else sequence
+    for name, value in (('budget', budget), ('episodes', episodes)):
+        if int(value) != value or value < 1:
+            raise ValueError(f'{name} is {value}; expected a positive integer')
+    path = files.check_path(path, ('.json',))
+    settings = (sequence.name, list(sequence.ids), int(budget), int(episodes), int(seed))
+    result: dict[str, Any] = dict(zip(_SETTINGS, settings, strict=True))
+    result |= {'trl_suite': trl_suite.__version__, 'initial': [], 'scores': []}
+    if path.exists():
+        result = _read(path, result)
+        done = len(result['scores'])
+        if 0 < done < len(sequence):
+            if not isinstance(learner, Resumable):
+                raise ValueError(
+                    f'{path} holds {done} of {len(sequence)} stages, and a {type(learner).__name__} '
+                    'has no load to go on from there; remove the file to begin anew'
+                )
+            learner.load(_stage(path, done))
+    test = (episodes, seed, num_threads)
+    with tqdm.tqdm(
+        total=len(sequence),
+        initial=len(result['scores']),
+        unit='stage',
+        disable=None if progress else True,
+    ) as bar:
+        if not result['initial']:
+            result['initial'] = scores(sequence, learner, *test)
+            _write(path, result)
+        for id in sequence.ids[len(result['scores']) :]:
+            bar.set_description(id)
+            learner.learn(id, int(budget))
+            result['scores'].append(scores(sequence, learner, *test))
+            done = len(result['scores'])
+            if done == len(sequence):
+                result['metrics'] = metrics(result['scores'], result['initial'])
+            elif isinstance(learner, Resumable):
+                with _folder(_stage(path, done)) as folder:
+                    learner.save(folder)
+            _write(path, result)  # from here on the stage counts, and the one before is not needed
+            shutil.rmtree(_stage(path, done - 1), ignore_errors=True)
+            bar.update()
+    return result
+
+
+def _stage(path: pathlib.Path, done: int) -> pathlib.Path:
+    return path.with_name(f'{path.stem}.stage{done}')
+
+
+@contextlib.contextmanager
+def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Yields a temporary folder that takes the place of `path` once all went well."""
+    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    part.mkdir()
+    try:
+        yield part
+        shutil.rmtree(path, ignore_errors=True)  # of a run that was cut before it wrote its result
+        os.replace(part, path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write(path: pathlib.Path, result: dict[str, Any]) -> None:
+    with files.replacing(path) as part:
+        part.write_text(f'{json.dumps(result, indent=1, allow_nan=False)}\n', encoding='utf-8')
+
+
+def _read(path: pathlib.Path, expected: dict[str, Any]) -> dict[str, Any]:
+    try:
+        result = json.loads(path.read_text(encoding='utf-8'))
+        tasks = len(expected['ids'])
+        whole = all(len(row) == tasks for row in result['scores'])
+        whole &= len(result['initial']) in (0, tasks) and len(result['scores']) <= tasks
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f'{path}: no result of a sequence ({error!r})') from None
+    for name in _SETTINGS:
+        if result.get(name) != expected[name]:
+            raise ValueError(
+                f'{path} holds a run with another {name}: {result.get(name)}; expected '
+                f'{expected[name]}'
+            )
+    if not whole:
+        raise ValueError(f'{path}: rows of scores that are not of {tasks} tasks')
+    return result

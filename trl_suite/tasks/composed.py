@@ -1,0 +1,224 @@
+"""A task with reward terms, observation blocks and failures of the user's beside its own.
+
+    def low(task):
+        return (parts.height(task) < 0.7).astype(float)
+
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={
+        'rewards': {'fast': (0.1, parts.speed)},
+        'observations': {'low': (1, low)},
+    })
+
+The same `task_kwargs` go into `VectorEnvironment` and Gymnasium.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from dm_control import composer
+
+from trl_suite import errors
+from trl_suite.tasks.task import Task, consecutive
+from trl_suite.world import World
+
+Function = Callable[[Any], np.ndarray]
+OPTIONS = ('rewards', 'observations', 'failures')
+
+
+class Composed(Task):
+    """Rules of another task, and some more.
+
+    A function is given this task and returns an array with a row per simulation. What it may read:
+    `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], all attributes of the other
+    task, and `trl_suite.tasks.parts`. It must treat rows alike and by themselves, and draw nothing.
+
+    Attributes:
+      task: the other one.
+      action: what was last done, (n, k); 0 at a start.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        rewards: Mapping[str, tuple[float, Function]] | None = None,
+        observations: Mapping[str, tuple[int, Function]] | None = None,
+        failures: Mapping[str, Function] | None = None,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          task: any task that nothing else uses.
+          rewards: name -> weight, function -> (n,). weight * value is added to the reward, but in
+            steps in which the other task fails.
+          observations: name -> size, function -> (n, size), or (n,) if the size is 1. Blocks
+            behind those of the other task.
+          failures: name -> function -> (n,) bool; where True, the episode ends with discount 0.
+
+        Raises:
+          ValueError: a name that is taken, a weight or a size that is none, or no function.
+        """
+        self.task = task
+        self._rewards, self._extras = dict(rewards or {}), dict(observations or {})
+        self._failures = dict(failures or {})
+        for name, (weight, function) in self._rewards.items():
+            _check('reward', name, function, np.isfinite(weight), f'weight {weight!r}')
+        for name, (size, function) in self._extras.items():
+            whole = isinstance(size, (int, np.integer)) and size > 0
+            _check('observation', name, function, whole, f'size {size!r}')
+            if name in task.blocks:
+                raise ValueError(f'the task has a block {name!r} already; name it otherwise')
+        for name, function in self._failures.items():
+            _check('failure', name, function, True, '')
+        self.set_timesteps(task.control_timestep, task.physics_timestep)
+        self.fields, self.action_map = task.fields, task.action_map
+        sizes = {name: part.stop - part.start for name, part in task.blocks.items()}
+        self.blocks = consecutive(sizes | {name: size for name, (size, _) in self._extras.items()})
+        self._own = sum(sizes.values())
+        self.mirror = None  # nothing tells how to reflect what was added
+
+    def __getattr__(self, name: str) -> Any:
+        if name == 'task' or name.startswith('__'):  # while being copied
+            raise AttributeError(name)
+        return getattr(self.task, name)
+
+    @property
+    def watch(self) -> Any:
+        """What is to be called within long steps, where the other task has such; for pictures."""
+        return self.task.watch  # type: ignore[attr-defined]
+
+    @watch.setter
+    def watch(self, look: Callable[[], None] | None) -> None:
+        self.task.watch = look  # type: ignore[attr-defined]
+
+    @property
+    def root_entity(self) -> composer.Entity:
+        return self.task.root_entity
+
+    @property
+    def signature(self) -> str:
+        added = ', '.join([*self._rewards, *self._extras, *self._failures])
+        return f'{self.task.signature} with {added}'
+
+    def bind(self, world: World) -> None:
+        self.task.bind(world)
+        self.world, n = world, world.n
+        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
+        self.action = np.zeros((n, len(self.action_map)))
+        self.reward, self._terms = np.zeros(n), np.zeros((len(self._rewards), n))
+        self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
+
+    def begin_episodes(
+        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> None:
+        self.task.begin_episodes(rows, random_states)
+        self.action[rows] = self.reward[rows] = 0.0
+        self._terms[:, rows] = 0.0
+        self.failed[rows] = self.diverged[rows] = False
+
+    def act(self, action: np.ndarray) -> None:
+        np.clip(action, -1.0, 1.0, out=self.action)
+        self.task.act(action)
+
+    def simulate(self, rows: np.ndarray | None = None) -> None:
+        self.task.simulate(rows)
+
+    def finish_step(self, stepped: np.ndarray | None = None) -> None:
+        inner = self.task
+        inner.finish_step(stepped)
+        if stepped is not None:
+            begun = ~stepped
+            self.action[begun] = inner.reward[begun] = 0.0
+            inner.failed[begun] = inner.diverged[begun] = False
+        self.diverged[:] = inner.diverged
+        self._write()
+        self.reward[:], self.failed[:] = inner.reward, inner.failed
+        counted = ~inner.failed if stepped is None else stepped & ~inner.failed
+        for term, (name, (weight, function)) in zip(
+            self._terms, self._rewards.items(), strict=True
+        ):
+            term[:] = np.where(counted, weight * self._ask('reward', name, function, 1)[:, 0], 0.0)
+            self.reward += term
+        for name, function in self._failures.items():
+            failing = self._ask('failure', name, function, 1)[:, 0] != 0
+            self.failed |= failing if stepped is None else failing & stepped
+
+    def observe(self) -> None:
+        self.task.observe()
+        self._write()
+
+    def _write(self) -> None:
+        self.observation[:, : self._own] = self.task.observation
+        usable = ~self.diverged[:, None]
+        for name, (size, function) in self._extras.items():
+            value = self._ask('observation', name, function, size)
+            np.copyto(self.observation[:, self.blocks[name]], value, where=usable)
+
+    def _ask(self, kind: str, name: str, function: Function, size: int) -> np.ndarray:
+        """Returns what a user's function says, (n, size), finite but where the physics broke down."""
+        with np.errstate(invalid='ignore' if self.diverged.any() else 'warn'):
+            value = np.asarray(function(self), dtype=float)
+        n = self.world.n
+        if value.shape == (n,) and size == 1:
+            value = value[:, None]
+        if value.shape != (n, size):
+            expected = f'({n},)' if kind != 'observation' else f'({n}, {size})'
+            raise ValueError(f'{kind} {name!r} has shape {value.shape}; expected {expected}')
+        finite = np.isfinite(value).all(1)
+        if not finite.all():
+            if not (finite | self.diverged).all():
+                raise ValueError(f'{kind} {name!r} is not finite: {value[~finite][0]}')
+            value = np.where(finite[:, None], value, 0.0)
+        return value
+
+    def infos(self) -> dict[str, Any]:
+        """As of the other task; the terms are of both."""
+        found = self.task.infos()
+        terms = {name: term.copy() for name, term in zip(self._rewards, self._terms, strict=True)}
+        return {**found, 'reward_terms': {**found.get('reward_terms', {}), **terms}}
+
+    def get_state(self, row: int) -> dict[str, Any]:
+        return {
+            'task': self.task.get_state(row),
+            'observation': self.observation[row].copy(),
+            'action': self.action[row].copy(),
+            'reward': float(self.reward[row]),
+            'terms': self._terms[:, row].copy(),
+            'failed': bool(self.failed[row]),
+            'diverged': bool(self.diverged[row]),
+        }
+
+    def set_state(self, row: int, state: dict[str, Any]) -> None:
+        self.task.set_state(row, state['task'])
+        self.observation[row], self.action[row] = state['observation'], state['action']
+        self.reward[row], self._terms[:, row] = state['reward'], state['terms']
+        self.failed[row], self.diverged[row] = state['failed'], state['diverged']
+
+
+def compose(task: Task, parts: Mapping[str, Any]) -> Task:
+    """Returns a task with parts, some of the keyword arguments of `Composed`; itself if none.
+
+    Raises:
+      ValueError: parts that are none, see `Composed`; each must be a dict by name.
+    """
+    for kind, entries in parts.items():
+        if kind not in OPTIONS:
+            raise ValueError(errors.unknown('kind of parts', kind, OPTIONS))
+        if not isinstance(entries, Mapping):
+            raise ValueError(f'{kind} is {entries!r}; expected a dict of name -> part')
+        for name, entry in entries.items():
+            if kind != 'failures' and not (isinstance(entry, tuple) and len(entry) == 2):
+                first = 'weight' if kind == 'rewards' else 'size'
+                raise ValueError(f'{kind}[{name!r}] is {entry!r}; expected ({first}, function)')
+    return Composed(task, **parts) if any(parts.values()) else task
+
+
+def _check(kind: str, name: str, function: Any, good: Any, number: str) -> None:
+    if not callable(function):
+        raise ValueError(f'{kind} {name!r} is {function!r}; expected a function of the task')
+    if not good:
+        raise ValueError(
+            f'{kind} {name!r} has {number}; expected a number, of a size a positive one'
+        )

@@ -1,0 +1,70 @@
+"""Parts to compose tasks of: what a task's characters do, over a leading batch axis.
+
+Each is a function of a task with a `figure`, as all families but the user's have, planar or spatial;
+one may be the function of a reward term or an observation block (see `trl_suite.tasks.composed`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from trl_suite.motion import quaternion
+
+
+def joint_angles(task: Any) -> np.ndarray:
+    """Joint angles in link order, rad (slides m, ball joints quaternions), (n, J or more)."""
+    return task.world.qpos.take(task.figure.pose_qpos[7 if _spatial(task) else 3 :], 1)
+
+
+def joint_rates(task: Any) -> np.ndarray:
+    """Joint rates in link order, rad/s (slides m/s), (n, J or more)."""
+    return task.world.qvel.take(task.figure.pose_dof[6 if _spatial(task) else 3 :], 1)
+
+
+def height(task: Any) -> np.ndarray:
+    """Height of the root above the ground under it, m, (n,)."""
+    place = root(task)
+    if _spatial(task):
+        return place[:, 2] - task.arena.height(place[:, :1], place[:, 1:2])[:, 0]
+    return place[:, 2] - task.arena.height(place[:, :1])[:, 0]
+
+
+def speed(task: Any) -> np.ndarray:
+    """Speed of the root where it heads, m/s, (n,); in the plane along x."""
+    velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
+    if not _spatial(task):
+        return velocity[:, 0]
+    angle = heading(task)
+    return np.cos(angle) * velocity[:, 0] + np.sin(angle) * velocity[:, 1]
+
+
+def heading(task: Any) -> np.ndarray:
+    """Where the root heads, rad to the left of +x, (n,); 0 in the plane."""
+    if not _spatial(task):
+        return np.zeros(task.world.n)
+    return quaternion.heading(task.world.qpos.take(task.figure.pose_qpos[3:7], 1))
+
+
+def upright(task: Any) -> np.ndarray:
+    """Cosine of the angle between the root's z axis and the vertical, (n,)."""
+    if not _spatial(task):
+        return np.cos(task.world.qpos[:, task.figure.pose_qpos[2]])
+    x, y = task.world.qpos.take(task.figure.pose_qpos[4:6], 1).T
+    return 1 - 2 * (x * x + y * y)
+
+
+def effort(task: Any) -> np.ndarray:
+    """Mean square of the last action, in [0, 1], (n,); of a composed task."""
+    return np.add.reduce(task.action**2, axis=1) / task.action.shape[1]
+
+
+def root(task: Any) -> np.ndarray:
+    """Where the root is, m, (n, 3)."""
+    figure = task.figure.kinematics if _spatial(task) else task.figure
+    return task.world.xpos[:, figure.links[0]]
+
+
+def _spatial(task: Any) -> bool:
+    return task.character.row.spatial

@@ -1,0 +1,143 @@
+"""Drawn ground as a mesh, for other programs."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.files import check_path, replacing
+from trl_suite.terrain.generators import SPACING
+from trl_suite.terrain.ground import Ground
+from trl_suite.terrain.layout import GRID, Boxes
+from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.surface import Y_UP, library
+
+if TYPE_CHECKING:
+    import trimesh
+
+WRITTEN = ('.obj', '.glb', '.stl')
+WIDTH = 2.0  # m; of planar ground
+DEPTH = 2.0  # m; of boxes that stand on nothing
+LARGEST_SIDE = 500.0  # m; of what is written
+
+_Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def to_mesh(
+    ground: Strip | Ground, low: npt.ArrayLike = -10.0, high: npt.ArrayLike = 10.0
+) -> trimesh.Trimesh:
+    """Returns a piece of ground as a mesh; its upper side is where heights say it is.
+
+    Planar ground is a band 2 m wide. Boxes stay boxes; moving ones stand where they begin.
+
+    Args:
+      ground: what was drawn.
+      low, high: from where to where, m: x of planar ground; else two corners, (2,), or one number
+        for x and y.
+
+    Returns:
+      A `trimesh.Trimesh`; x forward, y left, z up, in m.
+
+    Raises:
+      ValueError: low is not below high, or they are more than LARGEST_SIDE apart.
+      ImportError: trimesh is not installed.
+    """
+    trimesh = library('trimesh', 'trimesh')
+    corners = np.broadcast_to(low, 2).astype(float), np.broadcast_to(high, 2).astype(float)
+    size = corners[1] - corners[0]
+    if not ((size > 0) & (size <= LARGEST_SIDE)).all():
+        raise ValueError(
+            f'low is {low!r} and high {high!r}; expected low below high, at most {LARGEST_SIDE:g} m apart'
+        )
+    pieces = _strip(ground, *corners) if isinstance(ground, Strip) else _ground(ground, *corners)
+    return trimesh.util.concatenate([trimesh.Trimesh(*piece, process=False) for piece in pieces])
+
+
+def save_mesh(
+    ground: Strip | Ground,
+    path: str | os.PathLike[str],
+    low: npt.ArrayLike = -10.0,
+    high: npt.ArrayLike = 10.0,
+) -> None:
+    """Writes a piece of ground as a mesh file.
+
+    Args:
+      ground: what was drawn.
+      path: .obj, .glb (whose y axis points up, as its format has it) or .stl.
+      low, high: as for `to_mesh`.
+
+    Raises:
+      ValueError: another suffix, or as `to_mesh`.
+      OSError: the file cannot be written.
+    """
+    target = check_path(path, WRITTEN)
+    mesh = to_mesh(ground, low, high)
+    if target.suffix.lower() in Y_UP:
+        mesh.apply_transform(_Y_UP)
+    with replacing(target) as part:
+        mesh.export(part)
+
+
+Piece = tuple[np.ndarray, np.ndarray]  # vertices (v, 3) m, faces (f, 3)
+
+
+def _strip(strip: Strip, low: np.ndarray, high: np.ndarray) -> list[Piece]:
+    first, last = round(low[0] / SPACING), round(high[0] / SPACING)
+    heights = strip.window(first, last - first + 1)[0]
+    x = SPACING * np.arange(first, last + 1)
+    return [_sheet(x, 0.5 * WIDTH * np.array([-1.0, 1.0]), np.repeat(heights[:, None], 2, 1))]
+
+
+def _ground(ground: Ground, low: np.ndarray, high: np.ndarray) -> list[Piece]:
+    layout, pieces = ground.layout, []
+    if layout.level is not None:
+        x, y = np.stack([low, high], 1)
+        pieces.append(_sheet(x, y, np.full((2, 2), layout.level)))
+    if layout.grid is not None:
+        i, j = (
+            np.arange(round(a / GRID), round(b / GRID) + 1) for a, b in zip(low, high, strict=True)
+        )
+        pieces.append(_sheet(GRID * i, GRID * j, layout.vertices(i, j)))
+    groups = [layout.boxes_in(low, high)]
+    if layout.belts is not None:
+        groups.append(layout.belts.boxes)
+    if layout.movers is not None:
+        groups.append(ground.movers())
+    for boxes in groups:
+        for k in np.flatnonzero(boxes.touching(low, high)).tolist():
+            pieces.append(_box(boxes.select(np.array([k])), layout.level, low, high))
+    return pieces
+
+
+def _sheet(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> Piece:
+    """A height grid; cells are cut from the back left to the front right, as the ground is."""
+    k, m = heights.shape
+    points = np.stack([*np.meshgrid(x, y, indexing='ij'), heights], 2).reshape(-1, 3)
+    near = (np.arange(k - 1)[:, None] * m + np.arange(m - 1)).ravel()
+    back_left, front_right, far = near + 1, near + m, near + m + 1
+    faces = [[near, front_right, back_left], [far, back_left, front_right]]
+    return points, np.concatenate([np.stack(face, 1) for face in faces])
+
+
+def _box(box: Boxes, level: float | None, low: np.ndarray, high: np.ndarray) -> Piece:
+    """One box with upright sides, cut off at the rim if it is not turned."""
+    trimesh = library('trimesh', 'trimesh')
+    position, half, yaw, top, slope = (part[0] for part in box)
+    if not yaw:
+        begin, end = np.maximum(position - half, low), np.minimum(position + half, high)
+        top = top + slope * (0.5 * (begin + end) - position)[0]
+        position, half = 0.5 * (begin + end), 0.5 * (end - begin)
+    unit = trimesh.creation.box((2, 2, 2))
+    signs = np.asarray(unit.vertices)
+    along, across = (signs[:, :2] * half).T
+    upper = top + slope * along
+    bottom = upper.min() - DEPTH if level is None else level
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return np.stack([
+        position[0] + cosine * along - sine * across,
+        position[1] + sine * along + cosine * across,
+        np.where(signs[:, 2] > 0, upper, bottom),
+    ], 1), np.asarray(unit.faces)  # fmt: skip
