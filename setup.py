@@ -59,6 +59,7 @@ setup(
             BVH,
             TORCH,
         ],
+        'docs': ['mkdocs>=1.6,<2'],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1'],
     },
     entry_points={'console_scripts': ['trl-suite = trl_suite.cli:main']},

@@ -36,7 +36,9 @@ from trl_suite.vector import VectorEnvironment
 
 EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
 OBSERVATION_CLIP = 10.0  # in standard deviations
+MAPS = ('terrain', 'surface')  # blocks of an observation
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
+CLONING_RATE, CLONING_EPOCHS = 1e-3, 30
 START_COUNT = 2e4  # observations that the scales of a policy one begins with count as
 
 
@@ -76,8 +78,10 @@ class Settings:
     # those of the environment.
     lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
     # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
-    # weights, its scales and its noise. What it did not observe begins without influence.
+    # weights, its scales and its noise. What it did not observe begins without influence. Or with
+    # one of `evaluation.BASELINES`, which is imitated for `cloned` control steps.
     start: str = ''
+    cloned: float = 1e4
     value_first: float = 2e4  # control steps in which such a run learns only the value
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
@@ -90,20 +94,26 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
 # them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated, and
 # a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
+# At last it does not, and who is pushed may leave the plan to keep standing.
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.15, {
+    (0.1, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (0.35, {
+    (0.233, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
+    }),
+    (0.667, {
+        'footstep_scale': 8.0, 'heading_scale': 5.0,
+        'plans': {**VARIED, 'sharp': 0.1},
+        'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
@@ -122,12 +132,24 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 6e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 9e6, 'gamma': 0.97, 'lessons': LESSONS}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
 }  # fmt: skip
+PLANAR_LESSONS = (
+    (0.0, {'footstep_scale': 3.0, 'miss': 0.5}),
+    (0.4, {'footstep_scale': 3.0, 'miss': 0.5, 'plans': {'length': (0.25, 0.6), 'change': 1.0}}),
+)  # fmt: skip
+PLANAR_STEPS = {
+    'samples': 0.8e6, 'gamma': 0.97, 'lessons': PLANAR_LESSONS, 'start': 'PD_Biped2D_Flat-v0',
+}  # fmt: skip
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
+PLANS = {  # a step is a whole footstep: few of them
+    'samples': 1e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 1e-4,
+    'last_learning_rate': 3e-5, 'initial_std': 0.06, 'mirrored': False,
+    'view': (6.0, 3.0), 'start': 'scripted', 'evaluate_every': 2e4, 'evaluation_episodes': 16,
+}  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
     'samples': 6e4, 'horizon': 16, 'epochs': 20, 'minibatch': 128, 'learning_rate': 1e-4,
     'value_goes_on': True, 'gamma': 0.9, 'initial_std': 0.1, 'towards_sets': 3.0,
@@ -160,11 +182,15 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
             (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
         )
     ),
-    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'samples': 1e6}),
+    ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
+    # From one kind of obstacle to a mix of them, and on to that on slopes.
     *(
-        (f'PD_{name}_Slopes_Mixed_Terrain-v0', {'start': f'PD_{name}_Slopes_Terrain-v0'})
+        (f'PD_{name}_{to}_Terrain-v0', {'samples': 3e6, 'start': f'PD_{name}_{start}_Terrain-v0'})
         for name in ('Biped2D', 'Dog2D', 'Raptor2D')
+        for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
+    ('MTU_Raptor2D_*', {'samples': 1.6e6}),
+    ('Vel_Biped2D_*', {'samples': 1e6}),
     # In three dimensions the planar noise fells the body before it has learnt anything.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
     *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
@@ -177,6 +203,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # Its observation is mirrored.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {'samples': 2e6, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, 'samples': 2e6, 'lessons': LESSONS[:2]}),
+    ('PD_Biped3D_HLC_*', PLANS),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
 )
@@ -194,8 +221,8 @@ def settings_for(id_: str, **changes: Any) -> Settings:
 class Scales:
     """Running mean and standard deviation of observations.
 
-    The phase stays as it is, and all heights of the terrain share one scale: their shape is what
-    counts, and where the ground is flat nothing is blown up.
+    The phase stays as it is, and all numbers of a map of the ground share one scale: their shape is
+    what counts, and where the ground is flat nothing is blown up.
     """
 
     def __init__(
@@ -212,8 +239,7 @@ class Scales:
         if 'phase' in self.blocks:
             part = self.blocks['phase']
             mean[part], square[part] = 0.0, 1.0
-        if 'terrain' in self.blocks:
-            part = self.blocks['terrain']
+        for part in (self.blocks[name] for name in MAPS if name in self.blocks):
             mean[part], square[part] = 0.0, square[part].mean()
         self.mean += weight * (mean - self.mean)
         self.square += weight * (square - self.square)
@@ -268,15 +294,18 @@ def advantages(
 
 
 def visible(blocks: dict[str, slice], view: tuple[float, float] | None) -> np.ndarray | None:
-    """Which columns of an observation are no part of the map of the terrain, or near enough."""
-    if view is None or 'terrain' not in blocks:
+    """Which columns of an observation are no part of a map of the ground, or near enough."""
+    maps = [name for name in MAPS if name in blocks]
+    if view is None or not maps:
         return None
-    part = blocks['terrain']
-    lines, along = np.divmod(np.arange(part.stop - part.start), surroundings.SAMPLES)
+    lines, along = np.divmod(np.arange(surroundings.SAMPLES**2), surroundings.SAMPLES)
     forward = np.linspace(*surroundings.AHEAD, surroundings.SAMPLES)[along]
     aside = np.linspace(-surroundings.ASIDE, surroundings.ASIDE, surroundings.SAMPLES)[lines]
+    near = (forward <= view[0]) & (np.abs(aside) <= view[1])
     seen = np.ones(max(block.stop for block in blocks.values()), bool)
-    seen[part] = (forward <= view[0]) & (np.abs(aside) <= view[1])
+    for name in maps:
+        part = blocks[name]
+        seen[part] = np.tile(near, (part.stop - part.start) // len(near))
     return np.flatnonzero(seen)
 
 
@@ -307,8 +336,10 @@ class Trainer:
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
-        if s.start:
+        self.begun = not s.start
+        if s.start and s.start not in evaluation.BASELINES:
             self.begin_with(policies.reference(s.start))
+            self.begun = True
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
@@ -373,6 +404,36 @@ class Trainer:
                 layer.weight.copy_(torch.from_numpy(weight.T.copy()))
                 layer.bias.copy_(torch.from_numpy(bias.copy()))
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
+
+    def imitate(self, baseline: str) -> None:
+        """Has the policy do what a baseline does, as far as it sees why (behavioural cloning).
+
+        The baseline is disturbed as the policy will be, so that it shows how to come back.
+        """
+        s, environments = self.settings, self.environments
+        teacher = evaluation.BASELINES[baseline](environments)
+        seen, shown = [], []
+        std = self.log_std.exp().detach().numpy()
+        while len(seen) * s.num_envs < s.cloned:
+            action = teacher(self.observation)
+            seen.append(self.observation.copy())
+            shown.append(action)
+            noise = self.random.standard_normal(action.shape)
+            step = environments.step(np.clip(action + std * noise, -1, 1))
+            ended = step.terminated | step.truncated
+            self.observation = environments.reset(ended) if ended.any() else step.observation
+        self.samples += len(seen) * s.num_envs
+        self.scales.update(np.concatenate(seen))
+        inputs = self.scales(np.concatenate(seen))
+        targets = torch.from_numpy(np.concatenate(shown).astype(np.float32))
+        optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
+        for _ in range(CLONING_EPOCHS):
+            order = torch.from_numpy(self.random.permutation(len(inputs)))
+            for part in order.split(s.minibatch):
+                loss = (self.policy(inputs[part]) - targets[part]).square().mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
 
     def collect(self) -> dict[str, torch.Tensor]:
         """Steps all rows `horizon` times; returns the samples, flattened."""
@@ -472,7 +533,8 @@ class Trainer:
             group['lr'] = rate
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        divergence, waits = 0.0, bool(s.start) and self.samples <= s.value_first
+        divergence = 0.0
+        waits = bool(s.start) and self.samples <= s.value_first
         for _ in range(s.epochs):
             order = torch.from_numpy(self.random.permutation(len(advantage)))
             for part in order.split(s.minibatch):
@@ -614,7 +676,7 @@ class Trainer:
 
 
 _STATE = (
-    'samples', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns', 'steps',
+    'begun', 'samples', 'curve', 'best', 'seconds', 'observation', 'shares', 'recent', 'returns', 'steps',
 )  # fmt: skip
 
 
@@ -642,6 +704,9 @@ def train(
                 trainer.environments.close()
                 trainer.begin_lesson()
             begin, before = time.perf_counter(), trainer.samples
+            if not trainer.begun:
+                trainer.imitate(settings.start)
+                trainer.begun = True
             batch = trainer.collect()
             middle = time.perf_counter()
             divergence = trainer.learn(batch)

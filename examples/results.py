@@ -60,9 +60,10 @@ def environment_row(id_: str, entry: dict[str, Any]) -> list[str]:
         f'{found["fraction"]:.3f} ± {interval:.3f}',
         f'{found["full"]:.0%}',
         f'{found["distance"]:.1f}',
-        million(run['settings']['samples']),
+        million(run['curve'][-1]['samples']),
         f'{minutes:.0f}',
         str(run['seed']),
+        f'`{start}`' if (start := run['settings'].get('start')) else '–',
     ]
 
 
@@ -140,6 +141,22 @@ def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
+def plan_rows() -> list[list[str]]:
+    path = resources.directory('trained') / 'plans.json'
+    if not path.exists():
+        return []
+    return [
+        [
+            f'`{id_}`', name, str(found['episodes']), f'{found["reward"]:.2f}',
+            f'{found["survived"]:.0%}', f'{found["speed"]:.2f}', f'{found["goals_per_minute"]:.1f}',
+            f'{found["trail"]:.0f}' if found['trail'] else '–',
+            f'{found["at_goal"]:.0%}' if 'Soccer' in id_ else '–', f'{found["falls_per_km"]:.1f}',
+        ]
+        for id_, each in json.loads(path.read_text()).items()
+        for name, found in each.items()
+    ]  # fmt: skip
+
+
 def page(entries: dict[str, dict[str, Any]]) -> str:
     runs = [run for entry in entries.values() for run in entry['runs']]
     machines = ', '.join(sorted({run['machine'] for run in runs}))
@@ -152,12 +169,14 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '`suite.reference_policy(id)`.',
         f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
         'neither training nor the choice of the policy had seen. Return is a fraction of its '
-        'maximum, 256; an episode that ends in a fall earns nothing more. *Complete* is the share of '
-        'episodes that lasted 256 steps, *distance* the mean in m, *minutes* the wall time of the '
-        f'run. Machine: {machines}.',
+        'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
+        'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
+        'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
+        f'the run began with; its samples are not counted again. Machine: {machines}.',
         '## Every environment',
         table(
-            ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed'),
+            ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
+             'begins with'),
             (
                 environment_row(id_, entry)
                 for id_, entry in entries.items()
@@ -191,6 +210,30 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'a foot lands.',
             table(
                 ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
+            ),
+        ]
+    rows = plan_rows()
+    if rows:
+        parts += [
+            '## Planning footsteps',
+            'By `examples/evaluate_plans.py`: whole episodes of 200 s, seed 0, by the scripted policy '
+            'and the reference policy. Reward is normalised and cumulative: a fall ends it; speed is '
+            'towards the goal (soccer: of the ball), m/s; along the trail, m, median; with the ball at '
+            'its goal, share of the time.',
+            table(
+                (
+                    'environment',
+                    'policy',
+                    'episodes',
+                    'reward',
+                    'no fall',
+                    'speed',
+                    'goals a minute',
+                    'trail',
+                    'ball at goal',
+                    'falls per km',
+                ),
+                rows,
             ),
         ]
     rows = transfer_rows(entries)

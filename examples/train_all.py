@@ -68,7 +68,7 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
 def depth(id_: str) -> int:
     """How many environments a policy has learnt in before it comes to this one."""
     start = ppo.settings_for(id_).start
-    return 1 + depth(start) if start else 0
+    return 1 + depth(start) if start in catalogue.BY_ID else 0
 
 
 def entries(id_: str) -> list[dict[str, Any]]:
@@ -102,7 +102,9 @@ def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
 def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
     """Evaluates a finished run and writes it beside the others of its environment."""
     curve = json.loads((folder / 'curve.json').read_text())
-    policy = policies.load(folder / 'policy.npz')
+    # After lessons the last policy is the one that has learnt what the environment does not ask for.
+    name = 'last' if curve['settings']['lessons'] else 'policy'
+    policy = policies.load(folder / f'{name}.npz')
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]

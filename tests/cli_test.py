@@ -59,8 +59,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '117 environments')
-        self.assertLen(lines, 119)
+        self.assertEqual(lines[-1], '118 environments')
+        self.assertLen(lines, 120)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
@@ -69,7 +69,7 @@ class ListTest(CommandTest):
 
     @parameterized.parameters(
         (('--domain', 'imitation'), 27),
-        (('--domain', 'deeploco'), 19),
+        (('--domain', 'deeploco'), 20),
         (('--domain', 'plaid'), 28),
         (('--domain', 'terrainrl'), 43),
         (('--actuation', 'gait'), 43),
@@ -123,7 +123,7 @@ class InfoTest(CommandTest):
             self.assertIn(f'\n{title}', out)
         for title, shown in (
             ('Clip', not gait and not steps and not high), ('Gait', gait), ('Parameters', gait),
-            ('Steps', steps), ('Plans', steps),
+            ('Steps', steps), ('Plans', steps or rules == 'footsteps2d'),
         ):  # fmt: skip
             self.assertEqual(f'\n{title}:' in out, shown, title)
         self.assertEqual('\nFootstep controller\n' in out, high)
@@ -289,6 +289,7 @@ class InfoTest(CommandTest):
             'walks at 1.535 m/s': '3D walk',
             '27 of them': 'steps',
             'option miss': 'footsteps',
+            'half a cycle of the walk': 'in the plane',
             'truly mirrored': 'mirrored',
             'slower than the steps': 'run',
             'ankles of 0.03': 'run',
@@ -325,6 +326,10 @@ class InfoTest(CommandTest):
             ),
             ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped', 'short'}),
             ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper', 'short'}),
+            (
+                'PD_Biped2D_LLC_Flat_Step-v0',
+                tracking | {'completion', 'footsteps', 'in the plane'},
+            ),
             ('PD_Biped3D_Imitate-v0', walking),
             ('PD_Biped3D_Imitate-Stairs-v0', walking | {'stairs'}),
             ('PD_Biped3D_Imitate-Rough-v0', walking | {'completion'}),
@@ -757,12 +762,12 @@ class ReadmeTest(CommandTest):
 
     def test_commands_run(self):
         commands = re.findall(r'^(?:.* && \S*/)?trl-suite (.*)$', self.text, re.MULTILINE)
-        self.assertLen(commands, 6)
+        self.assertLen(commands, 9)
         for command in commands:
             with self.subTest(command):
                 pictures = SIZE if command.startswith('rollout') else ()
                 self.output(*command.split(), *pictures)
-        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4')
+        self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4', 'gallery')
 
 
 if __name__ == '__main__':

@@ -10,18 +10,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from PIL import Image
 
-from trl_suite import (
-    acting,
-    bench,
-    catalogue,
-    characters,
-    doctor,
-    gallery,
-    machine,
-    motion,
-    policies,
-    suite,
-)
+from trl_suite import acting, catalogue, characters, motion, policies, suite, terrain
+from trl_suite.commands import bench, doctor, gallery, machine
 
 GAPS = cli_test.GAPS
 CommandTest, run = cli_test.CommandTest, cli_test.run
@@ -135,25 +125,34 @@ class BenchTest(CommandTest):
 
 class GalleryTest(CommandTest):
     def test_everything_has_its_pictures(self):
-        paths = [item.path for item in gallery.items()]
-        self.assertLen(set(paths), len(characters.CHARACTERS) + 2 * len(catalogue.ROWS))
-        self.assertIn('environments/PD_Dog2D_Gaps_Terrain-v0.terrain.png', paths)
-        self.assertIn('environments/PD_Biped3D_HLC_Soccer-v0.terrain.jpg', paths)
+        items = list(gallery.items())
+        paths = [item.path for item in items]
+        self.assertLen(set(paths), len(paths))
+        shipped = len(policies.available())
+        for folder, count in (
+            ('environments', len(catalogue.ROWS)), ('characters', len(characters.CHARACTERS)),
+            ('terrains', len(terrain.PRESETS) + len(terrain.PRESETS3D)), ('curves', shipped),
+            ('families', len(suite.TASKS_BY_DOMAIN)),
+        ):  # fmt: skip
+            self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
+        self.assertIn('suite.jpg', paths)
+        self.assertIn('terrains/gaps.png', paths)
+        self.assertIn('terrains/plane.jpg', paths)
+        self.assertLen([item for item in items if item.source], 2 * shipped)
 
     def test_pictures(self):
         out = self.output('gallery', '--only', 'Hopper2D_Terrain_Gaps-', '--output', 'g')
-        self.assertEqual(out, '2 pictures written to g, 0 failed\n')
-        self.output('gallery', '--only', 'characters/hopper', '--output', 'g')
+        self.assertEqual(out, '1 pictures written to g, 0 failed\n')
+        for only in ('characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}', 'families/plaid'):
+            self.output('gallery', '--only', only, '--output', 'g')
         files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
-        self.assertCountEqual(files, [
-            'hopper.jpg', 'FSM_Hopper2D_Terrain_Gaps-v0.terrain.png',
-            'FSM_Hopper2D_Terrain_Gaps-v0.strip.jpg',
-        ])  # fmt: skip
+        strip = 'FSM_Hopper2D_Terrain_Gaps-v0.jpg'
+        self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png', 'plaid.jpg'])
         for path in files.values():
             self.assertBetween(path.stat().st_size, 1000, gallery.LARGEST)
             with Image.open(path) as image:
                 self.assertGreater(np.asarray(image.convert('RGB')).std(), 5)
-        with Image.open(files['FSM_Hopper2D_Terrain_Gaps-v0.strip.jpg']) as image:
+        with Image.open(files[strip]) as image:
             height, width = gallery.STRIP_SIZE
             self.assertEqual(image.size, (6 * width + 5 * 4, height))
 
@@ -166,6 +165,16 @@ class GalleryTest(CommandTest):
         self.assertEqual((old / 'dog.jpg').read_text(), 'mine')
         self.output('gallery', '--only', 'characters/dog', '--output', '.', '--again')
         self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
+
+    def test_a_policy_that_was_replaced_is_drawn_again(self):
+        only = ('gallery', '--only', f'curves/{GAPS}', '--output', 'g')
+        for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
+            with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
+                self.assertStartsWith(self.output(*only), f'{count} pictures')
+        for suffix in ('.png', '.jpg'):
+            path = self.folder / f'a{suffix}'
+            gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
+            self.assertEqual(gallery._source(path), 'digest')
 
     def test_one_that_fails_stops_no_other(self):
         def draw():

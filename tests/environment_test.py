@@ -33,6 +33,7 @@ SIZES = {
     'PD_Biped3D_Imitate-v0': (112, 17), 'PD_Biped3D_Imitate-Stairs-v0': (112, 17),
     'PD_Biped3D_Imitate-Track-v0': (156, 17), 'PD_Biped3D_Imitate-Hills_Terrain-v0': (1136, 17),
     'PD_Biped3D_Imitate-Run-v0': (112, 17),
+    'PD_Biped2D_LLC_Flat_Step-v0': (69, 11),
     'PD_Biped3D_LLC_General_Step-v0': (125, 17), 'PD_Biped3D_LLC_Symetric_Step-v0': (117, 17),
     'PD_Biped3D_LLC_Run_FootStep-v0': (125, 17), 'PD_Biped3D_FULL_Imitate-Steps-v0': (229, 35),
     'PD_Biped3D_HLC_LargeBlocks-v0': (1131, 5), 'PD_Biped3D_HLC_Forest-v0': (1131, 5),
@@ -94,6 +95,8 @@ def expected_blocks(id_):
             return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
         mirrored = 'Symetric' in id_
         return sizes | {'phase': 3 if mirrored else 5, 'contact': 2, 'plan': 7 if mirrored else 13}
+    if suite.find(id_).rules == 'footsteps2d':
+        return {'pose': 25, 'velocity': 24, 'phase': 5, 'contact': 2, 'plan': 13}
     if is_gait(id_):
         links = GAIT_LINKS[figure]
         return {'terrain': 200, 'pose': 2 * links - 1, 'velocity': 2 * links}

@@ -61,10 +61,11 @@ class PartsTest(parameterized.TestCase):
         for id_ in catalogue.BY_ID:
             settings = ppo.settings_for(id_)
             cycles = catalogue.BY_ID[id_].rules == 'gait'  # a step is 10 to 20 times longer
-            least = 5e4 if cycles else 2e5 if settings.start else 5e5
+            plans = catalogue.BY_ID[id_].rules in ('hike', 'soccer')
+            least = 5e4 if cycles or plans else 2e5 if settings.start else 5e5
             self.assertGreaterEqual(settings.samples, least, id_)
             if settings.start:
-                self.assertIn(settings.start, catalogue.BY_ID)
+                self.assertIn(settings.start, {**catalogue.BY_ID, **evaluation.BASELINES})
             self.assertEqual(settings.num_envs * settings.horizon % settings.minibatch, 0)
 
     def test_gaits_that_stand_still_are_ended_in_training_only(self):
@@ -179,6 +180,38 @@ class RunTest(parameterized.TestCase):
         trainer.samples = int(settings.value_first)
         trainer.learn(trainer.collect())
         self.assertTrue((trainer.exported().weights[0] != before[0]).any())
+
+    def test_a_run_may_begin_with_what_a_baseline_does(self):
+        id_ = 'PD_Biped3D_HLC_Soccer-v0'
+        settings = ppo.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
+        trainer = ppo.Trainer(id_, 0, settings, 1)
+        teacher = evaluation.BASELINES['scripted'](trainer.environments)
+        seen, shown = trainer.observation.copy(), teacher(trainer.observation)
+        before = np.abs(trainer.exported()(seen) - shown).mean()
+        trainer.imitate('scripted')
+        self.assertEqual(trainer.samples, 160)
+        self.assertLess(np.abs(trainer.exported()(seen) - shown).mean(), before / 2)
+
+    def test_a_run_ends_when_it_has_learnt_enough(self):
+        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY, enough=0.9), 1)
+        for fractions, expected in (
+            ((), False), ((0.95,), False), ((0.95, 0.8), False), ((0.8, 0.95), False),
+            ((0.8, 0.9, 0.91), True),
+        ):  # fmt: skip
+            trainer.curve = [{'fraction': fraction} for fraction in fractions]
+            self.assertEqual(trainer.has_learnt(), expected)
+
+    def test_near_parts_of_maps(self):
+        """Both maps of velocities are cut as that of heights."""
+        one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
+        two = {'surface': slice(0, 2048), 'pose': slice(2048, 2054)}
+        near, both = (ppo.visible(blocks, (2.5, 1.0)) for blocks in (one, two))
+        count = len(near) - 6
+        # 11 m by 11 m at 32 by 32 points: 3.5 m along, 2 m across.
+        self.assertEqual(count, 10 * 6)
+        np.testing.assert_array_equal(both[count : 2 * count], near[:count] + 1024)
+        np.testing.assert_array_equal(both[-6:], np.arange(2048, 2054))
+        self.assertIsNone(ppo.visible({'pose': slice(0, 6)}, (2.5, 1.0)))
 
     def test_a_policy_that_acts_otherwise_is_no_start(self):
         settings = ppo.Settings(

@@ -327,8 +327,8 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(
             {domain: len(tasks) for domain, tasks in suite.TASKS_BY_DOMAIN.items()},
             # Of imitation 14 in the plane and 13 in three dimensions.
-            # Of deeploco 6 of footsteps, 8 above them and 5 without them.
-            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 19},
+            # Of deeploco 7 of footsteps, one in the plane, 8 above them and 5 without them.
+            {'plaid': 28, 'imitation': 27, 'terrainrl': 43, 'deeploco': 20},
         )
         flat = [(domain, task) for domain, tasks in suite.TASKS_BY_DOMAIN.items() for task in tasks]
         self.assertCountEqual(flat, suite.ALL_TASKS)
@@ -548,7 +548,11 @@ class BuildTest(parameterized.TestCase):
         ({'character': 'biped3d_mocap', 'terrain': {'Type': 'var2d_gaps'}, 'task': 'footsteps'},
          "'biped3d_mocap' is three-dimensional and terrain 'var2d_gaps'"),
         ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
-        ({'character': 'dog', 'task': 'footsteps'}, "'dog' is planar; the task 'footsteps'"),
+        ({'character': 'dog', 'task': 'hike'}, "'dog' is planar; the task 'hike'"),
+        ({'character': 'dog', 'task': 'footsteps'}, "'dog' has no right and left foot to place"),
+        ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no right and left foot"),
+        ({'character': 'biped2d_full', 'task': 'footsteps', 'clip': motion.load_steps('biped3d_mocap')},
+         "'biped3d_mocap' is a library of steps"),
         ({'character': 'biped3d', 'task': 'imitation3d'}, "unknown task 'imitation3d'"),
         ({'character': 'biped3d', 'task': 'footsteps'},
          'no library of steps of its own; give clip=, one of .*biped3d_mocap'),

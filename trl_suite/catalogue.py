@@ -241,6 +241,19 @@ def _step(
     )
 
 
+_STEP2D = Row(
+    id='PD_Biped2D_LLC_Flat_Step-v0',
+    domain='deeploco',
+    task='llc_flat_step',
+    character='biped2d_full',
+    actuation='position',
+    terrain='flat',
+    rules='footsteps2d',
+    clip='biped2d_full_walk',
+    description='The biped with arms walks along planned footsteps, straight on over flat ground.',
+    tags=frozenset({'planar', 'flat', 'completion'}),
+)
+
 _STEPS = (
     _step(
         'PD_Biped3D_LLC_General_Step-v0', 'llc_general_step',
@@ -399,6 +412,7 @@ ROWS: tuple[Row, ...] = (
     _imitation3d('Track', 'plane', 'flat ground', True, target=True),
     _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
     *_STEPS,
+    _STEP2D,
     *_HIKES,
     *_JOURNEYS,
 )  # fmt: skip

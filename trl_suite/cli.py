@@ -8,7 +8,7 @@
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite doctor
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
-    trl-suite gallery --only 'Dog2D*strip'
+    trl-suite gallery --only Dog2D_Gaps
 
 Bad input ends with one line on stderr and exit status 2. The engine is imported only by the
 commands that need it.
@@ -169,12 +169,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--seconds', type=float, default=2.0, help='of each of four measurements')
     command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
 
-    command = add('gallery', _gallery, 'make pictures of all environments and characters')
+    command = add('gallery', _gallery, 'make pictures of all environments, terrains and characters')
     command.add_argument(
         '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='where to'
     )
     command.add_argument(
-        '--only', default='*', metavar='PATTERN', help="part of a name, as 'Dog2D*strip'"
+        '--only', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
     )
     command.add_argument('--again', action='store_true', help='also what is there already')
     return parser
@@ -490,7 +490,7 @@ def _clip(arguments: argparse.Namespace) -> None:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from trl_suite import doctor
+    from trl_suite.commands import doctor
 
     found = []
     for finding in doctor.findings():  # some take seconds
@@ -508,7 +508,7 @@ def _bench(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         files.check_path(arguments.json, ('.json',))
     _suite()
-    from trl_suite import bench
+    from trl_suite.commands import bench
 
     result = bench.bench(arguments.id, arguments.rows, arguments.threads, arguments.seconds)
     if arguments.json is not None:
@@ -536,7 +536,7 @@ def _write_json(result: dict[str, Any], path: pathlib.Path) -> None:
 
 def _gallery(arguments: argparse.Namespace) -> int:
     _suite()
-    from trl_suite import gallery
+    from trl_suite.commands import gallery
 
     written, failed = gallery.make(arguments.output, arguments.only, arguments.again)
     for path, error in failed.items():

@@ -19,9 +19,10 @@ from trl_suite.terrain.surroundings import AHEAD, ASIDE, SAMPLES
 LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
 CAUTIOUS = 0.5  # the same of one with something close ahead
 ROOM = 2.0  # m; what is close
-ANKLE = 0.2  # m; how far ahead of the root's middle the foot stands that has just landed
 WIDTH = 0.15  # m; between the feet
-TURN = 1.2  # rad; the most that a plan turns
+# The longer the steps the smaller these are: times the step length,
+ANKLE = 0.1  # m m; how far ahead of the root's middle the foot stands that has just landed
+TURN = 0.6  # rad m; the most that a plan turns
 SHARP = 0.8  # rad; turns from here on are made with short steps
 NEAR = 1.0  # m; where steps become short
 CANDIDATES = np.linspace(-1.4, 1.4, 29)  # rad; ways that are looked along
@@ -117,13 +118,14 @@ def steps(
     way: np.ndarray, distance: np.ndarray, room: np.ndarray, stance: np.ndarray, step_length: float
 ) -> np.ndarray:
     """Plans (n, 5) in physical units that walk along a bearing (n,), so far and with so much room."""
-    turn = np.clip(way, -TURN, TURN)
+    turn = np.clip(way, -TURN / step_length, TURN / step_length)
     short = (distance < NEAR) | (np.abs(way) > SHARP)
     length = np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH)) * step_length
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)
-    first = (ANKLE + length)[:, None] * forward + side[:, None] * left
-    second = (ANKLE + 2 * length)[:, None] * forward - side[:, None] * left
+    ankle = ANKLE / step_length
     plan = np.zeros((len(way), len(PLAN_NAMES)))
-    plan[:, :2], plan[:, 2:4], plan[:, 4] = first, second, turn
+    plan[:, :2] = (ankle + length)[:, None] * forward + side[:, None] * left
+    plan[:, 2:4] = (ankle + 2 * length)[:, None] * forward - side[:, None] * left
+    plan[:, 4] = turn
     return plan

@@ -16,6 +16,7 @@ from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
 from trl_suite.tasks import composed
 from trl_suite.tasks.footsteps import Footsteps
+from trl_suite.tasks.footsteps2d import PlanarFootsteps, check_feet
 from trl_suite.tasks.gait import GaitTask
 from trl_suite.tasks.high_level import HighLevel
 from trl_suite.tasks.imitation import Imitation
@@ -88,6 +89,13 @@ def _footsteps(row: Row, options: dict[str, Any]) -> Task:
     )  # fmt: skip
 
 
+def _footsteps2d(row: Row, options: dict[str, Any]) -> Task:
+    return PlanarFootsteps(
+        characters.make(row.character), PlanarTerrain(terrains.load(row.terrain)), _clip(row),
+        actuation_model=row.actuation, **options,
+    )  # fmt: skip
+
+
 def _high_level(cls: type[HighLevel]) -> Callable[[Row, dict[str, Any]], Task]:
     def make(row: Row, options: dict[str, Any]) -> Task:
         if row.actuation != 'position':
@@ -145,6 +153,7 @@ _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], Callable[..., Tas
     'gait': (_gait, GaitTask),
     'imitation3d': (_imitation3d, SpatialImitation),
     'footsteps': (_footsteps, Footsteps),
+    'footsteps2d': (_footsteps2d, PlanarFootsteps),
     'hike': (_high_level(HighLevel), HighLevel),
     'soccer': (_high_level(Soccer), Soccer),
     'journey': (_journey, journey),
@@ -154,9 +163,12 @@ _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], Callable[..., Tas
 # As `build` names rules.
 TASKS = ('imitation', 'footsteps', 'hike', 'soccer', 'journey', 'gait', 'walk')
 _SPATIAL = {  # what is for one kind of character only
-    'footsteps': True, 'hike': True, 'soccer': True, 'journey': True, 'gait': False,
+    'hike': True, 'soccer': True, 'journey': True, 'gait': False,
 }  # fmt: skip
-_OF_STEPS = ('footsteps', 'hike', 'soccer')  # tasks whose motion is a library of steps
+_BY_DIMENSIONS = {  # rules of a task that planar and spatial characters have
+    ('imitation', True): 'imitation3d', ('footsteps', False): 'footsteps2d',
+}  # fmt: skip
+_OF_STEPS = ('footsteps', 'hike', 'soccer')  # in space the motion is a library of steps
 _DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
@@ -249,13 +261,14 @@ def combine(
         joints by itself and takes none.
       terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
         dimensions as the character has. By default level ground.
-      task: the rules: 'imitation'; in three dimensions 'footsteps', 'hike' or 'soccer' (above a
-        footstep controller) or 'journey' (from goal to goal without one); 'gait' (in the plane), or 'walk', which needs neither clip nor controller. Or
+      task: the rules: 'imitation'; 'footsteps', for who has a right and a left foot; in three
+        dimensions 'hike' or 'soccer' (above a footstep controller) or 'journey' (from goal to goal
+        without one); 'gait' (in the plane), or 'walk', which needs neither clip nor controller. Or
         a class or function of the user's, called as task(character, arena, actuation_model=...),
         with clip=... if one is given, and with the task's options by keyword; it returns a `Task`.
       clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
-        footsteps the same of a library of steps, `Steps`. By default the character's own. A gait
-        or a walk takes none.
+        footsteps in three dimensions the same of a library of steps, `Steps`. By default the
+        character's own. A gait or a walk takes none.
 
     Raises:
       ValueError: unknown names, or parts that do not fit each other.
@@ -275,6 +288,8 @@ def combine(
             f'character {name!r} is {_DIMENSIONS[spatial]}; the task {title!r} is for '
             f'{_DIMENSIONS[not spatial]} characters'
         )
+    if task == 'footsteps' and not spatial:
+        check_feet(_character(character))
     if task == 'gait':
         if actuation not in (None, 'gait') or clip is not None:
             raise ValueError(
@@ -288,7 +303,7 @@ def combine(
         if task == 'walk' and clip is not None:
             raise ValueError('a walk tracks nothing: it takes no clip')
         if clip is None and not own and task != 'walk':
-            clip = _own_motion(name, title)
+            clip = _own_motion(name, title in _OF_STEPS and spatial)
     if terrain is None:
         terrain = 'plane' if spatial else 'flat'
     return Row(
@@ -298,7 +313,7 @@ def combine(
         character=character,  # type: ignore[arg-type]
         actuation=actuation,
         terrain=terrain,
-        rules='imitation3d' if task == 'imitation' and spatial else task,  # type: ignore[arg-type]
+        rules=task if own else _BY_DIMENSIONS.get((title, spatial), title),  # type: ignore[arg-type]
         clip=clip,  # type: ignore[arg-type]
         options=MappingProxyType({'rewards': WALK} if task == 'walk' else {}),
         description='A combination of the user.',
@@ -309,9 +324,9 @@ def _character(character: str | characters.CharacterRow) -> characters.Character
     return characters.CHARACTERS[character] if isinstance(character, str) else character
 
 
-def _own_motion(name: str, task: str) -> str:
+def _own_motion(name: str, steps: bool) -> str:
     """Returns the name of a character's own clip, or of its library of steps."""
-    if task not in _OF_STEPS:
+    if not steps:
         if name not in DEFAULT_CLIPS:
             raise ValueError(
                 f"character {name!r} has no clip of its own; give clip=, or task='walk', which needs none"

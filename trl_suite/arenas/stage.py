@@ -24,13 +24,14 @@ def prepare(root: mjcf.RootElement) -> None:
 
 def _decorate(root: mjcf.RootElement) -> None:
     """Sky and ground (the sun follows each character), cheap enough that one model serves pictures and physics."""
-    root.visual.quality.shadowsize = 1024
+    root.visual.quality.shadowsize = 2048
     root.visual.quality.offsamples = 0
     getattr(root.visual, 'global').offwidth = 1920
     getattr(root.visual, 'global').offheight = 1080
     root.statistic.extent = 3  # m; of what is looked at, not of the ground: shadows stay sharp
-    root.visual.map.shadowclip = 4  # extents; ground farther off than it is speckled with shadow
-    root.visual.map.znear = 0.01
+    # In extents. Ground farther off than shadows reach is speckled; the horizon is drawn to.
+    root.visual.map.shadowclip = 8
+    root.visual.map.znear, root.visual.map.zfar = 0.01, 400
     root.visual.headlight.set_attributes(
         ambient=(0.35, 0.35, 0.35), diffuse=(0.45, 0.45, 0.45), specular=(0.1, 0.1, 0.1)
     )

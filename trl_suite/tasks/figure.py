@@ -28,7 +28,13 @@ class PlanarFigure:
     """
 
     def __init__(
-        self, character: Character, arena: PlanarTerrain, behind: float, ahead: float, samples: int
+        self,
+        character: Character,
+        arena: PlanarTerrain,
+        behind: float,
+        ahead: float,
+        samples: int,
+        contact: bool = False,
     ) -> None:
         """Attaches the character and adds a contact sensor for each of its fall links.
 
@@ -38,25 +44,35 @@ class PlanarFigure:
           behind: where the line of observed ground heights begins, m behind the root.
           ahead: where it ends, m ahead of the root.
           samples: number of heights on that line; 0 is blind.
+          contact: whether to sense the contacts of end effectors too.
         """
         self.character, self.arena = character, arena
         character.create_root_joints(arena.attach(character))
         # The last sample is the ground under the root, from which all heights are measured.
         self._samples = np.append(np.linspace(-behind, ahead, samples), 0.0)
-        self._fall_sensors = [
-            f'{character.mjcf_model.model}_{n}_fall' for n in character.row.fall_links
-        ]
-        for name, link in zip(self._fall_sensors, character.row.fall_links, strict=True):
-            arena.mjcf_model.sensor.add(
-                'contact', name=name, body1=character.mjcf_model.find('body', link),
-                body2=arena.ground_body, num=1, data='found',
-            )  # fmt: skip
+        self._fall_sensors = [self._add_sensor(n, 'fall') for n in character.row.fall_links]
+        ends = character.row.end_effectors if contact else ()
+        self._contact_sensors = [self._add_sensor(name, 'contact') for name in ends]
         links = len(character.row.links)
         self.blocks = {'terrain': samples, 'pose': 2 * links + 1, 'velocity': 2 * links}
 
-    def bind(self, world: World) -> None:
-        """Resolves ids in a compiled world and allocates scratch of `world.n` rows."""
-        self._world = world
+    def _add_sensor(self, link: str, kind: str) -> str:
+        """Adds a sensor of the contacts between a link and the ground; returns its name."""
+        name = f'{self.character.mjcf_model.model}_{link}_{kind}'
+        self.arena.mjcf_model.sensor.add(
+            'contact', name=name, body1=self.character.mjcf_model.find('body', link),
+            body2=self.arena.ground_body, num=1, data='found',
+        )  # fmt: skip
+        return name
+
+    def bind(self, world: World, about: str = 'com') -> None:
+        """Resolves ids in a compiled world and allocates scratch of `world.n` rows.
+
+        Args:
+          world: the simulations.
+          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
+        """
+        self._world, self._about = world, about
         self.arena.bind(world)
         character = self.character
         scope = f'{character.mjcf_model.model}/'
@@ -86,6 +102,7 @@ class PlanarFigure:
         self._share = np.kron((mass / mass.sum())[:, None], np.eye(2))  # (2 * links, 2)
         falls = world.sensor_addresses(self._fall_sensors)  # added one after the other
         self._fall = slice(int(falls[0]), int(falls[-1]) + 1)
+        self._contact = world.sensor_addresses(self._contact_sensors)
         # One ground query serves samples, root and end effectors.
         self._ground_x = np.zeros((world.n, len(self._samples) + len(self.effectors)))
 
@@ -102,13 +119,13 @@ class PlanarFigure:
           observation: (n, size); terrain, pose and velocity are written there.
           blocks: where they lie.
           effectors: where end effectors are written, (n, 2 * E): all x ahead of the centre of mass,
-            then all z above the ground, m.
+            or of the root, then all z above the ground, m.
           com_velocity: where the velocity of the centre of mass is written, (n, 2), m/s.
 
         Returns:
           A namespace for `measure`. Of use to tasks: `x`, `z`, `pitch` (n, 1), `rates` of the joints
           (n, J or more), `height` (n, 1) of the root above the ground, `fall` (n, F) contact
-          counts, and after `measure` `facing`.
+          counts, and after `measure` `facing` and `under` (n, 1), the ground under the root, m.
         """
         world, n = self._world, self._world.n
         x, z, pitch = self.pose_qpos[:3]
@@ -116,6 +133,7 @@ class PlanarFigure:
         effector_count, samples = len(self.effectors), len(self._samples)
         return SimpleNamespace(
             facing=None,
+            under=None,
             qpos=world.qpos,
             qvel=world.qvel,
             x=world.qpos[:, x, None],
@@ -126,6 +144,7 @@ class PlanarFigure:
             xipos=world.xipos.reshape(n, -1),
             cvel=world.cvel.reshape(n, -1),
             com=world.subtree_com.reshape(n, -1),
+            about=(world.subtree_com if self._about == 'com' else world.xpos).reshape(n, -1),
             fall=world.sensordata[:, self._fall],
             height=pose[:, :1],
             position=pose[:, 1:],
@@ -167,11 +186,11 @@ class PlanarFigure:
         ground = self.arena.height(self._ground_x)
         if v.facing is not None:  # ahead is behind, where the boxes do not reach as far
             self.arena.look_far(self._ground_x, ground)
-        under_root = ground[:, samples : samples + 1]
-        np.subtract(v.z, under_root, v.height)
+        v.under = ground[:, samples : samples + 1]
+        np.subtract(v.z, v.under, v.height)
         if samples:
-            np.subtract(ground[:, :samples], under_root, out=v.terrain)
-        v.effector_x -= v.com.take(self._com_x, 1)
+            np.subtract(ground[:, :samples], v.under, out=v.terrain)
+        v.effector_x -= v.about.take(self._com_x, 1)
         v.effector_z -= ground[:, samples + 1 :]
 
         if v.facing is not None:
@@ -206,6 +225,14 @@ class PlanarFigure:
         world.qpos[rows[:, None], self.pose_qpos] = poses
         world.qvel[rows[:, None], self.pose_dof] = rates
         world.forward(rows)
+
+    def contacts(self) -> np.ndarray:
+        """Returns whether each end effector touches the ground, 0 or 1, (n, E)."""
+        return (self._world.sensordata.take(self._contact, 1) > 0).astype(float)
+
+    def feet(self) -> np.ndarray:
+        """Returns where the end effectors are in the world, x and z, (n, E, 2) m."""
+        return self._world.xpos[:, self.effectors, ::2]
 
     def ground(self, row: int, x: np.ndarray) -> np.ndarray:
         """Heights of the ground of one simulation at x (k,), m."""

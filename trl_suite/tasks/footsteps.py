@@ -24,9 +24,8 @@ from trl_suite.tasks.plans import (
     options,
 )
 from trl_suite.tasks.reference3d import SpatialReference
-from trl_suite.tasks.task import Marker, drawn_seed
+from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
-from trl_suite.terrain import Ground
 from trl_suite.world import World
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
@@ -140,7 +139,6 @@ class Footsteps(Tracking):
         weights = np.array(list(self.TERMS.values()))
         self._term_weights, self._term_scales = weights[None, :-1, 0], -weights[None, :-1, 1]
         self._heading_weight = weights[-1, 0]
-        self._random = [np.random.default_rng(0)] * n
         self.stance = np.zeros(n, int)  # foot that stands
         self.landing = np.zeros((n, 2, 3))  # m; where the swing foot lands, then the stance foot
         self.heading = np.zeros(n)  # rad; planned
@@ -168,14 +166,7 @@ class Footsteps(Tracking):
     def _start(
         self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = np.zeros((len(rows), 3))
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
-            drawn = random_state.random_sample()
-            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
-            self._random[row] = np.random.default_rng(drawn_seed(random_state))
-            spawns[i] = ground.spawn(self._random[row])
-            self.arena.begin_episode(row, ground, spawns[i, :2])
+        spawns = self._begin_grounds(rows, random_states)
         return self._pose_of_start(rows, spawns)
 
     def _pose_of_start(
@@ -427,18 +418,3 @@ class Footsteps(Tracking):
         'stance', 'landing', 'heading', '_length', '_width', '_track', '_turned', '_shift', 'goal',
         'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin',
     )  # fmt: skip
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            **super().get_state(row),
-            'random': self._random[row].bit_generator.state,
-            **{name: getattr(self, name)[row].copy() for name in self._KEPT},
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        super().set_state(row, state)
-        random = np.random.default_rng(0)
-        random.bit_generator.state = state['random']
-        self._random[row] = random
-        for name in self._KEPT:
-            getattr(self, name)[row] = state[name]

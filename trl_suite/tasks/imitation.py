@@ -7,8 +7,8 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import SimpleNamespace
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,10 @@ class Imitation(Task):
       target: height of the reference's root, then its link positions relative to its root and its
         link velocities; 4N + 1.
     """
+
+    TERMS: Mapping[str, tuple[float, float]] = rewards.IMITATION_TERMS  # weight, scale of the error
+    ABOUT = 'com'  # from where end effectors are measured, or 'root'
+    EXTRAS: Mapping[str, int] = MappingProxyType({})  # blocks of a subclass, with their sizes
 
     def __init__(
         self,
@@ -91,7 +95,9 @@ class Imitation(Task):
         self.character, self.arena, self.clip = character, arena, clip
         self.actuation_model = actuation_model
         self._start_phase, self._spawn, self._blend = start_phase, spawn, blend
-        self.figure = PlanarFigure(character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_samples)
+        self.figure = PlanarFigure(
+            character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_samples, 'contact' in self.EXTRAS
+        )
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
 
         options: dict[str, Any] = {}
@@ -106,6 +112,7 @@ class Imitation(Task):
             'strain': len(muscles),
             'phase': 0 if target else 1 + PHASE_BINS,
             'target': 4 * len(character.row.links) + 1 if target else 0,
+            **self.EXTRAS,
         })  # fmt: skip
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
         self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])
@@ -150,13 +157,13 @@ class Imitation(Task):
     def bind(self, world: World) -> None:
         self.world = world
         figure, row = self.figure, self.character.row
-        figure.bind(world)
+        figure.bind(world, self.ABOUT)
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
         self._ctrl = world.ctrl[:, controls[0] : controls[-1] + 1]  # added one after the other
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
-            figure.effectors, figure.geoms, PHASE_BINS,
+            figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
         )  # fmt: skip
         columns = self.reference.columns
         # Pitch and joints.
@@ -178,7 +185,7 @@ class Imitation(Task):
         n = world.n
         self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
         self.reward = np.zeros(n)
-        self.reward_terms = np.zeros((n, len(rewards.IMITATION_TERMS)))
+        self.reward_terms = np.zeros((n, len(self.TERMS)))
         self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
         self.phase = np.zeros(n)  # of the clip, in [0, 1)
         self._start_cycles = np.zeros(n)  # phase of the start
@@ -239,6 +246,7 @@ class Imitation(Task):
             too_fast = np.abs(v.rates).max(1) > MAX_JOINT_SPEED
             np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
             broken = bool(self.diverged.any())  # sums of many rows say little
+        self._step()
         if broken:
             # The last finite observation stands for what broke down.
             kept = self.observation[self.diverged]
@@ -253,6 +261,9 @@ class Imitation(Task):
             self.failed.fill(False)
         np.add.reduce(self.reward_terms, axis=1, out=self.reward)
 
+    def _step(self) -> None:
+        """What a subclass changes between the physics and the observation."""
+
     def observe(self) -> None:
         v = self._all
         self.figure.measure(v)
@@ -265,9 +276,7 @@ class Imitation(Task):
         if v.facing is not None:
             error[:, 0] = rewards.wrap(error[:, 0])
         error *= error
-        # Row by row, so that a row's sums do not depend on how many rows there are.
-        np.matmul(error[:, None], self._weights, out=self._errors)
-        rewards.imitation(self._errors[:, 0], out=self.reward_terms)
+        self._compare(error, reference)
 
         if v.strain is not None:
             np.subtract(self.world.ten_length, self._rest, out=v.strain)
@@ -277,12 +286,18 @@ class Imitation(Task):
         else:
             v.phase_out[...] = reference[:, self._phase_columns]
 
+    def _compare(self, error: np.ndarray, reference: np.ndarray) -> None:
+        """Writes the reward terms of squared differences from the features of the reference."""
+        # Row by row, so that a row's sums do not depend on how many rows there are.
+        np.matmul(error[:, None], self._weights, out=self._errors)
+        rewards.imitation(self._errors[:, 0], out=self.reward_terms)
+
     def infos(self) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
         # An observation has terms, also that of a start; but a start has no reward, nor its parts.
         terms = self.reward_terms.T * (self.reward != 0)
         return {
-            'reward_terms': dict(zip(rewards.IMITATION_TERMS, terms, strict=True)),
+            'reward_terms': dict(zip(self.TERMS, terms, strict=True)),
             'fell': self.failed > self.diverged,
             'diverged': self.diverged.copy(),
             'distance': self._all.x[:, 0].copy(),

@@ -22,10 +22,9 @@ from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, Footsteps
 from trl_suite.tasks.high_level import GOAL_LASTS, flag
 from trl_suite.tasks.imitation3d import SpatialImitation
-from trl_suite.tasks.task import Marker, consecutive, drawn_seed
+from trl_suite.tasks.task import Marker, consecutive
 from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
-from trl_suite.terrain import Ground
 from trl_suite.world import World
 
 REWARDS = ('goal', 'original')
@@ -95,7 +94,6 @@ class Journey(SpatialImitation):
         n = world.n
         terms = np.array(list(rewards.JOURNEY_TERMS.values()))
         self._term_weights, self._term_scales = terms[None, :, 0], -terms[None, :, 1]
-        self._random = [np.random.default_rng(0)] * n
         self.goal = np.zeros((n, 3))  # m
         self._due = np.zeros(n, int)  # control step of the episode at which it is drawn anew
         self.goals_reached = np.zeros(n, int)  # in the episode
@@ -109,14 +107,7 @@ class Journey(SpatialImitation):
     def _start(
         self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = np.zeros((len(rows), 3))
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
-            drawn = random_state.random_sample()
-            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
-            self._random[row] = np.random.default_rng(drawn_seed(random_state))
-            spawns[i] = ground.spawn(self._random[row])
-            self.arena.begin_episode(row, ground, spawns[i, :2])
+        spawns = self._begin_grounds(rows, random_states)
         times = self._start_cycles[rows] * self.period
         poses = self.clip.pose(times)
         poses[:, :2] = 0.0
@@ -205,21 +196,6 @@ class Journey(SpatialImitation):
         return [*self.trace.markers(row), flag(self.goal[row])]
 
     _KEPT: tuple[str, ...] = ('goal', '_due', 'goals_reached', '_speed', '_places')
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            **super().get_state(row),
-            'random': self._random[row].bit_generator.state,
-            **{name: getattr(self, name)[row].copy() for name in self._KEPT},
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        super().set_state(row, state)
-        random = np.random.default_rng(0)
-        random.bit_generator.state = state['random']
-        self._random[row] = random
-        for name in self._KEPT:
-            getattr(self, name)[row] = state[name]
 
 
 BALL_TERMS = {

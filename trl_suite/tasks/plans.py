@@ -54,6 +54,24 @@ class Plans:
 
 
 @dataclasses.dataclass(frozen=True)
+class StraightPlans:
+    """How plans in the plane are drawn: as those of `Plans`, but straight on and of no width.
+
+    Attributes:
+      length: of a step, m: least and most.
+      change: probability that a step has another length than the one before.
+    """
+
+    length: tuple[float, float] = (0.4, 0.4)
+    change: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, ('length',), 'm')
+        if not 0 <= self.change <= 1:
+            raise ValueError(f'change is {self.change}; expected a probability')
+
+
+@dataclasses.dataclass(frozen=True)
 class Pushes:
     """Horizontal forces from any side on the middle of the torso, again and again.
 

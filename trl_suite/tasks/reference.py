@@ -16,7 +16,8 @@ class Reference:
 
     Features of one phase, all independent of the ground and of the distance walked; see `columns`:
       angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
-      effectors (2 * E,) end effectors: all x ahead of the centre of mass, then all z above 0, m;
+      effectors (2 * E,) end effectors: all x ahead of the centre of mass, or of the root, then all z
+        above 0, m;
       com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z by turns, m;
       velocities (2 * links,) of the link centres, m/s;
@@ -36,6 +37,7 @@ class Reference:
         effectors: np.ndarray,
         geoms: np.ndarray,
         bins: int,
+        about: str = 'com',
     ) -> None:
         """Tabulates a clip.
 
@@ -48,6 +50,7 @@ class Reference:
           effectors: body ids of the end effectors.
           geoms: ids of the collision geoms.
           bins: parts of the cycle, a divisor of SAMPLES.
+          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
         """
         self.clip = clip
         self.period = clip.duration
@@ -65,7 +68,8 @@ class Reference:
             centres = data.xipos[links][:, ::2]
             com = share @ centres
             velocity = link_velocities(centres, data.cvel[links], data.subtree_com[links[0], ::2])
-            effector = data.xpos[effectors][:, ::2] - (com[0], 0)
+            ahead = com[0] if about == 'com' else pose[0]
+            effector = data.xpos[effectors][:, ::2] - (ahead, 0)
             rows.append(
                 np.concatenate([
                     pose[2:], rate[2:], effector.T.ravel(), share @ velocity,

@@ -18,7 +18,8 @@ from trl_suite.symmetry import Mirror, blocks, exchanged
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.reference3d import SpatialReference, mean_targets
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive
+from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive, drawn_seed
+from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
 
@@ -182,6 +183,7 @@ class Tracking(Task):
         self.reward_terms = np.zeros((n, len(self.TERMS)))
         self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
         self._start_cycles = np.zeros(n)  # phase of the start
+        self._random = [np.random.default_rng(0)] * n  # what is drawn within an episode
         self._count = np.zeros(n, int)  # control steps since
         self._origin = np.zeros((n, 3))  # x, y, heading of the start
         self._observation = np.zeros((n, max(part.stop for part in self._full.values())))
@@ -221,6 +223,20 @@ class Tracking(Task):
             columns['effectors'].start - offset, columns['effectors'].stop - offset
         )
         return result
+
+    def _begin_grounds(
+        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> np.ndarray:
+        """Draws phases, grounds, generators and starts of some rows; returns spawns, (m, 3)."""
+        spawns = np.zeros((len(rows), 3))
+        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+            drawn = random_state.random_sample()
+            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
+            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            self._random[row] = np.random.default_rng(drawn_seed(random_state))
+            spawns[i] = ground.spawn(self._random[row])
+            self.arena.begin_episode(row, ground, spawns[i, :2])
+        return spawns
 
     def begin_episodes(
         self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
@@ -393,6 +409,8 @@ class Tracking(Task):
         """Distance travelled, (n,) m, from the way from the start, (n, 2) m."""
         return np.sqrt(way[:, 0] ** 2 + way[:, 1] ** 2)
 
+    _KEPT: tuple[str, ...] = ()  # arrays of n rows that a subclass has in its state
+
     def get_state(self, row: int) -> dict[str, Any]:
         return {
             'arena': self.arena.state(row),
@@ -405,6 +423,8 @@ class Tracking(Task):
             'reward_terms': self.reward_terms[row].copy(),
             'failed': bool(self.failed[row]),
             'diverged': bool(self.diverged[row]),
+            'random': self._random[row].bit_generator.state,
+            **{name: getattr(self, name)[row].copy() for name in self._KEPT},
         }
 
     def set_state(self, row: int, state: dict[str, Any]) -> None:
@@ -416,3 +436,8 @@ class Tracking(Task):
         self.reward[row] = state['reward']
         self.reward_terms[row] = state['reward_terms']
         self.failed[row], self.diverged[row] = state['failed'], state['diverged']
+        random = np.random.default_rng(0)
+        random.bit_generator.state = state['random']
+        self._random[row] = random
+        for name in self._KEPT:
+            getattr(self, name)[row] = state[name]

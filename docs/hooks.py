@@ -1,0 +1,26 @@
+"""What mkdocs.yml has no words for: pages link to files beside docs/, which the site has inside."""
+
+from __future__ import annotations
+
+import pathlib
+import re
+from typing import Any
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+BESIDE = ('examples', 'benchmarks')
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Adds the files of the folders beside docs/."""
+    from mkdocs.structure.files import File
+
+    for name in BESIDE:
+        for path in (ROOT / name).glob('*.*'):
+            uri = path.relative_to(ROOT).as_posix()
+            files.append(File.generated(config, uri, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Turns links out of docs/ into links inside the site."""
+    return re.sub(rf'\]\(\.\./({"|".join(BESIDE)})/', r'](\1/', markdown)

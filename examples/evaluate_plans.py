@@ -1,0 +1,122 @@
+"""How well footsteps are planned: the high-level tasks, by hand and by what was learnt.
+
+    python examples/evaluate_plans.py                                      # all, both policies
+    python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
+
+Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
+`evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the share that does not
+fall, speed towards the goal, goals per minute, distance along a trail, the share of time with the
+ball at its goal, and falls per kilometre. Writes into trained/plans.json what it has measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from trl_suite import catalogue, errors, files, policies, resources
+from trl_suite.scripted import scripted
+from trl_suite.vector import VectorEnvironment
+
+EPISODES = 32
+POLICIES = ('scripted', 'reference')
+SEGMENT = 2.0  # m; of a trail
+
+
+def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarray:
+    """Distance of places (n, 2) from the beginnings of their trails, (n,) m; 0 where is none."""
+    found = np.zeros(len(place))
+    for row, ground in enumerate(environments.task.arena.grounds):
+        if ground.layout.trail is not None:
+            trail = ground.layout.trail
+            middle = 0.5 * (trail.start + trail.end)
+            found[row] = SEGMENT * np.linalg.norm(middle - place[row], axis=1).argmin()
+    return found
+
+
+def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int) -> dict:
+    """Runs one episode in every row; returns what became of them."""
+    seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
+    environments = VectorEnvironment(id_, episodes, 0, seeds, autoreset='disabled')
+    policy, observation = make(environments), environments.reset()
+    task, limit = environments.task, environments.step_limit
+    assert limit is not None
+    root = task.figure.kinematics.links[0]
+
+    def places() -> np.ndarray:
+        return task.world.xpos[:, root, :2].copy()
+
+    runs, fell = np.ones(episodes, bool), np.zeros(episodes, bool)
+    reward, seconds, towards, path, goals, arrived = np.zeros((6, episodes))
+    before = places()
+    begin = along_trails(environments, before)
+    trail = np.zeros(episodes)
+    while runs.any():
+        step = environments.step(policy(observation))
+        info, after = step.info, places()
+        reward += step.reward * runs
+        seconds += info['duration'] * runs
+        towards += info['speed'] * info['duration'] * runs
+        path += np.linalg.norm(after - before, axis=1) * runs
+        arrived += info.get('at_goal', np.zeros(episodes)) * info['duration'] * runs
+        goals[runs] = info['goals_reached'][runs]
+        ended = step.terminated | step.truncated
+        if (ended & runs).any():
+            last = along_trails(environments, after) - begin
+            trail[ended & runs] = last[ended & runs]
+        fell |= step.terminated & runs
+        runs &= ~ended
+        observation, before = step.observation, after
+        if ended.any() and runs.any():  # every row must go on
+            observation = environments.reset(ended)
+            before = places()
+    environments.close()
+    return {
+        'episodes': episodes, 'seed': seed, 'reward': float(reward.mean() / limit),
+        'survived': float(1 - fell.mean()), 'seconds': float(seconds.mean()),
+        'speed': float(towards.sum() / seconds.sum()),
+        'goals_per_minute': float(60 * goals.sum() / seconds.sum()),
+        'trail': float(np.median(trail)), 'at_goal': float(arrived.sum() / seconds.sum()),
+        'falls_per_km': float(1000 * fell.sum() / path.sum()),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('pattern', nargs='?', default='PD_Biped3D_HLC_*', help='of ids')
+    parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES)
+    parser.add_argument('--episodes', type=int, default=EPISODES)
+    parser.add_argument('--seed', type=int, default=0)
+    arguments = parser.parse_args()
+    ids = [
+        row.id
+        for row in catalogue.ROWS
+        if 'hierarchical' in row.tags and fnmatch.fnmatchcase(row.id, arguments.pattern)
+    ]
+    if not ids:
+        raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
+    path = resources.directory('trained') / 'plans.json'
+    found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    for id_ in ids:
+        for name in arguments.policies:
+            make = scripted
+            if name == 'reference':
+                try:
+                    policy = policies.reference(id_)
+                except FileNotFoundError:
+                    continue
+                make = lambda _, policy=policy: policy  # noqa: E731
+            result = run(id_, make, arguments.episodes, arguments.seed)
+            found.setdefault(id_, {})[name] = result
+            print(id_, name, {k: round(v, 3) for k, v in result.items()}, flush=True)
+            with files.replacing(path) as part:
+                part.write_text(json.dumps(found, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,108 @@
+"""The pages in docs/: as fresh as the code, with all that they link to; and the README."""
+
+import importlib.util
+import pathlib
+import re
+
+from absl.testing import absltest, parameterized
+
+from trl_suite import catalogue, describe, suite
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+DOCS = ROOT / 'docs'
+LARGEST = 12e6  # bytes of all pictures
+_LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f'{name}.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+generate = load('generate')
+
+
+class PagesTest(absltest.TestCase):
+    def test_fresh(self):
+        """Made anew, all pages are what is there: run `python docs/generate.py` if this fails."""
+        pages = generate.pages()
+        self.assertEqual(list(generate.stale(pages)), [])
+        for folder, names in (
+            ('environments', catalogue.BY_ID), ('characters', generate.characters.CHARACTERS),
+            ('terrains', map(generate.slug, generate.presets())),
+        ):  # fmt: skip
+            for name in names:
+                self.assertIn(f'{folder}/{name}.md', pages)
+
+    def test_links(self):
+        """Whatever a page links to is there, and is not empty."""
+        files = [ROOT / 'README.md', *DOCS.rglob('*.md')]
+        for file in files:
+            for link in _LINK.findall(file.read_text(encoding='utf-8')):
+                target = file.parent / link
+                self.assertTrue(target.exists(), f'{file}: {link}')
+                if target.is_file():
+                    self.assertGreater(target.stat().st_size, 0, f'{file}: {link}')
+
+    def test_pictures_are_small_and_used(self):
+        pictures = [path for path in (DOCS / 'pictures').rglob('*') if path.is_file()]
+        self.assertLess(sum(path.stat().st_size for path in pictures), LARGEST)
+        linked = {
+            (file.parent / link).resolve()
+            for file in (ROOT / 'README.md', *DOCS.rglob('*.md'))
+            for link in _LINK.findall(file.read_text(encoding='utf-8'))
+        }
+        self.assertEqual({path.resolve() for path in pictures} - linked, set())
+
+    def test_numbers_in_the_readme(self):
+        text = (ROOT / 'README.md').read_text(encoding='utf-8')
+        self.assertIn(f'{len(catalogue.ROWS)} environments', text)
+        self.assertIn(f'\n{len(suite.BENCHMARKING)} of them are registered', text)
+        for domain, tasks in suite.TASKS_BY_DOMAIN.items():
+            self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
+
+
+class WordsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        'PD_Dog2D_Gaps_Terrain-v0', 'FSM_Raptor2D_Terrain_Walls-v0', 'PD_Biped3D_HLC_LargeBlocks-v0'
+    )
+    def test_what_is_built_on_other_ground_is_told_the_same(self, id_):
+        """Pages of environments that differ by their ground share what was built."""
+        row = suite.find(id_)
+        other = next(
+            each for each in catalogue.ROWS
+            if each.terrain != row.terrain and each.options == row.options
+            and (each.rules, each.character, each.clip) == (row.rules, row.character, row.clip)
+        )  # fmt: skip
+        own, shared = (suite.build_row(each, {}, {}) for each in (row, other))
+        self.assertEqual(list(describe.sections(row, own)), list(describe.sections(row, shared)))
+
+    def test_markdown(self):
+        table = describe.Table(('a', 'b'), [('x|y', 0.5), ('2 * <3>', 12)])
+        self.assertEqual(
+            describe.markdown(['a * b', table._replace(numbered=True)]),
+            'a \\* b\n\n| index | a | b |\n| --: | --- | --: |\n'
+            '| 0 | x\\|y | 0.5 |\n| 1 | 2 \\* &lt;3> | 12 |',
+        )
+        self.assertEqual(describe.table(table.header, table.cells).split(), [
+            'a', 'b', 'x|y', '0.5', '2', '*', '<3>', '12',
+        ])  # fmt: skip
+
+
+class SiteTest(absltest.TestCase):
+    def test_links_out_of_the_folder_stay_inside_the_site(self):
+        hooks = load('hooks')
+        self.assertEqual(
+            hooks.on_page_markdown('[a](../examples/a.py) [b](../characters/dog.md)'),
+            '[a](examples/a.py) [b](../characters/dog.md)',
+        )
+        # No other links leave the folder.
+        for file in DOCS.glob('*.md'):
+            for link in _LINK.findall(hooks.on_page_markdown(file.read_text(encoding='utf-8'))):
+                self.assertFalse(link.startswith('..'), f'{file}: {link}')
+
+
+if __name__ == '__main__':
+    absltest.main()

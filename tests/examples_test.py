@@ -1,0 +1,76 @@
+"""Tests of the programs that train and compare: which runs there are, and in which order."""
+
+import pathlib
+import sys
+
+from absl.testing import absltest, parameterized
+
+from trl_suite import catalogue, evaluation
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import compare_transfer
+import evaluate_plans
+import ppo
+import train_all
+
+
+class JobsTest(parameterized.TestCase):
+    def test_every_environment_is_trained_but_for_most_gaits(self):
+        ids = {id_ for id_, _ in train_all.jobs('*')}
+        gaits = {id_ for id_, row in catalogue.BY_ID.items() if row.rules == 'gait'}
+        self.assertEqual(ids, set(catalogue.BY_ID) - gaits | set(train_all.GAITS))
+
+    def test_actuation_models_are_compared_with_three_seeds(self):
+        """Twelve cells: torque, velocity, position and muscle, of biped, dog and raptor."""
+        again = {id_ for id_, seed in train_all.jobs('*') if seed == 3}
+        self.assertLen(again, 12)
+        self.assertLen([id_ for id_ in again if id_.startswith('MTU_')], 3)
+
+    def test_what_a_run_begins_with_is_trained_before(self):
+        seen = set()
+        for id_, _ in train_all.jobs('*'):
+            start = ppo.settings_for(id_).start
+            if start and start not in evaluation.BASELINES:
+                self.assertIn(start, seen, id_)
+            seen.add(id_)
+
+    def test_starts_act_as_what_begins_with_them(self):
+        for id_ in catalogue.BY_ID:
+            start = ppo.settings_for(id_).start
+            if start in catalogue.BY_ID:
+                own, other = catalogue.BY_ID[id_], catalogue.BY_ID[start]
+                self.assertEqual(
+                    (own.character, own.actuation), (other.character, other.actuation), id_
+                )
+
+
+class TransferTest(parameterized.TestCase):
+    def test_flat_ground_of_every_row(self):
+        for row in catalogue.ROWS:
+            if row.domain == 'plaid':
+                flat = catalogue.BY_ID[compare_transfer.flat_ground(row)]
+                self.assertEqual(
+                    (flat.terrain, flat.character, dict(flat.options)),
+                    ('flat', row.character, dict(row.options)),
+                )
+
+
+class PlansTest(absltest.TestCase):
+    def test_what_is_measured(self):
+        """Two episodes of a controller that walks nowhere: they end early, without a goal."""
+        id_ = 'PD_Biped3D_HLC_PathFollowing-v0'
+
+        def make(environments):
+            return lambda observation: 0.0 * observation[:, :5] + 1.0  # too far for anybody
+
+        found = evaluate_plans.run(id_, make, episodes=2, seed=0)
+        self.assertEqual(found['survived'], 0)
+        self.assertEqual(found['goals_per_minute'], 0)
+        self.assertBetween(found['seconds'], 0.5, 20)
+        self.assertLess(found['reward'], 0.05)
+        self.assertGreater(found['falls_per_km'], 50)
+        self.assertEqual(found['at_goal'], 0)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,1 @@
+"""What stands behind the longer commands of `trl-suite`: doctor, bench and gallery."""

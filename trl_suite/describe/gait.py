@@ -1,0 +1,157 @@
+"""Gait state machines, whose parameters an action sets once per cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from trl_suite import catalogue
+from trl_suite.describe.common import Meanings, floats
+from trl_suite.describe.layout import Section, Table, section
+from trl_suite.environment import Environment
+from trl_suite.tasks import gait
+
+_BLOCKS = {
+    'terrain': (
+        'm',
+        'ground heights from 0.5 m behind to 10 m ahead, above the ground at the root',
+    ),
+    'pose': ('m', 'root height above ground; then x, z of each other link centre from the root'),
+    'velocity': ('m/s', 'x, z velocity of each link centre'),
+}
+_STANCE_FIRST = '; the stance leg first, then the swing leg'
+_HOPPER_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
+# Units of gait parameters that are no angles, by name without state.
+_UNITS = {
+    'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
+    **dict.fromkeys(
+        ('BackForceX', 'BackForceY', 'FrontForceX', 'FrontForceY', 'ForceX', 'ForceY'), 'N'
+    ),
+}  # fmt: skip
+
+
+def blocks(task: Any) -> Meanings:
+    """Returns units and meanings of the observation blocks."""
+    row = task.character.row
+    ends = _HOPPER_ENDS if row.name == 'hopper' else {}
+    if row.mirror:
+        ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
+    return {name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _BLOCKS.items()}
+
+
+def before(task: Any) -> Iterator[Section]:
+    """Yields the machine's states and parameters."""
+    figures = task.gait.parameters
+    yield section(
+        f'Gait: {len(figures.states)} states; joints are driven to targets by stable PD',
+        Table(('state', 'ends'), list(zip(figures.states, task.gait.endings, strict=True))),
+    )
+    chosen = [
+        name for name, values in figures.sets.items() if np.array_equal(values, figures.centre)
+    ]
+    same = (figures.base_actions == figures.centre).all(1)
+    chosen += [f'base action {i}' for i in np.flatnonzero(same)]
+    blends = [
+        (i, f'{a} {1 - share:g}, {b} {share:g}' if 0 < share < 1 else b if share else a)
+        for i, (a, b, share) in enumerate(figures.blends)
+    ]
+    fixed = [
+        f'{name} {value:g} {_unit(task, name)}' if value else f'{name} 0'
+        for i, (name, value) in enumerate(zip(figures.names, figures.centre, strict=True))
+        if i not in figures.actions
+    ]
+    yield section(
+        f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
+        Table(('base action', 'parameter set'), blends),
+        f'action 0 is {" = ".join(chosen)}',
+        f'sign does not count: {", ".join(figures.names[i] for i in figures.absolute)}',
+        *([f'fixed: {", ".join(fixed)}'] if fixed else []),
+    )
+
+
+def after(task: Any) -> Iterator[Section]:
+    """Yields what comes after the observation."""
+    yield from ()
+
+
+def action(environment: Environment) -> Section:
+    """Returns what the actions set."""
+    task: Any = environment.task
+    action_map, count = task.action_map, len(task.action_map)
+    if task.interface == 'base_action':
+        return section(
+            f'Action: {count} numbers in [-1, 1]; the largest chooses the base action',
+            'it begins with the next cycle',
+        )
+    units = [_unit(task, name) for name in action_map.names]
+    columns = (action_map.names, floats(action_map.centre), floats(action_map.half_range), units)
+    return section(
+        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
+        Table(
+            ('sets', 'centre', 'half range', 'unit'),
+            list(zip(*columns, strict=True)),
+            numbered=True,
+        ),
+    )
+
+
+def _unit(task: Any, parameter: str) -> str:
+    own = parameter.split('.')[-1]
+    slides = own == 'Knee' and task.character.prismatic.any()
+    return 'm' if slides else _UNITS.get(own, 'rad')
+
+
+def rules(task: Any) -> Iterator[Section]:
+    """Yields reward and termination."""
+    row, weights = task.character.row, task.reward_weights
+    weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
+    lines = [
+        f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {task.gait.parameters.target_speed:g})^2)',
+        'v: mean forward speed of the centre of mass, m/s',
+    ]
+    if weights['stumble']:
+        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait.STUMBLE_SHARPNESS:g} s)'
+        lines.append(
+            's: share of the time in which a link other than '
+            f'{", ".join(row.stumble_exempt)} touches the ground'
+        )
+    if row.name in gait.NO_REWARD_BACKWARDS:
+        lines.append('0 if v is negative')
+    yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
+    links = ', '.join(row.fall_links)
+    ends = [
+        f'{"one of " if len(row.fall_links) > 1 else ""}{links} touches the ground in '
+        f'{looks_until_fall(gait)} looks in a row, or often enough',
+        f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
+        f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
+        'the physics diverges',
+    ]
+    if row.name in gait.FORWARD_ONLY:
+        ends.insert(2, 'it moves backwards')
+    yield section(
+        f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',
+        '\n'.join(f'- {end}' for end in ends),
+    )
+
+
+def looks_until_fall(rule: Any) -> int:
+    """Returns how often in a row a link must be seen on the ground, from a module with the rule."""
+    down, count = 0.0, 0
+    while down <= rule.FALLEN:
+        down, count = rule.FADING * down + rule.SHARE, count + 1
+    return count
+
+
+def time(row: catalogue.Row, task: Any) -> Section:
+    """Returns rates, and how long a step and an episode are."""
+    control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
+    step = f'one cycle, at most {gait.LONGEST_CYCLE * gait.FRAME:.3g} s'
+    if task.interface == 'base_action':
+        step = f'{gait.FRAME:.3g} s'
+    return section(
+        'Time',
+        f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
+        f'(discount 1) after {row.step_limit} steps',
+    )

@@ -1,0 +1,257 @@
+"""Clips and footsteps that are tracked in three dimensions, and journeys without hierarchy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from trl_suite.describe.common import Meanings, action, time
+from trl_suite.describe.layout import Section, Table, section
+from trl_suite.tasks import ball, high_level, journey
+
+__all__ = ['BLOCKS', 'action', 'after', 'before', 'blocks', 'rules', 'time']
+
+BLOCKS = {
+    'terrain': (
+        'm',
+        'ground heights above the ground at the root, 32 lines from the left to the right (5.5 m to each '
+        'side), each of 32 from 1 m behind to 10 m ahead',
+    ),
+    'pose': (
+        'm, 1',
+        'root height above ground; then of each link its centre from the root and its orientation (wxyz)',
+    ),
+    'velocity': (
+        'm/s, rad/s',
+        'of each link the velocity of its centre, against the ground under the root, and its angular '
+        'velocity',
+    ),
+    'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
+    'target': (
+        'm, m/s',
+        "the clip's root height; its link centres from its root; their velocities",
+    ),
+    'goal': (
+        'rad, m',
+        'bearing (positive to the left) and distance of the point on the line of the start that is 3 m '
+        'further on',
+    ),
+    'contact': ('1', 'whether the right and the left foot touch the ground'),
+    'plan': ('m, rad', 'see below'),
+}
+# Of a task whose goal moves, or whose ball has one.
+TARGETS = {
+    False: ('rad, m', 'bearing (positive to the left) and distance of the goal'),
+    True: ('rad, m', 'bearing and distance of the goal as seen from the ball'),
+}
+BALL_BLOCK = (
+    'rad, m, m/s, rad/s',
+    'bearing, distance and height of the ball; its velocity (3) and its angular velocity (3)',
+)
+_MIRRORED_BLOCKS = {
+    'phase': ('1', 'phase of the step in [0, 1); then the one-hot of its half'),
+    'contact': ('1', 'whether the stance and the swing foot touch the ground'),
+}
+# Size, unit and meaning of the parts of a plan.
+_PLAN = (
+    (3, 'm', 'first landing place from the right foot; 0 while that one stands'),
+    (3, 'm', 'first landing place from the left foot; 0 while that one stands'),
+    (3, 'm', 'second landing place from the right foot; 0 unless that one stands'),
+    (3, 'm', 'second landing place from the left foot; 0 unless that one stands'),
+    (1, 'rad', 'planned heading, to the left of the present one'),
+)
+_MIRRORED_PLAN = (
+    (1, 'rad', 'planned heading, to the swing side of the present one'),
+    (3, 'm', 'first landing place from the swing foot'),
+    (3, 'm', 'second landing place from the stance foot'),
+)
+
+
+def blocks(task: Any) -> Meanings:
+    """Returns units and meanings of the observation blocks."""
+    found = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
+    if isinstance(task, journey.Journey | journey.HiddenSteps):
+        found['goal'] = TARGETS['ball' in task.blocks]
+    return found
+
+
+def before(task: Any) -> Iterator[Section]:
+    """Yields what comes before the observation."""
+    yield from ()
+
+
+def after(task: Any) -> Iterator[Section]:
+    """Yields where links and parts of a plan are in the observation."""
+    links = list(task.character.row.links)
+    pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
+    if task.mirrored:
+        # In right stance; in left stance links change places.
+        yield section(
+            'Mirrored: while the left foot stands, all is seen in a mirror, and actions are mirrored back',
+            'then what is called right below is the left side',
+        )
+    yield section(
+        'Links in the observation (centre 3 and orientation 4; velocity 3 and angular velocity 3)',
+        Table(
+            ('link', 'pose from', 'to', 'velocity from', 'to'),
+            [
+                (name, *(pose + 7 * i + k for k in (0, 7)), *(velocity + 6 * i + k for k in (0, 6)))
+                for i, name in enumerate(links)
+            ],
+        ),
+    )
+    if 'plan' in task.blocks:
+        yield plan(task, task.mirrored)
+
+
+def plan(task: Any, mirrored: bool = False) -> Section:
+    """Returns where the parts of a plan are in the observation."""
+    parts = _MIRRORED_PLAN if mirrored else _PLAN
+    starts = task.blocks['plan'].start + np.cumsum([0, *(size for size, _, _ in parts)])
+    return section(
+        'Plan in the observation (x, y, and z above the ground at the root)',
+        Table(
+            ('from', 'to', 'size', 'unit', 'meaning'),
+            [
+                (int(start), int(start) + size, size, unit, text)
+                for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
+            ],
+        ),
+        *([] if task.character.row.spatial else ['in the plane y and the heading are 0']),
+    )
+
+
+def rules(task: Any) -> Iterator[Section]:
+    """Yields what is tracked, reward and termination."""
+    row, motion = task.character.row, task.motion
+    steps = hasattr(task, 'plans')
+    if steps:
+        noun = 'step' if len(motion) == 1 else 'steps'
+        yield section(
+            f'Steps: {motion.name}',
+            f'{motion.description}: {len(motion)} {noun} and the mirrored; the nearest to the plan is '
+            f'the reference of a step. Period of two steps {task.period:.4g} s; the right foot '
+            'stands while the phase is below 0.5',
+        )
+        yield _plans(task)
+    else:
+        yield section(
+            f'Clip: {motion.name}',
+            f'{motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
+        )
+    if isinstance(task, journey.Journey):
+        yield goal_and_ball() if 'ball' in task.blocks else goal(task)
+    yield section(
+        'Reward: sum of weight * exp(-scale * squared error), at most 1; 0 after a fall',
+        *_reward(task, steps),
+    )
+    miss = ''
+    if steps and task.miss is not None:
+        miss = f'a foot lands more than {task.miss:g} m from its place; '
+    yield section(
+        'Termination (discount 0)',
+        f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
+        f'{miss}or the physics diverges',
+    )
+
+
+def _reward(task: Any, steps: bool) -> Iterator[Table | str]:
+    of_ball = 'ball' in task.blocks
+    yield Table(
+        ('term', 'weight', 'scale'),
+        [
+            (name, weight, scale if name != 'heading' else '')
+            for name, (weight, scale) in task.TERMS.items()
+            if name not in ball.SOCCER_TERMS or not of_ball
+        ],
+    )
+    if 'heading' in task.TERMS:
+        aim = 'of the planned heading' if steps else 'of the heading from the way to go'
+        yield f'heading: weight * ((1 + cos error) / 2)^4, error {aim}'
+    if 'proximity' in task.TERMS:
+        where = 'ball' if of_ball else 'goal'
+        yield (
+            f'the way to go is that to the {where}: the clip is turned that way; within '
+            f'{journey.NEAR:g} m neither velocity nor heading counts; proximity is of the distance over '
+            f'{journey.NEAR:g} m'
+        )
+    if of_ball:
+        formulas, full = ball_terms(ball.SPEED, task._goal_reached)
+        weights = [task.TERMS[name][0] for name in task.TERMS if name in ball.SOCCER_TERMS]
+        yield Table(
+            ('term', 'weight', 'times'),
+            list(zip(ball.SOCCER_TERMS, weights, formulas, strict=True)),
+        )
+        yield full
+    if steps:
+        yield (
+            'end_effector: in the second half of a step, that of the swing foot is the way to its '
+            'landing place'
+        )
+
+
+def _plans(task: Any) -> Section:
+    """Returns how plans are drawn."""
+    plans = task.plans
+    lines = [f'steps {span(plans.length)} long, feet {span(plans.width)} apart']
+    if task.goal_given:
+        lines.append('heads for a goal, drawn anew when it is reached')
+    else:
+        lines.append(f'the heading changes by N(0, {plans.turn:g}) rad from step to step')
+        if plans.sharp:
+            lines.append(f'with probability {plans.sharp:g} by anything up to pi instead')
+    if plans.from_root:
+        lines.append(f'with probability {plans.from_root:g} planned anew from the root')
+    if task.pushes:
+        low, high = task.pushes.force
+        lines.append(f'the torso is pushed now and then by {low:g} to {high:g} N')
+    return section('Plans: at every switch of stance', '; '.join(lines))
+
+
+def span(values: tuple[float, float]) -> str:
+    """Returns a range of lengths in m."""
+    low, high = values
+    return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
+
+
+def goal(task: Any) -> Section:
+    """Returns when the goal changes."""
+    times = _seconds(high_level.GOAL_LASTS)
+    return section('Goal', f'drawn anew within {task._goal_reached:g} m of it, or after {times}')
+
+
+def goal_and_ball() -> Section:
+    """Returns where ball and goal are, and when they change."""
+    low, high = ball.BALL_AWAY
+    return section(
+        'Goal and ball',
+        f'a ball of {ball.RADIUS:g} m and {ball.MASS:g} kg lies {low:g} to {high:g} m from the walker, the '
+        f'goal up to {ball.GOAL_AWAY[1]:g} m from the ball; both are drawn anew, the ball after '
+        f'{_seconds(ball.BALL_LASTS)}, the goal after {_seconds(high_level.GOAL_LASTS)}',
+    )
+
+
+def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
+    """Returns formulas of the terms that are about a ball, and when they are full.
+
+    Args:
+      speed: of the walker and the ball that is full, m/s.
+      reached: distance of the ball from the goal at which all are full, m.
+    """
+    speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
+    formulas = [
+        f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
+        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: from where it was to the ball, m',
+        f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
+        f'exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball to the goal, m',
+    ]
+    return formulas, (
+        f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '
+        'the walker'
+    )
+
+
+def _seconds(span: tuple[float, float]) -> str:
+    return f'{span[0]:g} to {span[1]:g} s'
