@@ -134,13 +134,13 @@ class EveryIdTest(Same, parameterized.TestCase):
             self.assertEqual(action.shape, (len(env.environment.action_map),))
             self.assertTrue((action.low == -1).all() and (action.high == 1).all())
             self.assertEqual(action.dtype, np.float32)
-        # All of PLAiD, and in three dimensions all but the one that observes a target and those
-        # above a controller, which are not told the phase.
+        # All of PLAiD, the planar footsteps, and in three dimensions all but the one that observes a
+        # target and those above a controller, which are not told the phase.
         spatial = [
             row for row in catalogue.ROWS
             if 'spatial' in row.tags and 'hierarchical' not in row.tags
         ]  # fmt: skip
-        self.assertEqual(phases, len(suite.TASKS_BY_DOMAIN['plaid']) + len(spatial) - 1)
+        self.assertEqual(phases, len(suite.TASKS_BY_DOMAIN['plaid']) + 1 + len(spatial) - 1)
 
 
 class SingleTest(Same, parameterized.TestCase):
