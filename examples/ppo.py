@@ -94,26 +94,32 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
 # them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated, and
 # a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
-# At last it does not, and who is pushed may leave the plan to keep standing.
+# Then it does not, and who is pushed may leave the plan to keep standing; at last it must come back,
+# from so far away that the reward has to reach there.
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.1, {
+    (0.09, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (0.233, {
+    (0.21, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (0.667, {
+    (0.6, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
+    }),
+    (0.9, {
+        'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
+        'plans': {**VARIED, 'sharp': 0.05},
+        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
@@ -132,7 +138,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 9e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 10e6, 'gamma': 0.97, 'lessons': LESSONS}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
