@@ -400,7 +400,7 @@ class ShippedTest(parameterized.TestCase):
     def test_no_file_is_of_an_unknown_environment(self):
         folder = resources.directory('trained')
         names = {path.stem for path in folder.iterdir() if path.suffix in ('.npz', '.json')}
-        studies = {'footsteps', 'default_gaits', 'transfer'}  # see trained/README.md
+        studies = {'footsteps', 'default_gaits', 'plans', 'transfer'}  # see trained/README.md
         self.assertEqual(names - set(catalogue.BY_ID) - studies, set())
         self.assertTrue((folder / 'README.md').exists())
 
