@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import pathlib
 from typing import Any
 
 import numpy as np
 import train_all
 
-from trl_suite import evaluation, policies, resources
+from trl_suite import evaluation, files, policies, resources
 
 
 def line(name: str, found: dict[str, Any]) -> str:
@@ -49,9 +48,8 @@ def main() -> None:
         print(f'{line("policy", own)}; {ratio:.1f} times', flush=True)
         stored[id_] = default
         if arguments.policy is None:
-            part = path.with_name('.default_gaits.part')
-            part.write_text(json.dumps(stored) + '\n')
-            os.replace(part, path)
+            with files.replacing(path) as part:
+                part.write_text(json.dumps(stored) + '\n')
 
 
 if __name__ == '__main__':

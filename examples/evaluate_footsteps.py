@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import policies, rendering, suite
+from trl_suite import files, policies, suite
 from trl_suite.catalogue import Row
 from trl_suite.vector import VectorEnvironment
 
@@ -134,7 +134,7 @@ def main() -> None:
             flush=True,
         )
     if arguments.json:
-        with rendering.replacing(arguments.json) as part:
+        with files.replacing(arguments.json) as part:
             part.write_text(json.dumps({'id': arguments.id, 'conditions': found}, indent=1) + '\n')
 
 

@@ -33,7 +33,7 @@ from typing import Any
 import ppo
 import tqdm
 
-from trl_suite import catalogue, errors, evaluation, policies, resources
+from trl_suite import catalogue, errors, evaluation, files, policies, resources
 
 EPISODES, SEED = 50, 0  # of the published evaluation
 SEEDS = (1,)
@@ -113,9 +113,8 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
     trained = resources.directory('trained')
     if best is run:
         policies.save(policy, trained / f'{id_}.npz')
-    part = trained / f'.{id_}.part'
-    part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
-    os.replace(part, trained / f'{id_}.json')
+    with files.replacing(trained / f'{id_}.json') as part:
+        part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
     return run
 
 

@@ -22,6 +22,7 @@ from trl_suite.motion import Steps, quaternion
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
+from trl_suite.tasks.plans import span
 from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed, drawn_way
 from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
@@ -120,10 +121,8 @@ class HighLevel(Footsteps):
         ):  # fmt: skip
             if not 0 < value < np.inf:
                 raise ValueError(f'{name} is {value}; expected a positive number')
-        if goal_distance is not None and not 0 < goal_distance[0] <= goal_distance[1] < np.inf:
-            raise ValueError(
-                f'goal_distance is {goal_distance}; expected the least and the most, m'
-            )
+        if goal_distance is not None:
+            goal_distance = span('goal_distance', goal_distance, 'm')
         if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
             raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
         self._furnish(arena)

@@ -93,14 +93,22 @@ class Pushes:
 def _check_ranges(instance: Any, names: Sequence[str], unit: str) -> None:
     """Turns fields into pairs of floats, the least and the most."""
     for name in names:
-        value = getattr(instance, name)
-        try:
-            low, high = map(float, value)
-        except (TypeError, ValueError):
-            low, high = np.nan, np.nan
-        if not 0 <= low <= high < np.inf:
-            raise ValueError(f'{name} is {value}; expected the least and the most, in {unit}')
-        object.__setattr__(instance, name, (low, high))
+        object.__setattr__(instance, name, span(name, getattr(instance, name), unit))
+
+
+def span(name: str, value: Any, unit: str) -> tuple[float, float]:
+    """Returns the least and the most, 0 or more, as floats.
+
+    Raises:
+      ValueError: it is no such pair; the message has the name.
+    """
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low, high = np.nan, np.nan
+    if not 0 <= low <= high < np.inf:
+        raise ValueError(f'{name} is {value}; expected the least and the most, in {unit}')
+    return low, high
 
 
 def options(cls: Any, kind: str, given: Any) -> Any:
