@@ -57,12 +57,8 @@ class Settings:
     lambda_: float = 0.95
     clip: float = 0.2
     kl_per_action: float = 0.004  # an update stops at this mean divergence times the actions
-    value_goes_on: bool = False  # the policy's part of the update only; the value uses all epochs
     hidden: tuple[int, ...] = (256, 256)
     initial_std: float = 0.2  # of actions in [-1, 1]
-    # Where a gait acts: how far towards each of its parameter sets an output of 1 leads, besides one
-    # output for each action. Leaps lie in these directions.
-    towards_sets: float = 0.0
     bound_cost: float = 0.1  # times the squared excess of a mean action over 1
     gradient_norm: float = 0.5
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
@@ -94,31 +90,41 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
 # them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated, and
 # a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
-# Then it does not, and who is pushed may leave the plan to keep standing; at last it must come back,
-# from so far away that the reward has to reach there.
+# Then it does not, and who is pushed may leave the plan to keep standing; then it must come back, from
+# so far away that the reward has to reach there, and be accurate again; at last both at once.
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.09, {
+    (0.06, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (0.21, {
+    (0.14, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (0.6, {
+    (0.4, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
-    (0.9, {
+    (0.6, {
         'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
+        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
+    }),
+    (0.6667, {
+        'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
+        'plans': {**VARIED, 'sharp': 0.05},
+        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
+    }),
+    (0.8, {
+        'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
+        'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
 )  # fmt: skip
@@ -138,7 +144,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 10e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 15e6, 'gamma': 0.97, 'lessons': LESSONS}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
@@ -161,9 +167,8 @@ PLANS = {  # a step is a whole footstep: few of them
     'view': (6.0, 3.0), 'start': 'scripted', 'evaluate_every': 2e4, 'evaluation_episodes': 16,
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
-    'samples': 6e4, 'horizon': 16, 'epochs': 20, 'minibatch': 128, 'learning_rate': 1e-4,
-    'value_goes_on': True, 'gamma': 0.9, 'initial_std': 0.1, 'towards_sets': 3.0,
-    'least_share': {}, 'evaluate_every': 5e3, 'evaluation_episodes': 32,
+    'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
+    'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
 }  # fmt: skip
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
@@ -195,8 +200,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
     # From one kind of obstacle to a mix of them, and on to that on slopes.
     *(
-        (f'PD_{name}_{to}_Terrain-v0', {'samples': 3e6, 'start': f'PD_{name}_{start}_Terrain-v0'})
-        for name in ('Biped2D', 'Dog2D', 'Raptor2D')
+        (f'PD_{name}_{to}_Terrain-v0', {'samples': n, 'start': f'PD_{name}_{start}_Terrain-v0'})
+        for name, n in (('Biped2D', 3e6), ('Dog2D', 1.2e6), ('Raptor2D', 1.2e6))
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
     ('MTU_Raptor2D_*', {'samples': 1.6e6}),
@@ -204,7 +209,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # In three dimensions the planar noise fells the body before it has learnt anything.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
     *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
-    ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'view': (2.5, 1.0)}),
+    ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'samples': 1.6e6, 'view': (2.5, 1.0)}),
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
@@ -340,9 +345,6 @@ class Trainer:
         columns = visible(self.environments.blocks, s.view)
         self.scales = Scales(self.environments.blocks, inputs, columns)
         inputs = inputs if columns is None else len(columns)
-        self.mixture = self.find_mixture()
-        if self.mixture is not None:
-            outputs = len(self.mixture)
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
@@ -382,7 +384,7 @@ class Trainer:
         """Takes over weights, scales and noise of a policy, block by block of the observation."""
         acts, scales = self.environments.action_map, self.scales
         same = (other.actions, other.quantity) == (tuple(acts.names), acts.quantity)
-        if not same or self.mixture is not None:
+        if not same:
             raise ValueError(f'{self.row.id} does not act as {other.id} does')
         hidden = tuple(len(bias) for bias in other.biases[:-1])
         if hidden != self.settings.hidden:
@@ -461,7 +463,7 @@ class Trainer:
                 means[t] = self.policy(self.scales(observations[t])).numpy()
             actions[t] = means[t] + std * noise[t]
             step = environments.step(
-                self.mirror.answered(actions[t], left) if self.mirror else self.meant(actions[t])
+                self.mirror.answered(actions[t], left) if self.mirror else actions[t]
             )
             failed[t] = step.terminated | self.strays(step.info['reward_terms'])
             ended[t] = failed[t] | step.truncated
@@ -503,22 +505,6 @@ class Trainer:
             return observation, np.zeros(len(observation), bool)
         return self.mirror.canonical(observation)
 
-    def find_mixture(self) -> np.ndarray | None:
-        """What the outputs of the policy mean as actions, (outputs, a), if not the actions."""
-        if not self.settings.towards_sets:
-            return None
-        gait = self.environments.task.gait.parameters
-        others = [vector for vector in gait.sets.values() if (vector != gait.centre).any()]
-        towards = self.settings.towards_sets * gait.action(np.array(others))
-        return np.concatenate([np.eye(len(gait.actions)), towards]).astype(np.float32)
-
-    def meant(self, outputs: Any) -> Any:
-        """Actions of outputs (..., outputs)."""
-        if self.mixture is None:
-            return outputs
-        arrays = isinstance(outputs, np.ndarray)
-        return outputs @ (self.mixture if arrays else torch.from_numpy(self.mixture))
-
     def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
         """Rows whose reward terms have been too low for too long."""
         s, result = self.settings, np.zeros(self.settings.num_envs, bool)
@@ -558,17 +544,16 @@ class Trainer:
                 ratio = log_ratio.exp()
                 with torch.no_grad():
                     divergence = float((ratio - 1 - log_ratio).mean())
-                far = divergence > s.kl_per_action * mean.shape[1]
-                if far and not s.value_goes_on:
+                if divergence > s.kl_per_action * mean.shape[1]:
                     return divergence
                 gain = torch.min(
                     ratio * b['advantage'],
                     ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
                 ).mean()
                 value_error = (self.value(b['observation'])[:, 0] - b['target']).square().mean()
-                excess = (self.meant(mean).abs() - 1).clamp(min=0).square().sum(-1).mean()
+                excess = (mean.abs() - 1).clamp(min=0).square().sum(-1).mean()
                 loss = 0.5 * value_error
-                if not (far or waits):
+                if not waits:
                     loss = -gain + loss + s.bound_cost * excess
                 self.optimizer.zero_grad()
                 loss.backward()
@@ -582,10 +567,6 @@ class Trainer:
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
-        weights[-1], biases[-1] = self.meant(weights[-1]), self.meant(biases[-1])
-        log_std = self.log_std.detach().numpy().copy()
-        if self.mixture is not None:
-            log_std = np.log(np.exp(2 * log_std) @ self.mixture**2) / 2
         return policies.Policy(
             id=self.row.id,
             blocks=tuple(
@@ -600,7 +581,7 @@ class Trainer:
             weights=tuple(weights),
             biases=tuple(biases),
             activation='tanh',
-            log_std=log_std,
+            log_std=self.log_std.detach().numpy().copy(),
             info={
                 'seed': self.seed,
                 'samples': self.samples,

@@ -159,20 +159,21 @@ def plan_rows() -> list[list[str]]:
 
 def page(entries: dict[str, dict[str, Any]]) -> str:
     runs = [run for entry in entries.values() for run in entry['runs']]
-    machines = ', '.join(sorted({run['machine'] for run in runs}))
+    machines = ', '.join(sorted({run['machine'].partition(';')[0] for run in runs}))
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
         '# What has been learnt',
         f'Made by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
-        'run of `examples/ppo.py` with the settings in its JSON file; `examples/train_all.py` '
-        'repeats them. Each environment ships with the policy of its best seed: '
+        'run of `examples/ppo.py`, or of `examples/search_gaits.py` where a gait acts, with the '
+        'settings in its JSON file; `examples/train_all.py` repeats them. Each environment ships with the policy of its best seed: '
         '`suite.reference_policy(id)`.',
         f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
         'neither training nor the choice of the policy had seen. Return is a fraction of its '
         'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
         'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
         'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
-        f'the run began with; its samples are not counted again. Machine: {machines}.',
+        f'the run began with; its samples are not counted again. Machine: {machines}; one thread per '
+        'run, with up to five others and other work beside it, so that minutes say little.',
         '## Every environment',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
@@ -197,9 +198,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Gaits',
-            'A sample is a whole cycle. Median distance in m before a fall, of the trained policy and '
-            'of action 0, the default gait, in the same episodes.',
-            table(('environment', 'trained', 'default', 'ratio', 'cycles', 'seed'), rows),
+            'Median distance in m before a fall, of the trained policy and of action 0, the default '
+            'gait, in the same episodes. A decision is a cycle whose base actions were all tried.',
+            table(('environment', 'trained', 'default', 'ratio', 'decisions', 'seed'), rows),
         ]
     rows = footstep_rows()
     if rows:

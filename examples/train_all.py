@@ -5,8 +5,8 @@
     python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
     python examples/train_all.py --only FSM_Goat2D_Terrain_Cliffs-v0
 
-Each run is `examples/ppo.py` on one thread; those that begin with the policy of another environment
-come after it. Stopped runs go on from their checkpoints in RUNS;
+Each run is `examples/ppo.py` on one thread, of rows that gaits drive `examples/search_gaits.py`;
+those that begin with the policy of another environment come after it. Stopped runs go on from their checkpoints in RUNS;
 finished ones are evaluated and entered into `trained/ID.json` (settings, learning curve,
 evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
 the same settings is not trained again. Of the rows that gaits drive (FSM_...) five are trained; any
@@ -28,9 +28,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Collection
+from types import ModuleType
 from typing import Any
 
 import ppo
+import search_gaits
 import tqdm
 
 from trl_suite import catalogue, errors, evaluation, files, policies, resources
@@ -65,6 +67,11 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
     return sorted(found, key=lambda job: (job[1], depth(job[0])))  # sorting is stable
 
 
+def program(id_: str) -> ModuleType:
+    """The program that trains an environment."""
+    return search_gaits if catalogue.BY_ID[id_].rules == 'gait' else ppo
+
+
 def depth(id_: str) -> int:
     """How many environments a policy has learnt in before it comes to this one."""
     start = ppo.settings_for(id_).start
@@ -77,20 +84,23 @@ def entries(id_: str) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     runs = json.loads(path.read_text())['runs']
-    default = json.loads(json.dumps(dataclasses.asdict(ppo.Settings())))
-    for run in runs:  # settings that came later were at their defaults
-        run['settings'] = {**default, **run['settings']}
+    default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
+    for (
+        run
+    ) in runs:  # settings that came later were at their defaults, those that went made no change
+        own = run['settings']
+        run['settings'] = {name: own.get(name, value) for name, value in default.items()}
     return runs
 
 
 def settings(id_: str) -> dict[str, Any]:
     """Settings as JSON gives them back."""
-    return json.loads(json.dumps(dataclasses.asdict(ppo.settings_for(id_))))
+    return json.loads(json.dumps(dataclasses.asdict(program(id_).settings_for(id_))))
 
 
 def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
     """Trains in a process of its own; returns the folder of the run."""
-    script = pathlib.Path(ppo.__file__)
+    script = pathlib.Path(program(id_).__file__ or '')
     command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={runs}']
     folder = runs / id_ / f'seed_{seed}'
     folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +113,7 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
     """Evaluates a finished run and writes it beside the others of its environment."""
     curve = json.loads((folder / 'curve.json').read_text())
     # After lessons the last policy is the one that has learnt what the environment does not ask for.
-    name = 'last' if curve['settings']['lessons'] else 'policy'
+    name = 'last' if curve['settings'].get('lessons') else 'policy'
     policy = policies.load(folder / f'{name}.npz')
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}

@@ -134,6 +134,23 @@ class ActTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, message):
             make()(observation)
 
+    def test_it_may_choose_instead_of_composing(self):
+        choices = np.array([[0.5, -0.5], [1, 0], [-1, 0.25]])
+        policy = make(
+            hidden=(), blocks=(('a', 3),), weights=[np.eye(3)], biases=[np.zeros(3)],
+            mean=np.zeros(3), std=np.ones(3), choices=choices,
+        )  # fmt: skip
+        observations = np.array([[1, 0, -1], [-1, 1.2, 1.1], [0, 0, 0.3], [9, 9, 0]])
+        np.testing.assert_array_equal(policy(observations), choices[[0, 1, 2, 0]])
+        np.testing.assert_array_equal(policy(observations[1]), choices[1])
+
+    def test_it_may_see_only_some_columns(self):
+        policy = make(
+            hidden=(), columns=np.array([4, 1]), mean=np.zeros(2), std=np.ones(2), clip=9,
+            weights=[np.eye(2) / 10], biases=[np.zeros(2)],
+        )  # fmt: skip
+        np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
+
     def test_samples(self):
         # Not clipped before the noise: a mean far outside stays outside.
         policy = make(
@@ -168,6 +185,12 @@ class ActTest(parameterized.TestCase):
         ({'info': {'a': np.zeros(2)}}, 'info: JSON cannot hold it'),
         ({'info': {'a': np.nan}}, 'info: JSON cannot hold it'),
         ({'info': [1]}, 'info: expected a dict'),
+        ({'columns': np.array([0.5])}, 'columns: expected integers, at least one'),
+        ({'columns': np.array([7])}, 'columns: expected numbers of 0 to 6'),
+        ({'columns': np.array([0, 6])}, r'mean: has shape \(7,\); expected \(2,\)'),
+        ({'choices': np.zeros((3, 2))}, r'weight_2: has shape \(5, 2\); expected \(5, 3\)'),
+        ({'choices': np.zeros((2, 3))}, r'choices: has shape \(2, 3\); expected \(2, 2\)'),
+        ({'choices': np.full((2, 2), 1.5)}, r'choices: expected at least one action, in \[-1, 1'),
     )
     def test_refuses_malformed_fields(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):
@@ -235,6 +258,19 @@ class FileTest(FolderTest):
         # The same policy is the same file.
         policies.save(policies.load(path), self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
+
+    def test_what_not_every_policy_has_comes_back(self):
+        policy = make(
+            columns=np.array([0, 2, 5]), mean=np.zeros(3), std=np.ones(3),
+            weights=[np.ones((3, 4))], biases=[np.arange(4)],
+            choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)),
+        )  # fmt: skip
+        policies.save(policy, self.folder / 'p.npz')
+        again = policies.load(self.folder / 'p.npz')
+        for name in ('columns', 'choices'):
+            np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
+        for name in policies._OPTIONAL:
+            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
 
     def test_the_format_is_the_documented_one(self):
         policies.save(make(), self.folder / 'p.npz')

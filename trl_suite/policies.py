@@ -25,7 +25,7 @@ there are `columns`):
     activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
     layers       int ()      L
     weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
-    bias_0...    float       (outputs,); the last layer is linear and has a outputs
+    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
     info         U ()        a JSON object: how the policy was made
 
@@ -40,6 +40,10 @@ and, if the policy sees left stance as right stance in a mirror (see `trl_suite.
 and, if the network sees only a part of it, say of a map of the terrain what is near:
 
     columns      int (c,)    of the observation, after any mirror
+
+and, if it chooses among b actions instead of composing one, as mixtures of experts do:
+
+    choices      float (b, a)  the action is the row whose output is the largest
 
 Floats are written as float32.
 """
@@ -58,6 +62,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite import catalogue, errors, resources
+from trl_suite.files import check_path, replacing
 from trl_suite.symmetry import Mirror
 
 FORMAT = 'trl_suite policy'
@@ -79,6 +84,7 @@ _MIRROR = {
     'phase': ('iu', 0), 'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
     'action_index': ('iu', 1), 'action_sign': ('f', 1),
 }  # fmt: skip
+_OPTIONAL = {'columns': ('iu', 1), 'choices': ('f', 2)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,6 +108,8 @@ class Policy:
       info: how the policy was made; what JSON can hold.
       mirror: how it sees left stance as right stance; None if it sees all as it is.
       columns: of the observation, after any mirror, that the network sees, (c,); None: all.
+      choices: actions of which the one with the largest output is taken, (b, a); None: the outputs
+        are the action.
 
     Raises:
       ValueError: a field is malformed, or fields do not fit each other; the message names it.
@@ -121,6 +129,7 @@ class Policy:
     info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
     mirror: Mirror | None = dataclasses.field(default=None, repr=False)
     columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    choices: np.ndarray | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -156,12 +165,20 @@ class Policy:
         put('clip', float(_array('clip', self.clip, ())))
         if not self.clip > 0:
             raise ValueError(f'clip: expected a positive number; got {self.clip}')
+        last = a
+        if self.choices is not None:
+            last = len(self.choices)
+            put('choices', _array('choices', self.choices, (last, a)))
+            if not last or np.abs(self.choices).max() > 1:
+                raise ValueError('choices: expected at least one action, in [-1, 1]')
+            if self.mirror is not None:
+                raise ValueError('choices: a policy with a mirror cannot have them')
         layers = len(self.weights)
         if not layers or len(self.biases) != layers:
             raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
         weights, biases, inputs = [], [], seen
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            outputs = a if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
+            outputs = last if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
             weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
             biases.append(_array(f'bias_{i}', bias, (outputs,)))
             inputs = outputs
@@ -268,6 +285,8 @@ class Policy:
             x = np.matmul(x[:, None], weight)[:, 0] + bias
             if i < len(self.weights) - 1:
                 x = activation(x)
+        if self.choices is not None:
+            x = self.choices[x.argmax(1)]
         if self.mirror is not None and left is not None:
             x = self.mirror.answered(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
@@ -280,8 +299,6 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
       ValueError: another suffix.
       OSError: the file cannot be written.
     """
-    from trl_suite import rendering
-
     fields: dict[str, Any] = {
         'format': FORMAT,
         'version': VERSION,
@@ -304,9 +321,9 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
         for name, (kind, _) in _MIRROR.items():
             value = np.asarray(getattr(policy.mirror, name))
             fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
-    if policy.columns is not None:
-        fields['columns'] = policy.columns
-    with rendering.replacing(rendering.check_path(path, ('.npz',))) as part:
+    optional = {name: getattr(policy, name) for name in _OPTIONAL}
+    fields |= {name: value for name, value in optional.items() if value is not None}
+    with replacing(check_path(path, ('.npz',))) as part:
         np.savez_compressed(part, allow_pickle=False, **fields)
 
 
@@ -343,19 +360,17 @@ def load(path: str | os.PathLike[str]) -> Policy:
                 field = f'mirror_{name}'
                 parts[name] = _read(archive, field, kind, axes)
             mirror = Mirror(**{**parts, 'phase': int(parts['phase'])})
-        columns = None
-        if 'columns' in archive.files:
-            field = 'columns'
-            columns = _read(archive, field, 'iu', 1)
+        for field in _OPTIONAL.keys() & archive.files:
+            fields[field] = _read(archive, field, *_OPTIONAL[field])
         field = 'info'
         fields[field] = json.loads(fields[field])
         for field in archive:
-            known = field in _FIELDS or field == 'columns'
+            known = field in _FIELDS or field in _OPTIONAL
             known |= field.removeprefix('mirror_') in _MIRROR
             if not known and field.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
         expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) if mirror else 0)
-        expected += columns is not None
+        expected += len(_OPTIONAL.keys() & archive.files)
         if len(archive.files) != expected:
             field = 'layers'
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
@@ -371,7 +386,6 @@ def load(path: str | os.PathLike[str]) -> Policy:
             weights=tuple(weights),
             biases=tuple(biases),
             mirror=mirror,
-            columns=columns,
             **fields,
         )
     except ValueError as error:

@@ -203,11 +203,13 @@ class VectorEnvironment:
         self._task.observe()
         return self._observation()
 
-    def step(self, action: np.ndarray) -> Step:
-        """Takes one step in every row.
+    def step(self, action: np.ndarray, rows: np.ndarray | Sequence[int] | None = None) -> Step:
+        """Takes one step in every row, or in some.
 
         Args:
           action: (n, k) in [-1, 1], clipped there.
+          rows: numbers of rows, or a mask (n,) bool; None for all. The others do not move, and have
+            reward 0.
 
         Raises:
           ValueError: an action of another shape, or with NaN or infinity; the row is named.
@@ -218,30 +220,37 @@ class VectorEnvironment:
         if self._fresh:
             raise RuntimeError('step before the first reset')
         action = self._checked(action)
-        task, ended = self._task, self._ended
-        resetting = ended.nonzero()[0]
-        stepped = None
+        task, ended, stepped = self._task, self._ended, None
+        resting: Any = False  # rows that do not move
+        if rows is not None:
+            resting = np.ones(self.num_envs, bool)
+            resting[self._numbers(rows)] = False
+            stepped = ~resting
+        resetting = (ended > resting).nonzero()[0]
         if len(resetting):
             if self.autoreset == 'disabled':
                 raise RuntimeError(
                     f'row {resetting[0]} has ended; reset it, or choose another autoreset'
                 )
-            stepped = ~ended
+            stepped = ~(ended | resting)
             self._begin(resetting)
         task.act(action)
         task.simulate(None if stepped is None else stepped.nonzero()[0])
         self._steps += 1 if stepped is None else stepped
         task.finish_step(stepped)
         if stepped is not None:
-            task.reward[resetting] = 0.0
-            task.failed[resetting] = task.diverged[resetting] = False
+            task.reward[~stepped] = 0.0
+            task.failed[~stepped] = task.diverged[~stepped] = False
         terminated = task.failed.copy()
         limit = np.inf if self.step_limit is None else self.step_limit
         over = self._steps >= limit
         if self._time is not None:
             over |= self._time >= self.time_limit
         truncated = over > terminated
-        self._ended = over | terminated
+        if rows is not None:
+            terminated &= ~resting
+            truncated &= ~resting
+        self._ended = np.where(resting, ended, over | terminated)
         reward, info = task.reward.astype(self.dtype), task.infos()
         if self.autoreset == 'same_step':
             info['ended'] = self._ended.copy()
@@ -311,6 +320,38 @@ class VectorEnvironment:
             self._random[row].set_state(state['random'][row])
         self.seeds, self._fresh = state['seeds'].copy(), state['fresh']
         self._steps, self._ended = state['steps'].copy(), state['ended'].copy()
+
+    def copy_from(
+        self, other: VectorEnvironment, other_rows: Sequence[int], rows: Sequence[int]
+    ) -> None:
+        """Puts some rows where rows of another environment are, to try what would come of an action.
+
+        Random numbers and seeds stay: the rows share the present, and the future as far as nothing is
+        drawn.
+
+        Args:
+          other: environment of the same id and options.
+          other_rows: numbers of its rows.
+          rows: as many rows of this one; each may be named once.
+
+        Raises:
+          ValueError: another environment, or as many rows do not exist.
+          RuntimeError: one of the two was never reset.
+        """
+        self._check_usable()
+        other._check_usable()
+        if self._fresh or other._fresh:
+            raise RuntimeError('copy_from before the first reset')
+        assert self._world is not None and other._world is not None
+        if other.row != self.row or other._task_kwargs != self._task_kwargs:
+            raise ValueError(f'rows of {other.row.id} cannot go on in {self.row.id} as it is here')
+        if len(other_rows) != len(rows) or len(self._numbers(rows)) != len(rows):
+            raise ValueError(f'{len(other_rows)} rows to put into rows {list(rows)}')
+        other._numbers(other_rows)
+        for source, row in zip(other_rows, rows, strict=True):
+            self._task.set_state(row, other._task.get_state(source))
+            self._world.set_state(row, other._world.get_state(source))
+            self._steps[row], self._ended[row] = other._steps[source], other._ended[source]
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(

@@ -37,6 +37,8 @@ SOLE, SOLE_AHEAD = (0.0885, 0.045, 0.004), 0.052  # m; of the markers, and how f
 SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)  # who lands there
 GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)
 
+_END = list(rewards.STEP_TERMS).index('end_effector')
+
 
 class Footsteps(Tracking):
     """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
@@ -70,7 +72,7 @@ class Footsteps(Tracking):
         goal: bool = False,
         pushes: Pushes | Mapping[str, Any] | None = None,
         miss: float | None = None,
-        footstep_scale: float = 1.0,
+        footstep_scale: float | Sequence[float] = 1.0,
         heading_scale: float = 1.0,
         terrain_map: bool = False,
         mirrored: bool = False,
@@ -93,7 +95,8 @@ class Footsteps(Tracking):
           miss: an episode fails where a foot lands farther than this from its place, m. The original
             meant to fail at 1 m and does not.
           footstep_scale: times the squared distance between swing foot and landing place in the
-            reward; more than 1 teaches accuracy sooner.
+            reward; more than 1 teaches accuracy sooner. Of several, the mean of their rewards counts:
+            a small one reaches far, a large one is accurate.
           heading_scale: the same of the error of the heading.
           terrain_map, mirrored, substeps, centre, half_range, start_phase, blend: as for
             `SpatialImitation`; the middle of position control is the mean pose of a straight step.
@@ -106,15 +109,18 @@ class Footsteps(Tracking):
         if miss is not None and not 0 < miss < np.inf:
             raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
         for name, scale in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
-            if not 0 <= scale < np.inf:
+            if not np.size(scale) or not np.all(
+                (0 <= np.array(scale)) & (np.array(scale) < np.inf)
+            ):
                 raise ValueError(f'{name} is {scale}; expected 0 or more')
+        self._footstep_scales = np.atleast_1d(footstep_scale).tolist()
+        self._heading_scale = heading_scale
         self.plans = options(Plans, 'plans', {} if plans is None else plans)
         self.pushes = None if pushes is None else options(Pushes, 'pushes', pushes)
         if self.pushes:
             self.fields = (*self.fields, 'xfrc_applied')
         self.steps, self.period = steps, 2 * steps.duration
         self.goal_given, self.miss = goal, miss
-        self._footstep_scale, self._heading_scale = footstep_scale, heading_scale
         mean = np.mean(self.plans.length)
         # The straight step of about the planned length, from which episodes start.
         straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
@@ -335,13 +341,18 @@ class Footsteps(Tracking):
         step = self.landing[:, 0] - found.feet[rows, swing]
         step[:, 2] += raised
         step *= late[:, None]
-        end = (feet * feet).reshape(n, 6).sum(1) + self._footstep_scale * (step * step).sum(1)
+        feet, step = (feet * feet).reshape(n, 6).sum(1), (step * step).sum(1)
+        end = feet + self._footstep_scales[0] * step
         error *= error
         # Row by row, so that a row's sums do not depend on how many rows there are.
         pose, velocity, com, root = np.matmul(error[:, None], self._weights)[:, 0].T
         errors = np.stack([pose, velocity, end, com, root], axis=1)
         terms = self.reward_terms
         terms[:, :-1] = rewards.exponentials(errors, self._term_weights, self._term_scales)
+        for scale in self._footstep_scales[1:]:
+            end = feet + scale * step
+            terms[:, _END] += self._term_weights[:, _END] * np.exp(self._term_scales[:, _END] * end)
+        terms[:, _END] /= len(self._footstep_scales)
         self._off = rewards.wrap(self.heading - found.heading)
         error = np.minimum(self._heading_scale * np.abs(self._off), np.pi)
         terms[:, -1] = self._heading_weight * rewards.heading(error)

@@ -1,0 +1,322 @@
+"""Teaches a gait's policy which base action to take when, by trying them all.
+
+    python examples/search_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1
+
+Before each cycle the default gait runs in a copy of the simulation, and what the network would do goes
+on from there for some cycles. Where that falls, all other base actions of the gait are tried in the
+same way: rollouts improve the policy (Tesauro, Galperin 1996). The network learns to tell from the
+observation what the search found, as in DAgger (Ross, Gordon, Bagnell 2011): in half of the
+simulations the search drives on, in the other half the network does, which so learns where its own
+mistakes lead. What comes out chooses one of the base actions, as the mixtures of experts of Peng,
+Berseth, van de Panne (2016) do.
+
+Writes into OUTPUT/ID/seed_S what `examples/ppo.py` writes there: `curve.json`, `policy.npz` (the best
+of the curve), `last.npz`, and `decisions.npz`, from which the same command goes on. Needs
+`pip install 'trl_suite[train]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import ppo
+import torch
+import tqdm
+from torch.nn import functional
+
+from trl_suite import characters, evaluation, files, policies, suite
+from trl_suite.tasks import gait
+from trl_suite.vector import VectorEnvironment
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a run depends on besides environment and seed."""
+
+    samples: float = 6e3  # decisions that the search makes, one per cycle
+    num_envs: int = 16  # half of them driven by the search, half by the network
+    cycles: int = 3  # that the search looks ahead; all but the first as the network would
+    alive: float = 2.0  # worth of not having fallen by then, in rewards of a cycle
+    temperature: float = 0.3  # of the shares at which the network aims, in rewards of a cycle
+    view: float = 5.0  # m ahead that the network sees
+    hidden: tuple[int, ...] = (256, 128)
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-3
+    epochs: int = 40  # each time over all decisions
+    minibatch: int = 256
+    evaluate_every: float = 500  # decisions
+    evaluation_episodes: int = 32
+
+
+def settings_for(id_: str, **changes: Any) -> Settings:
+    """The settings of an environment: of all the same."""
+    return Settings(**changes)
+
+
+class Search:
+    """Finds out what each base action leads to."""
+
+    def __init__(self, id_: str, settings: Settings, threads: int) -> None:
+        environments = VectorEnvironment(id_, 1, 1, 0)
+        parameters = environments.task.gait.parameters
+        environments.close()
+        choices = np.clip(parameters.action(parameters.base_actions), -1, 1)
+        default = np.zeros((1, choices.shape[1]))
+        # The default gait first: where all do as well, it stays.
+        self.choices = np.unique(np.concatenate([default, choices]), axis=0)
+        self.choices = self.choices[np.argsort(np.abs(self.choices).sum(1), kind='stable')]
+        self.settings = settings
+        n = settings.num_envs * len(self.choices)
+        self.copies = VectorEnvironment(id_, n, threads, 0, autoreset='disabled')
+        self.copies.reset()
+
+    def __call__(
+        self, environments: VectorEnvironment, network: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray:
+        """Returns the worth of each choice in each of the environments' rows.
+
+        Args:
+          environments: stand before a cycle.
+          network: observations (m, k) -> numbers of choices (m,), in the cycles after the first.
+
+        Returns:
+          (n, choices); NaN for all but the default gait where that does not fall.
+        """
+        n, count = environments.num_envs, len(self.choices)
+        worth = np.full((n, count), np.nan)
+        worth[:, 0], alive = self._tried(environments, np.arange(n), np.zeros(n, int), network)
+        hard = np.flatnonzero(~alive)
+        rows, choices = np.repeat(hard, count - 1), np.tile(np.arange(1, count), len(hard))
+        worth[rows, choices] = self._tried(environments, rows, choices, network)[0]
+        return worth
+
+    def _tried(
+        self,
+        environments: VectorEnvironment,
+        rows: np.ndarray,
+        choices: np.ndarray,
+        network: Callable[[np.ndarray], np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Worth of choices in rows, and who does not fall, (m,) both."""
+        copies, here = self.copies, np.arange(len(rows))
+        copies.copy_from(environments, rows.tolist(), here.tolist())
+        alive, worth = np.ones(len(rows), bool), np.zeros(len(rows))
+        going = here
+        choice = np.zeros(copies.num_envs, int)
+        choice[here] = choices
+        for _ in range(self.settings.cycles):
+            step = copies.step(self.choices[choice], going)
+            worth[going] += step.reward[going]
+            alive &= ~step.terminated[here]
+            going = going[~(step.terminated | step.truncated)[going]]
+            if not len(going):
+                break
+            choice[going] = network(step.observation[going])
+        return worth + self.settings.alive * alive, alive
+
+
+def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
+    """Which columns of an observation are no ground, or not too far ahead."""
+    ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+    seen = np.ones(max(part.stop for part in blocks.values()), bool)
+    seen[blocks['terrain']] = ahead <= view
+    return np.flatnonzero(seen)
+
+
+class Learner:
+    """A network that tells which choice the search would make."""
+
+    def __init__(self, environments: VectorEnvironment, choices: np.ndarray, settings: Settings):
+        self.settings, self.choices, self.environments = settings, choices, environments
+        columns = visible(environments.blocks, settings.view)
+        size = environments.task.observation.shape[1]
+        self.scales = ppo.Scales(environments.blocks, size, columns)
+        self.network = ppo.network((len(columns), *settings.hidden, len(choices)), 0.01)
+
+    def fit(
+        self, observations: np.ndarray, worth: np.ndarray, random: np.random.Generator
+    ) -> float:
+        """Learns all decisions anew; returns the cross entropy of the last epoch."""
+        s = self.settings
+        size = observations.shape[1]
+        self.scales = ppo.Scales(self.environments.blocks, size, self.scales.columns)
+        self.scales.update(observations)
+        inputs = self.scales(observations)
+        worth = np.where(
+            np.isnan(worth), -np.inf, worth
+        )  # where the default gait does, it is the aim
+        aims = torch.softmax(torch.from_numpy(worth / s.temperature).float(), 1)
+        self.network = ppo.network((inputs.shape[1], *s.hidden, len(self.choices)), 0.01)
+        optimizer = torch.optim.AdamW(
+            self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay
+        )
+        steps = s.epochs * -(-len(inputs) // s.minibatch)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+        total = 0.0
+        for _ in range(s.epochs):
+            total = 0.0
+            order = torch.from_numpy(random.permutation(len(inputs)))
+            for part in order.split(s.minibatch):
+                loss = functional.cross_entropy(self.network(inputs[part]), aims[part])
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                schedule.step()
+                total += loss.item() * len(part) / len(inputs)
+        return total
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Returns the number of the choice for each observation, (n,)."""
+        with torch.no_grad():
+            return self.network(self.scales(observation)).argmax(1).numpy()
+
+    def exported(self, samples: int, seed: int) -> policies.Policy:
+        """The policy of now, without PyTorch."""
+        environments, columns = self.environments, self.scales.columns
+        layers = [layer for layer in self.network if isinstance(layer, torch.nn.Linear)]
+        return policies.Policy(
+            id=environments.row.id,
+            blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
+            actions=tuple(environments.action_map.names),
+            quantity=environments.action_map.quantity,
+            mean=self.scales.mean[columns],
+            std=self.scales.std[columns],
+            columns=columns,
+            clip=ppo.OBSERVATION_CLIP,
+            weights=tuple(layer.weight.detach().numpy().T.copy() for layer in layers),
+            biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
+            activation='tanh',
+            log_std=np.full(len(environments.action_map), np.log(ppo.LEAST_STD)),
+            choices=self.choices,
+            info={
+                'seed': seed,
+                'samples': samples,
+                'character': characters.fingerprint(environments.task.character.row),
+            },
+        )
+
+
+def train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int = 0
+) -> list[dict[str, Any]]:
+    """Trains to the end, from the decisions in `folder` if there are any; returns the curve."""
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    s = settings
+    search = Search(id_, s, threads)
+    observations, worth, curve = load(folder, s)
+    random = np.random.default_rng((seed, len(worth)))
+    environments = VectorEnvironment(
+        id_, s.num_envs, threads, random.integers(2**32, size=s.num_envs).tolist(),
+        autoreset='disabled',
+    )  # fmt: skip
+    learner = Learner(environments, search.choices, s)
+    learnt = bool(len(worth))
+    if learnt:
+        learner.fit(observations, worth, random)
+
+    def network(observation: np.ndarray) -> np.ndarray:
+        return learner(observation) if learnt else np.zeros(len(observation), int)
+
+    seen, found = list(observations), list(worth)
+    searches, searched = np.arange(s.num_envs) < s.num_envs // 2, []
+    seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
+    if curve:
+        seconds = dict(curve[-1]['seconds'])
+    best = max((point['fraction'] for point in curve), default=-np.inf)
+    observation = environments.reset()
+    with tqdm.tqdm(total=int(s.samples), initial=len(found), unit='decision') as bar:
+        bar.set_description(id_)
+        while len(found) < s.samples:
+            begin, before = time.perf_counter(), len(found)
+            values = search(environments, network)
+            seen.extend(observation.astype(np.float32))
+            found.extend(values)
+            choice = np.where(searches, np.nanargmax(values, axis=1), network(observation))
+            step = environments.step(search.choices[choice])
+            ended = step.terminated | step.truncated
+            searched += step.info['distance'][ended & searches].tolist()
+            observation = environments.reset(ended) if ended.any() else step.observation
+            seconds['simulation'] += time.perf_counter() - begin
+            bar.update(len(found) - before)
+            every = s.evaluate_every
+            if len(found) // every == before // every and len(found) < s.samples:
+                continue
+            begin = time.perf_counter()
+            observations, worth = np.array(seen), np.array(found)
+            loss, learnt = learner.fit(observations, worth, random), True
+            middle = time.perf_counter()
+            policy = learner.exported(len(found), seed)
+            result = evaluation.evaluate(
+                id_, policy, s.evaluation_episodes, ppo.EVALUATION_SEED, threads
+            )
+            seconds['learning'] += middle - begin
+            seconds['evaluation'] += time.perf_counter() - middle
+            point = {name: result[name] for name in ('fraction', 'full', 'distance')}
+            point |= {'samples': len(found), 'loss': loss, 'seconds': dict(seconds)}
+            point['median_distance'] = float(np.median(result['distances']))
+            point['hard'] = float(np.isfinite(worth[-int(every) :]).all(1).mean())
+            point['searched'] = searched  # m; distances of the episodes that the search has ended
+            searched = []
+            curve.append(point)
+            if point['fraction'] > best:
+                best = point['fraction']
+                policies.save(policy, folder / 'policy.npz')
+            policies.save(policy, folder / 'last.npz')
+            bar.set_postfix(distance=f'{point["median_distance"]:.1f} m', loss=f'{loss:.2f}')
+            with files.replacing(folder / 'decisions.npz') as part:
+                np.savez_compressed(part, observation=observations, worth=worth)
+            record = {
+                'id': id_, 'seed': seed, 'settings': dataclasses.asdict(s), 'threads': threads,
+                'curve': curve,
+            }  # fmt: skip
+            with files.replacing(folder / 'curve.json') as part:
+                part.write_text(json.dumps(record, indent=1))
+    return curve
+
+
+def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarray, list]:
+    """Decisions that have been made, and the curve so far.
+
+    Raises:
+      ValueError: they were made with other settings.
+    """
+    path = folder / 'decisions.npz'
+    if not path.exists():
+        return np.empty((0, 0)), np.empty((0, 0)), []
+    record = json.loads((folder / 'curve.json').read_text())
+    if record['settings'] != json.loads(json.dumps(dataclasses.asdict(settings))):
+        raise ValueError(f'{folder} holds a run with other settings: {record["settings"]}')
+    with np.load(path) as stored:
+        return stored['observation'], stored['worth'], record['curve']
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=0, help='0: all cores')
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--samples', type=float, help='decisions, instead of the default')
+    arguments = parser.parse_args()
+    id_ = suite.find(arguments.id).id
+    changes = {} if arguments.samples is None else {'samples': arguments.samples}
+    folder = arguments.output / id_ / f'seed_{arguments.seed}'
+    curve = train(id_, arguments.seed, settings_for(id_, **changes), folder, arguments.threads)
+    for point in curve:
+        print(
+            f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["full"]:.0%} complete'
+        )
+    print(folder / 'policy.npz')
+
+
+if __name__ == '__main__':
+    main()
