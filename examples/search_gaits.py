@@ -2,12 +2,11 @@
 
     python examples/search_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1
 
-Before each cycle the default gait runs in a copy of the simulation, and what the network would do goes
-on from there for some cycles. Where that falls, all other base actions of the gait are tried in the
-same way: rollouts improve the policy (Tesauro, Galperin 1996). The network learns to tell from the
-observation what the search found, as in DAgger (Ross, Gordon, Bagnell 2011): in half of the
-simulations the search drives on, in the other half the network does, which so learns where its own
-mistakes lead. What comes out chooses one of the base actions, as the mixtures of experts of Peng,
+Before each cycle every base action of the gait runs in a copy of the simulation, and what the network
+would do goes on from there: rollouts improve a policy (Tesauro, Galperin 1996). The network learns
+to tell from the observation what the search found, as in DAgger (Ross, Gordon, Bagnell 2011): in half
+of the simulations the search drives on, in the other half the network does, which so learns where its
+own mistakes lead. What comes out chooses one of the base actions, as the mixtures of experts of Peng,
 Berseth, van de Panne (2016) do.
 
 Writes into OUTPUT/ID/seed_S what `examples/ppo.py` writes there: `curve.json`, `policy.npz` (the best
@@ -29,7 +28,6 @@ import numpy as np
 import ppo
 import torch
 import tqdm
-from torch.nn import functional
 
 from trl_suite import characters, evaluation, files, policies, suite
 from trl_suite.tasks import gait
@@ -42,16 +40,15 @@ class Settings:
 
     samples: float = 6e3  # decisions that the search makes, one per cycle
     num_envs: int = 16  # half of them driven by the search, half by the network
-    cycles: int = 3  # that the search looks ahead; all but the first as the network would
+    cycles: int = 2  # that the search looks ahead; all but the first as the network would
     alive: float = 2.0  # worth of not having fallen by then, in rewards of a cycle
-    temperature: float = 0.3  # of the shares at which the network aims, in rewards of a cycle
     view: float = 5.0  # m ahead that the network sees
     hidden: tuple[int, ...] = (256, 128)
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
     epochs: int = 40  # each time over all decisions
     minibatch: int = 256
-    evaluate_every: float = 500  # decisions
+    evaluate_every: float = 1e3  # decisions
     evaluation_episodes: int = 32
 
 
@@ -87,39 +84,21 @@ class Search:
           network: observations (m, k) -> numbers of choices (m,), in the cycles after the first.
 
         Returns:
-          (n, choices); NaN for all but the default gait where that does not fall.
+          (n, choices): rewards until the last cycle, and `alive` of who has not fallen by then.
         """
-        n, count = environments.num_envs, len(self.choices)
-        worth = np.full((n, count), np.nan)
-        worth[:, 0], alive = self._tried(environments, np.arange(n), np.zeros(n, int), network)
-        hard = np.flatnonzero(~alive)
-        rows, choices = np.repeat(hard, count - 1), np.tile(np.arange(1, count), len(hard))
-        worth[rows, choices] = self._tried(environments, rows, choices, network)[0]
-        return worth
-
-    def _tried(
-        self,
-        environments: VectorEnvironment,
-        rows: np.ndarray,
-        choices: np.ndarray,
-        network: Callable[[np.ndarray], np.ndarray],
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Worth of choices in rows, and who does not fall, (m,) both."""
-        copies, here = self.copies, np.arange(len(rows))
-        copies.copy_from(environments, rows.tolist(), here.tolist())
-        alive, worth = np.ones(len(rows), bool), np.zeros(len(rows))
-        going = here
-        choice = np.zeros(copies.num_envs, int)
-        choice[here] = choices
+        n, count, copies = environments.num_envs, len(self.choices), self.copies
+        copies.copy_from(environments, np.repeat(np.arange(n), count).tolist(), range(n * count))
+        worth, alive = np.zeros(n * count), np.ones(n * count, bool)
+        going, choice = np.arange(n * count), np.tile(np.arange(count), n)
         for _ in range(self.settings.cycles):
             step = copies.step(self.choices[choice], going)
             worth[going] += step.reward[going]
-            alive &= ~step.terminated[here]
+            alive &= ~step.terminated
             going = going[~(step.terminated | step.truncated)[going]]
             if not len(going):
                 break
             choice[going] = network(step.observation[going])
-        return worth + self.settings.alive * alive, alive
+        return (worth + self.settings.alive * alive).reshape(n, count)
 
 
 def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
@@ -131,7 +110,7 @@ def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
 
 
 class Learner:
-    """A network that tells which choice the search would make."""
+    """A network that tells what the search would find."""
 
     def __init__(self, environments: VectorEnvironment, choices: np.ndarray, settings: Settings):
         self.settings, self.choices, self.environments = settings, choices, environments
@@ -143,16 +122,15 @@ class Learner:
     def fit(
         self, observations: np.ndarray, worth: np.ndarray, random: np.random.Generator
     ) -> float:
-        """Learns all decisions anew; returns the cross entropy of the last epoch."""
+        """Learns all decisions anew; returns the mean squared error of the last epoch."""
         s = self.settings
         size = observations.shape[1]
         self.scales = ppo.Scales(self.environments.blocks, size, self.scales.columns)
         self.scales.update(observations)
         inputs = self.scales(observations)
-        worth = np.where(
-            np.isnan(worth), -np.inf, worth
-        )  # where the default gait does, it is the aim
-        aims = torch.softmax(torch.from_numpy(worth / s.temperature).float(), 1)
+        # How much better than the others each choice is: an action's advantage.
+        aims = torch.from_numpy(worth - worth.mean(1, keepdims=True)).float()
+        aims /= aims.std() + 1e-8
         self.network = ppo.network((inputs.shape[1], *s.hidden, len(self.choices)), 0.01)
         optimizer = torch.optim.AdamW(
             self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay
@@ -164,7 +142,7 @@ class Learner:
             total = 0.0
             order = torch.from_numpy(random.permutation(len(inputs)))
             for part in order.split(s.minibatch):
-                loss = functional.cross_entropy(self.network(inputs[part]), aims[part])
+                loss = (self.network(inputs[part]) - aims[part]).square().mean()
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
@@ -240,7 +218,7 @@ def train(
             values = search(environments, network)
             seen.extend(observation.astype(np.float32))
             found.extend(values)
-            choice = np.where(searches, np.nanargmax(values, axis=1), network(observation))
+            choice = np.where(searches, values.argmax(1), network(observation))
             step = environments.step(search.choices[choice])
             ended = step.terminated | step.truncated
             searched += step.info['distance'][ended & searches].tolist()
@@ -263,7 +241,6 @@ def train(
             point = {name: result[name] for name in ('fraction', 'full', 'distance')}
             point |= {'samples': len(found), 'loss': loss, 'seconds': dict(seconds)}
             point['median_distance'] = float(np.median(result['distances']))
-            point['hard'] = float(np.isfinite(worth[-int(every) :]).all(1).mean())
             point['searched'] = searched  # m; distances of the episodes that the search has ended
             searched = []
             curve.append(point)

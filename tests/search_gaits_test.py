@@ -34,20 +34,18 @@ class SearchTest(absltest.TestCase):
 
         worth = search(environments, network)
         self.assertEqual(worth.shape, (2, len(search.choices)))
-        np.testing.assert_array_equal(np.isnan(worth), [[False] + [True] * 7] * 2)  # nobody falls
+        self.assertGreater(np.ptp(worth), 0.01)  # base actions differ
         choice = len(search.choices) - 1
-        worth, alive = search._tried(environments, np.arange(2), np.full(2, choice), network)
-        self.assertTrue(alive.all())
         other = VectorEnvironment(HOPPER, 2, 1, 3, autoreset='disabled')
         other.reset()
         other.step(np.tile(default, (2, 1)))
         expected = np.zeros(2)
-        for action in (search.choices[choice], default, default):
+        for action in (search.choices[choice], default):
             steps = [e.step(np.tile(action, (2, 1))) for e in (environments, other)]
             np.testing.assert_array_equal(steps[0].observation, steps[1].observation)
             expected += steps[0].reward
             self.assertFalse(steps[0].terminated.any())
-        np.testing.assert_allclose(worth, expected + TINY.alive)
+        np.testing.assert_allclose(worth[:, choice], expected + TINY.alive)
 
     def test_the_network_sees_the_ground_that_is_near(self):
         environments = VectorEnvironment(HOPPER, 1, 1, 0)
