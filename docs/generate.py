@@ -118,8 +118,10 @@ def home() -> str:
         table(
             ('guide', ''),
             (
+                ('[Notebooks](../colab/README.md)', 'with pictures: first steps, training, and most of what follows'),
                 ('[Make your own](make_your_own.md)', 'characters, terrains, tasks'),
                 ('[Make your own: clips](make_your_own_clips.md)', 'from motion files'),
+                ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
                 ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
                 ('[What has been learnt](results.md)', 'the shipped policies, measured'),
                 ('[Differences from the original](differences.md)', 'and why'),

@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-BESIDE = ('examples', 'benchmarks')
+BESIDE = ('examples', 'benchmarks', 'colab')
 
 
 def on_files(files: Any, config: Any) -> Any:

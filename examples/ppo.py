@@ -98,32 +98,37 @@ LESSONS = (
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.06, {
+    (0.05, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (0.14, {
+    (0.117, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (0.4, {
+    (0.3333, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
-    (0.6, {
+    (0.5, {
         'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (0.6667, {
+    (0.5555, {
         'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (0.8, {
+    (0.6667, {
         'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
+        'plans': {**VARIED, 'sharp': 0.1},
+        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
+    }),
+    (0.8333, {
+        'footstep_scale': 8.0, 'heading_scale': 3.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
@@ -144,7 +149,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 15e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 18e6, 'gamma': 0.97, 'lessons': LESSONS}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',

@@ -17,6 +17,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, scripted, suite
+from trl_suite.commands import list as listing
+from trl_suite.commands import rollout
 from trl_suite.tasks.gait import GaitTask
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -398,7 +400,7 @@ class RolloutTest(CommandTest):
         )
         starts = np.flatnonzero(t['step_types'] == 0)
         lengths = np.diff([*starts, len(t['rewards'])]) - 1
-        for i, length in enumerate(lengths[: cli.SHOWN_EPISODES], 1):
+        for i, length in enumerate(lengths[: rollout.SHOWN_EPISODES], 1):
             end = 'goes on' if i == episodes and t['step_types'][-1] != 2 else 'fell'
             self.assertRegex(out, rf'\n +{i} +{length} +[\d.]+ +-?[\d.]+ +{end}\n')
 
@@ -416,7 +418,7 @@ class RolloutTest(CommandTest):
     def test_many_episodes_are_summed_up(self):
         out = self.output('rollout', GAPS, '--steps', '600', '--seed', '1')
         lines = out.splitlines()
-        self.assertLen(lines, cli.SHOWN_EPISODES + 3)
+        self.assertLen(lines, rollout.SHOWN_EPISODES + 3)
         self.assertRegex(lines[-2], r'^\.\.\. and \d+ more$')
 
     def test_pictures(self):
@@ -710,7 +712,7 @@ class ProgramTest(CommandTest):
     def test_other_errors_are_not_hidden(self):
         # A defect of ours must keep its traceback.
         with (
-            mock.patch.object(cli, '_values', lambda *_: 1 / 0),
+            mock.patch.object(listing, '_values', lambda *_: 1 / 0),
             self.assertRaises(ArithmeticError),
         ):
             run('list', '--tag', 'blind')

@@ -1,3 +1,11 @@
-"""Chooses how to render before any test imports dm_control."""
+"""Chooses how to render before any test imports dm_control; spares the garbage collector."""
+
+import gc
 
 import trl_suite  # noqa: F401
+
+
+def pytest_collection_finish():
+    # Modules and tests are never garbage. The collector would look through them whenever an
+    # environment, which is full of cycles, was let go: a sixth of the whole run.
+    gc.freeze()

@@ -6,6 +6,7 @@ import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 from dm_env import test_utils
+from helpers import links_on_ground
 
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain
@@ -60,6 +61,7 @@ def is_high(id_):
     return suite.find(id_).rules in ('hike', 'soccer')
 
 
+# Steps of 1/30 s.
 ONE_BY_ONE = [id_ for id_ in suite.ALL_IDS if not is_gait(id_) and not is_high(id_)]
 
 
@@ -129,113 +131,154 @@ def rollout(environment, actions):
     )
 
 
-def contract(id_):
-    """dm_env's own tests for one environment, across ends of episodes."""
+def every_row(id_):
+    """What holds for all environments, dm_env's own tests among it, for one of them.
 
-    class Contract(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    It is built once for all tests, as building takes most of the time; a seed brings it back to
+    where a new one begins.
+    """
+    gait, high = is_gait(id_), is_high(id_)
+
+    class EveryRow(test_utils.EnvironmentTestMixin, absltest.TestCase):
+        @classmethod
+        def setUpClass(cls):
+            super().setUpClass()
+            cls.kept = {}
+
+        @classmethod
+        def tearDownClass(cls):
+            super().tearDownClass()
+            cls.let_go()
+
+        @classmethod
+        def let_go(cls):
+            while cls.kept:
+                cls.kept.popitem()[1].close()
+
+        def made(self, seed, flat=False, step_limit=256):
+            """The environment, seeded anew, before the first reset of that seed."""
+            if flat not in self.kept:
+                self.kept[flat] = suite.make(id_, {'random': seed}, {'flat_observation': flat})
+            environment = self.kept[flat]
+            environment.random_state.seed(seed)
+            environment._step_limit = step_limit
+            return environment
+
+        # By another name, so that it comes first: then the environment is fresh.
+        test_a_step_on_fresh_environment = (
+            test_utils.EnvironmentTestMixin.test_step_on_fresh_environment
+        )
+        test_step_on_fresh_environment = None
+
         def make_object_under_test(self):
-            limit = 2 if is_gait(id_) or is_high(id_) else 12
-            return suite.make(id_, {'random': 0, 'step_limit': limit})
+            if self._testMethodName == 'test_a_step_on_fresh_environment':
+                self.let_go()
+            return self.made(0, step_limit=2 if gait or high else 12)  # so that episodes end
+
+        def tearDown(self):
+            absltest.TestCase.tearDown(self)  # the mixin's closes the environment
+
+        def make_action(self):
+            # dm_env's is the least that is allowed: of such a gait a cycle lasts until it is cut.
+            return np.zeros(self.environment.action_spec().shape) if gait else super().make_action()
 
         def make_action_sequence(self):
-            return random_actions(self.environment, 3 if is_gait(id_) or is_high(id_) else 30)
+            return random_actions(self.environment, 3 if gait or high else 30)
 
         def test_specs(self):
             spec = self.environment.action_spec()
             self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
             self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
 
-    Contract.__name__ = Contract.__qualname__ = f'Contract_{id_}'.replace('-', '_')
-    return Contract
+        def test_blocks(self):
+            environment, blocks = self.environment, expected_blocks(id_)
+            spec = environment.observation_spec()
+            self.assertEqual(list(spec), list(blocks))  # terrain first
+            self.assertEqual({name: each.shape[0] for name, each in spec.items()}, blocks)
+            stop = 0
+            for name, part in environment.blocks.items():
+                self.assertEqual(part, slice(stop, stop + blocks[name]))
+                stop = part.stop
+            for each in spec.values():
+                self.assertEqual(each.dtype, np.float64)
+
+        if id_ in SIZES:
+
+            def test_sizes(self):
+                environment, (observation, action) = self.made(0, flat=True), SIZES[id_]
+                spec = environment.observation_spec()
+                self.assertEqual(spec['observations'].shape, (observation,))
+                self.assertEqual(environment.action_spec().shape, (action,))
+
+        def test_random_rollout(self):
+            # A walker that is told nonsense may well stay up: its episode is cut.
+            self.wander(*((6, 4) if gait else (16, 12) if high else (200, 256)))
+
+        @pytest.mark.slow
+        def test_long_random_rollout(self):
+            self.wander(300 if gait or high else 5000, 256)
+
+        def wander(self, steps, step_limit):
+            environment = self.made(1, step_limit=step_limit)
+            observations, rewards, discounts, types = rollout(
+                environment, random_actions(environment, steps)
+            )
+            self.assertTrue(np.isfinite(observations).all())
+            self.assertLess(np.abs(observations).max(), 1e4)
+            first = np.array([each is dm_env.StepType.FIRST for each in types])
+            self.assertTrue(np.isfinite(rewards[~first]).all())
+            self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
+            self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
+            last = np.array([each is dm_env.StepType.LAST for each in types])
+            self.assertTrue(last.any())  # random actions fall, or the episode is cut
+            np.testing.assert_array_equal(rewards[discounts == 0], 0)
+            np.testing.assert_array_equal(last[discounts == 0], True)
+
+        def test_flat_observation_is_the_blocks_side_by_side(self):
+            blocks, flat = self.made(2), self.made(2, flat=True)
+            actions = random_actions(blocks, 1 if gait else 3 if high else 20)
+            for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+
+        if not gait and not high:  # these run their physics by themselves: see gait_test, and below
+
+            def test_plain_composer_environment_agrees(self):
+                ours = self.made(3)
+                theirs = composer.Environment(
+                    suite.build_task(suite.find(id_)), random_state=3,
+                    strip_singleton_obs_buffer_dim=True,
+                )  # fmt: skip
+                np.testing.assert_array_equal(theirs.action_spec().minimum, -1)
+                np.testing.assert_array_equal(theirs.action_spec().maximum, 1)
+                actions = random_actions(ours, 40)
+                for mine, composers in zip(
+                    rollout(ours, actions), rollout(theirs, actions), strict=True
+                ):
+                    np.testing.assert_array_equal(mine, composers)
+
+        if high:
+
+            def test_plain_composer_environment_is_refused(self):
+                for interface in ('plan', 'frame'):
+                    task = suite.build_task(suite.find(id_), {'interface': interface})
+                    environment = composer.Environment(task, random_state=3)
+                    environment.reset()
+                    with (
+                        self.subTest(interface),
+                        self.assertRaisesRegex(
+                            RuntimeError, 'trl_suite.environment.Environment, not.*composer'
+                        ),
+                    ):
+                        environment.step(np.zeros(len(task.action_map)))
+
+    EveryRow.__name__ = EveryRow.__qualname__ = f'EveryRow_{id_}'.replace('-', '_')
+    return EveryRow
 
 
 for _id in suite.ALL_IDS:
-    _class = contract(_id)
+    _class = every_row(_id)
     globals()[_class.__name__] = _class
 del _class  # else it would be collected twice
-
-
-class EveryRowTest(parameterized.TestCase):
-    """What holds for all environments."""
-
-    @parameterized.parameters(*suite.ALL_IDS)
-    def test_blocks(self, id_):
-        environment = suite.make(id_, {'random': 0})
-        blocks = expected_blocks(id_)
-        spec = environment.observation_spec()
-        self.assertEqual(list(spec), list(blocks))  # terrain first
-        self.assertEqual({name: each.shape[0] for name, each in spec.items()}, blocks)
-        stop = 0
-        for name, part in environment.blocks.items():
-            self.assertEqual(part, slice(stop, stop + blocks[name]))
-            stop = part.stop
-        for each in spec.values():
-            self.assertEqual(each.dtype, np.float64)
-
-    @parameterized.parameters(*((id_, *sizes) for id_, sizes in SIZES.items()))
-    def test_sizes(self, id_, observation, action):
-        environment = suite.make(id_, {'random': 0}, {'flat_observation': True})
-        self.assertEqual(environment.observation_spec()['observations'].shape, (observation,))
-        self.assertEqual(environment.action_spec().shape, (action,))
-
-    @parameterized.parameters(*suite.ALL_IDS)
-    def test_random_rollout(self, id_):
-        # A walker that is told nonsense may well stay up: its episode is cut.
-        self.wander(id_, *((6, 4) if is_gait(id_) else (16, 12) if is_high(id_) else (200,)))
-
-    @parameterized.parameters(*suite.ALL_IDS)
-    @pytest.mark.slow
-    def test_long_random_rollout(self, id_):
-        self.wander(id_, 300 if is_gait(id_) or is_high(id_) else 5000)
-
-    def wander(self, id_, steps, step_limit=256):
-        environment = suite.make(id_, {'random': 1, 'step_limit': step_limit})
-        observations, rewards, discounts, types = rollout(
-            environment, random_actions(environment, steps)
-        )
-        self.assertTrue(np.isfinite(observations).all())
-        self.assertLess(np.abs(observations).max(), 1e4)
-        first = np.array([each is dm_env.StepType.FIRST for each in types])
-        self.assertTrue(np.isfinite(rewards[~first]).all())
-        self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
-        self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
-        last = np.array([each is dm_env.StepType.LAST for each in types])
-        self.assertTrue(last.any())  # random actions fall, or the episode is cut
-        np.testing.assert_array_equal(rewards[discounts == 0], 0)
-        np.testing.assert_array_equal(last[discounts == 0], True)
-
-    @parameterized.parameters(*suite.ALL_IDS)
-    def test_flat_observation_is_the_blocks_side_by_side(self, id_):
-        blocks = suite.make(id_, {'random': 2})
-        flat = suite.make(id_, {'random': 2}, {'flat_observation': True})
-        actions = random_actions(blocks, 1 if is_gait(id_) else 3 if is_high(id_) else 20)
-        for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-
-    # A gait runs its physics by itself, and so does a footstep: see gait_test, and below.
-    @parameterized.parameters(*ONE_BY_ONE)
-    def test_plain_composer_environment_agrees(self, id_):
-        ours = suite.make(id_, {'random': 3})
-        theirs = composer.Environment(
-            suite.build_task(suite.find(id_)), random_state=3, strip_singleton_obs_buffer_dim=True
-        )
-        np.testing.assert_array_equal(theirs.action_spec().minimum, -1)
-        np.testing.assert_array_equal(theirs.action_spec().maximum, 1)
-        actions = random_actions(ours, 40)
-        for mine, composers in zip(rollout(ours, actions), rollout(theirs, actions), strict=True):
-            np.testing.assert_array_equal(mine, composers)
-
-    @parameterized.product(
-        id_=[id_ for id_ in suite.ALL_IDS if is_high(id_)], interface=('plan', 'frame')
-    )
-    def test_plain_composer_environment_is_refused(self, id_, interface):
-        task = suite.build_task(suite.find(id_), {'interface': interface})
-        environment = composer.Environment(task, random_state=3)
-        environment.reset()
-        with self.assertRaisesRegex(
-            RuntimeError, 'trl_suite.environment.Environment, not.*composer'
-        ):
-            environment.step(np.zeros(len(task.action_map)))
 
 
 class ActionTest(parameterized.TestCase):
@@ -272,9 +315,9 @@ class ActionTest(parameterized.TestCase):
 
     @parameterized.parameters(*EXAMPLES)
     def test_far_actions_are_clipped(self, id_):
-        poses = []
+        environment, poses = suite.make(id_), []
         for size in (1.0, 5.0, 1e200):
-            environment = suite.make(id_, {'random': 4})
+            environment.random_state.seed(4)
             environment.reset()
             action = size * np.sign(random_actions(environment, 1)[0])
             poses.append(environment.step(action).observation['pose'])
@@ -363,13 +406,8 @@ class EpisodeTest(parameterized.TestCase):
         self.assertTrue(environment.info['fell'])
         self.assertFalse(environment.info['diverged'])
         self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
-        # A fall link touches the ground, as the engine's list of contacts says.
-        data, model = environment.physics.data.ptr, environment.physics.model.ptr
-        bodies = {model.body(b).name.split('/')[-1] for b in model.geom_bodyid[data.contact.geom]
-                  [(model.geom_bodyid[data.contact.geom] == model.body('terrain').id).any(1)]
-                  .ravel()}  # fmt: skip
         fall_links = environment.task.character.row.fall_links
-        self.assertNotEmpty(bodies & set(fall_links))
+        self.assertNotEmpty(links_on_ground(environment) & set(fall_links))
         step = environment.step(action)
         self.assertTrue(step.first())
         self.assertFalse(environment.info['fell'])

@@ -1,9 +1,10 @@
 """Tests of footsteps in the plane: plans, clock, observation, reward, landings, ends."""
 
-import pickle
-
+import helpers
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_singles, body, put
+from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
 from trl_suite.tasks import rewards
@@ -12,14 +13,6 @@ from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_LLC_Flat_Step-v0'
 VARIED = {'length': (0.25, 0.6), 'change': 1.0}
-WEIGHTS = {
-    name: weight / 1.05
-    for name, weight in (
-        ('pose', 0.5), ('velocity', 0.05), ('end_effector', 0.2), ('com', 0.1), ('root', 0.1),
-        ('heading', 0.1),
-    )
-}  # fmt: skip
-RIGHT, LEFT = 0, 1
 ZERO = np.zeros(11)
 
 
@@ -28,22 +21,9 @@ def started(**options):
     return environment, environment.reset()
 
 
-def body(environment, field, link):
-    name = environment.task.character.row.name
-    return getattr(environment.physics.named.data, field)[f'{name}/{link}'].copy()
-
-
 def ankles(environment):
     """x and z of right and left, (2, 2) m."""
-    return np.stack([
-        body(environment, 'xpos', f'{side}_ankle')[::2] for side in ('right', 'left')
-    ])  # fmt: skip
-
-
-def put(environment, pose, rate):
-    task, data = environment.task, environment.physics.data
-    data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
-    environment.physics.forward()
+    return helpers.ankles(environment)[:, ::2]
 
 
 def held(environment):
@@ -178,12 +158,10 @@ class PlanTest(parameterized.TestCase):
 
     def test_contacts(self):
         environment, _ = started(start_phase=0.0)
-        model, contact = environment.physics.model.ptr, environment.physics.data.ptr.contact
         seen = set()
         for _ in range(25):
             step = environment.step(environment.task.clip_action(0))
-            touching = model.geom_bodyid[contact.geom].ravel()
-            links = {model.body(b).name.split('/')[-1] for b in touching}
+            links = helpers.links_on_ground(environment)
             expected = [float(f'{side}_ankle' in links) for side in ('right', 'left')]
             np.testing.assert_array_equal(step.observation['contact'], expected)
             seen.add(tuple(expected))
@@ -355,15 +333,11 @@ class SaveTest(parameterized.TestCase):
     """Seeds decide; state and pickles go on bit for bit; many rows are single ones."""
 
     def advance(self, environment, seed):
-        rng, found = np.random.default_rng(seed), []
-        for _ in range(40):
-            step = environment.step(0.3 * rng.uniform(-1, 1, 11))
-            task = environment.task
-            found.append(np.concatenate([
-                [step.reward or 0.0, int(step.step_type), task.landing_error[0]],
-                *step.observation.values(), task.landing[0].ravel(), task.reference_pose(0),
-            ]))  # fmt: skip
-        return np.array(found)
+        task = environment.task
+        return advance(
+            environment, seed, 40, 0.3,
+            lambda _: (task.landing_error, task.landing[0].ravel(), task.reference_pose(0)),
+        )  # fmt: skip
 
     @parameterized.parameters({}, {'plans': VARIED, 'miss': 0.5})
     def test_goes_on_in_the_middle_of_a_step(self, **options):
@@ -372,14 +346,8 @@ class SaveTest(parameterized.TestCase):
             each.reset()
         for _ in range(4):
             environment.step(ZERO)
-        twin = pickle.loads(pickle.dumps(environment))
-        state = pickle.loads(pickle.dumps(environment.get_state()))
         self.advance(other, 4)
-        expected, info = self.advance(environment, 1), environment.info
-        other.set_state(state)
-        for each in (twin, other):
-            np.testing.assert_array_equal(self.advance(each, 1), expected)
-            self.assertEqual(each.info, info)
+        assert_goes_on(environment, other, self.advance)
 
     def test_the_seed_decides(self):
         first, again, another = (
@@ -390,26 +358,7 @@ class SaveTest(parameterized.TestCase):
 
     @parameterized.product(n=(1, 2, 5), options=({}, {'plans': VARIED, 'miss': 0.5}))
     def test_rows_are_single_environments(self, n, options):
-        rows = VectorEnvironment(ID, n, 2, seed=3, step_limit=19, task_kwargs=options)
-        alone = [
-            suite.make(
-                ID, {'random': int(s), 'step_limit': 19, **options}, {'flat_observation': True}
-            )
-            for s in rows.seeds
-        ]
-        first = [one.reset().observation['observations'] for one in alone]
-        np.testing.assert_array_equal(rows.reset(), first)
-        rng = np.random.default_rng(0)
-        for _ in range(45):
-            action = 0.2 * rng.uniform(-1, 1, (n, 11))
-            step = rows.step(action)
-            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
-            np.testing.assert_array_equal(
-                step.observation, [one.observation['observations'] for one in steps]
-            )
-            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
-            for name in ('landed', 'landing_error', 'fell', 'distance'):
-                np.testing.assert_array_equal(step.info[name], [one.info[name] for one in alone])
+        assert_rows_are_singles(ID, n, 45, 19, options, scale=0.2)
 
 
 class HelperTest(parameterized.TestCase):

@@ -1,13 +1,13 @@
 """Tests of the gait task: observation, reward, falls and cycles, recomputed by other means."""
 
 import dataclasses
-import pickle
 from unittest import mock
 
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer
+from helpers import advance, assert_goes_on, assert_rows_are_singles, links_on_ground
 
 from trl_suite import controllers, suite, terrain
 from trl_suite.vector import VectorEnvironment
@@ -51,7 +51,7 @@ class Probe:
     """Reads an environment's state by names, with the engine's own functions."""
 
     def __init__(self, environment):
-        self.task = environment.task
+        self.environment, self.task = environment, environment.task
         self.model, self.data = environment.physics.model.ptr, environment.physics.data.ptr
         self.row = self.task.character.row
         self.name, self.links = self.row.name, self.row.links
@@ -75,11 +75,7 @@ class Probe:
         return result[[3, 5]]
 
     def touching(self):
-        """Links with a contact point on the ground, from the engine's list."""
-        ground = self.model.body('terrain').id
-        pairs = self.model.geom_bodyid[self.data.contact.geom]
-        bodies = set(pairs[(pairs == ground).any(1)].ravel())
-        return {link for link in self.links if self.body(link) in bodies}
+        return links_on_ground(self.environment)
 
     def observation(self, left_stance):
         x, z = self.root
@@ -638,31 +634,19 @@ class GaitTest(parameterized.TestCase):
 class StateTest(parameterized.TestCase):
     """Save anywhere, go on bit for bit."""
 
-    def advance(self, environment, steps, seed):
-        rng, found = np.random.default_rng(seed), []
-        for _ in range(steps):
-            step = environment.step(0.3 * rng.uniform(-1, 1, len(environment.action_map)))
-            blocks = np.concatenate(list(step.observation.values()))
-            found.append([step.reward or 0.0, int(step.step_type), *blocks])
-        return np.array(found)
-
     @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
     def test_save_restore_and_pickle(self, id_, interface):
         steps = 4 if interface == 'parameters' else 17  # in the middle of a cycle
-        environment = make(id_, seed=6, interface=interface, start_noise=0.01)
-        self.advance(environment, steps, 0)
-        twin = pickle.loads(pickle.dumps(environment))
-        state = pickle.loads(pickle.dumps(environment.get_state()))
-        other = make(id_, seed=77, interface=interface, start_noise=0.01)
-        self.advance(other, steps - 1, 5)
-        other.set_state(state)
-        self.assertEqual(other.info, environment.info)
-        expected = self.advance(environment, 2 * steps, 1)
-        following = np.concatenate(list(environment.reset().observation.values()))
-        for each in (twin, other):
-            np.testing.assert_array_equal(self.advance(each, 2 * steps, 1), expected)
-            again = np.concatenate(list(each.reset().observation.values()))
-            np.testing.assert_array_equal(again, following)
+        environment, other = (
+            make(id_, seed=seed, interface=interface, start_noise=0.01) for seed in (6, 77)
+        )
+        advance(environment, 0, steps, 0.3)
+        advance(other, 5, steps - 1, 0.3)
+
+        def go(each, seed):
+            return advance(each, seed, steps if seed == 1 else 1, 0.3)
+
+        assert_goes_on(environment, other, go)
 
     def test_a_state_of_another_gait_is_refused(self):
         states = [make(DOG), make(RAPTOR), make(DOG, interface='base_action')]
@@ -677,39 +661,14 @@ class RowsTest(parameterized.TestCase):
     @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
     def test_bit_for_bit(self, id_, interface):
         limit = 3 if interface == 'parameters' else 15
-        options = {'interface': interface, 'start_noise': 0.02}
-        rows = VectorEnvironment(id_, 4, 2, seed=3, step_limit=limit, task_kwargs=options)
-        alone = [
-            suite.make(
-                id_,
-                {'random': int(seed), 'step_limit': limit, **options},
-                {'flat_observation': True},
-            )
-            for seed in rows.seeds
-        ]
-        first = [one.reset().observation['observations'] for one in alone]
-        np.testing.assert_array_equal(rows.reset(), first)
-        rng, ends, durations = np.random.default_rng(0), 0, set()
-        scale = np.array([0.1, 0.3, 0.7, 1.0])[:, None]  # so that some fall and some do not
-        for _ in range(2 * limit + 2):
-            action = scale * rng.uniform(-1, 1, (4, len(rows.action_map)))
-            step = rows.step(action)
-            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
-            np.testing.assert_array_equal(
-                step.observation, [one.observation['observations'] for one in steps]
-            )
-            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
-            np.testing.assert_array_equal(
-                step.terminated, [one.last() and one.discount == 0 for one in steps]
-            )
-            for name in ('duration', 'stumbled', 'distance', 'fell', 'stuck'):
-                found = [one.info[name] for one in alone]
-                np.testing.assert_array_equal(step.info[name], found, name)
-            ends += sum(one.last() for one in steps)
-            durations |= set(np.round(600 * step.info['duration']).astype(int).tolist())
+        found, ends = assert_rows_are_singles(
+            id_, 4, 2 * limit + 2, limit, {'interface': interface, 'start_noise': 0.02},
+            scale=np.array([0.1, 0.3, 0.7, 1.0])[:, None],  # so that some fall and some do not
+        )  # fmt: skip
         self.assertGreaterEqual(ends, 4)
         if interface == 'parameters':
-            self.assertGreater(len(durations), 3)
+            durations = np.stack([600 * step.info['duration'] for step in found])
+            self.assertGreater(len(np.unique(durations.round())), 3)
 
     def test_rows_that_all_begin_cost_no_physics(self):
         rows = VectorEnvironment(RAPTOR, 2, 1, seed=0, step_limit=1)

@@ -2,10 +2,8 @@
 
 import itertools
 import os
-import pathlib
 import subprocess
 import sys
-import tempfile
 from unittest import mock
 
 import imageio.v3 as iio
@@ -13,6 +11,7 @@ import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer
+from helpers import FolderTest
 
 from trl_suite import rendering, suite
 
@@ -191,17 +190,6 @@ class TerrainIsCurrentTest(parameterized.TestCase):
 
 def numbered(count, height=32, width=48):
     return [np.full((height, width, 3), 10 * i, np.uint8) for i in range(count)]
-
-
-class FolderTest(parameterized.TestCase):
-    def setUp(self):
-        super().setUp()
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = pathlib.Path(folder.name)
-
-    def assert_only(self, *names):
-        self.assertCountEqual([path.name for path in self.folder.iterdir()], names)
 
 
 class VideoTest(FolderTest):

@@ -9,28 +9,14 @@ import sys
 import mujoco
 import numpy as np
 from absl.testing import parameterized
+from helpers import assert_rows_are_singles
 
-from trl_suite import suite
+from trl_suite import catalogue, suite
 from trl_suite.vector import AUTORESET, VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 LIMIT = 12  # control steps: short episodes, so that rows are reset in the middle
-
-
-def singles(seeds, id_, **task_kwargs):
-    return [
-        suite.make(
-            id_,
-            {'random': int(seed), 'step_limit': LIMIT, **task_kwargs},
-            {'flat_observation': True},
-        )
-        for seed in seeds
-    ]
-
-
-def flat(time_step):
-    return time_step.observation['observations']
 
 
 class IdentityTest(parameterized.TestCase):
@@ -45,24 +31,7 @@ class IdentityTest(parameterized.TestCase):
             limit, steps, scale = 1, 4, 0.3
         elif suite.find(id_).rules in ('hike', 'soccer'):
             limit, steps = 3, 8
-        rows = VectorEnvironment(id_, 3, num_threads=2, seed=5, step_limit=limit)
-        alone = singles(rows.seeds, id_, step_limit=limit)
-        first = rows.reset()
-        np.testing.assert_array_equal(first, [flat(one.reset()) for one in alone])
-        random, ends = np.random.default_rng(0), 0
-        for _ in range(steps):
-            action = scale * random.uniform(-1, 1, (3, len(rows.action_map)))
-            step = rows.step(action)
-            steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
-            np.testing.assert_array_equal(step.observation, [flat(one) for one in steps])
-            np.testing.assert_array_equal(step.reward, [one.reward or 0.0 for one in steps])
-            np.testing.assert_array_equal(
-                step.terminated, [one.last() and one.discount == 0 for one in steps]
-            )
-            np.testing.assert_array_equal(
-                step.truncated, [one.last() and one.discount == 1 for one in steps]
-            )
-            ends += sum(one.last() for one in steps)
+        _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5)
         self.assertGreaterEqual(ends, 6)
 
     @parameterized.parameters(1, 2, 3)
@@ -142,7 +111,9 @@ class IdentityTest(parameterized.TestCase):
     @parameterized.parameters(*AUTORESET)
     def test_terms_sum_to_the_reward(self, autoreset):
         rows = VectorEnvironment(FLAT, 3, 1, seed=3, autoreset=autoreset, step_limit=LIMIT)
-        alone = singles(rows.seeds, FLAT)
+        alone = [
+            suite.make(FLAT, {'random': int(seed), 'step_limit': LIMIT}) for seed in rows.seeds
+        ]
 
         def check(reward, info):
             total = sum(info['reward_terms'].values())
@@ -291,6 +262,77 @@ class AutoresetTest(parameterized.TestCase):
 
     def test_autoreset_names(self):
         self.assertEqual(AUTORESET, ('next_step', 'same_step', 'disabled'))
+
+
+KINDS = tuple({row.rules: row.id for row in catalogue.ROWS}.values())  # one id of each task
+ALONE = np.array([False, True, False])
+
+
+class SomeRowsTest(parameterized.TestCase):
+    """Stepping some rows, and going on where another environment is: what a search needs."""
+
+    @parameterized.parameters(*KINDS)
+    def test_rows_that_rest_stay_as_they_are(self, id_):
+        """Row 1 rests every other step, and is no other for it than the row that never rests."""
+        rows, other = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
+        random = np.random.default_rng(0)
+        actions = random.uniform(-0.1, 0.1, (3, 3, len(rows.action_map)))
+        for each in (rows, other):
+            each.reset()
+        for t, action in enumerate(actions):
+            expected = other.step(action)
+            before = rows.task.world.qpos[1].copy(), rows.task.world.qvel[1].copy()
+            waiting = rows.step(np.ones_like(action), [0, 2] if t == 1 else [2])
+            np.testing.assert_array_equal(rows.task.world.qpos[1], before[0])
+            np.testing.assert_array_equal(rows.task.world.qvel[1], before[1])
+            self.assertEqual(waiting.reward[1], 0)
+            self.assertFalse(waiting.terminated[1] or waiting.truncated[1])
+            step = rows.step(action, ALONE)
+            np.testing.assert_array_equal(step.observation[1], expected.observation[1])
+            self.assertEqual(step.reward[1], expected.reward[1])
+            self.assertEqual(step.terminated[1], expected.terminated[1])
+
+    def test_a_row_that_has_ended_rests_until_it_is_asked(self):
+        rows = VectorEnvironment(GAPS, 3, 1, 0, step_limit=2)
+        rows.reset()
+        action = np.zeros((3, len(rows.action_map)))
+        rows.step(action, [0, 1])
+        step = rows.step(action, [0])
+        np.testing.assert_array_equal(step.truncated, [True, False, False])
+        for _ in range(2):
+            step = rows.step(action, [2])
+        np.testing.assert_array_equal(step.truncated, [False, False, True])
+        step = rows.step(action)  # the first and the last begin anew, the other ends
+        np.testing.assert_array_equal(step.truncated, [False, True, False])
+        np.testing.assert_array_equal(step.reward > 0, [False, True, False])
+        with self.assertRaisesRegex(ValueError, 'rows .3. of an environment of 3 rows'):
+            rows.step(action, [3])
+
+    @parameterized.parameters(*KINDS)
+    def test_copies_go_on_where_the_other_is(self, id_):
+        rows = VectorEnvironment(id_, 2, 1, seed=4)
+        copies = VectorEnvironment(id_, 3, 1, seed=9)
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (2, len(rows.action_map)))
+        for each in (rows, copies):
+            each.reset()
+        rows.step(action)
+        copies.copy_from(rows, [1, 0, 1], [0, 1, 2])
+        expected, step = rows.step(action), copies.step(action[[1, 0, 1]])
+        np.testing.assert_array_equal(step.observation, expected.observation[[1, 0, 1]])
+        np.testing.assert_array_equal(step.reward, expected.reward[[1, 0, 1]])
+
+    def test_what_cannot_be_copied(self):
+        rows, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
+        with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
+            rows.copy_from(rows, [0], [1])
+        rows.reset()
+        other.reset()
+        with self.assertRaisesRegex(ValueError, f'rows of {FLAT} cannot go on in {GAPS}'):
+            rows.copy_from(other, [0], [1])
+        with self.assertRaisesRegex(ValueError, '2 rows to put into rows .1.'):
+            rows.copy_from(rows, [0, 1], [1])
+        with self.assertRaisesRegex(ValueError, 'rows .2. of an environment of 2 rows'):
+            rows.copy_from(rows, [2], [1])
 
 
 class RobustnessTest(parameterized.TestCase):

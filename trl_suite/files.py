@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import json
 import os
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 Path = str | os.PathLike[str]
 
@@ -60,3 +62,14 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(content: Any, path: pathlib.Path) -> None:
+    """Writes a .json file, readable by people too.
+
+    Raises:
+      ValueError: the content has a number that is not finite.
+      OSError: the file cannot be written.
+    """
+    with replacing(path) as part:
+        part.write_text(f'{json.dumps(content, indent=1, allow_nan=False)}\n', encoding='utf-8')

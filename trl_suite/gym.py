@@ -162,6 +162,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if mode not in modes:
             raise ValueError(errors.unknown('autoreset_mode', mode, modes))
         self.metadata = {**METADATA, 'autoreset_mode': modes[mode]}
+        self.autoreset_mode = modes[mode]  # as Gymnasium's own have it; TorchRL looks for it
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}

@@ -102,6 +102,10 @@ class CharacterRow:
         raw = np.array([self.root_weight, *(joint.weight for joint in self.joints.values())])
         return raw / raw.sum()
 
+    @functools.cached_property
+    def _fingerprint(self) -> str:
+        return _digest(self)  # it compiles the character
+
 
 class Character(composer.Entity):
     """An articulated figure, planar or in three dimensions, that can be attached to any arena.
@@ -267,8 +271,12 @@ class CharacterObservables(composer.Observables):
 def fingerprint(row: CharacterRow) -> str:
     """Returns name and digest of all that makes a body move as it does, gains included.
 
-    Looks do not count, nor does how the MJCF is written.
+    Looks do not count, nor does how the MJCF is written. Found once for every row.
     """
+    return row._fingerprint
+
+
+def _digest(row: CharacterRow) -> str:
     model = mjcf.Physics.from_mjcf_model(Character(row).mjcf_model).model
     solid = _solid(row, model)
     figures = [

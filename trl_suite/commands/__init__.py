@@ -1,1 +1,1 @@
-"""What stands behind the longer commands of `trl-suite`: doctor, bench and gallery."""
+"""The commands of `trl-suite`, one module each; and what several of them need."""

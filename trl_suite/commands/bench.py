@@ -9,6 +9,7 @@ parts: many sizes, memory, and other suites.
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from trl_suite import suite
+from trl_suite import files, suite
 from trl_suite.commands import machine
 from trl_suite.vector import VectorEnvironment
 
@@ -105,11 +106,12 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
     world: Any = environments._world
     physics, begin = _counted(environments), Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
+    control = Stopwatch(environments.step, lambda action: rows)
     start = time.perf_counter()
-    control = rate(lambda: environments.step(next(drawn)), seconds, rows)
+    rate(lambda: control(next(drawn)), seconds)
     total = time.perf_counter() - start
     found = {
-        'control': control,
+        'control': control.items / total,
         'physics': physics.items / total,
         'share': physics.seconds / total,
         'reset': 1e3 * begin.seconds / max(1, begin.items),
@@ -228,3 +230,23 @@ def bench(
         'share of the physics': round(many['share'], 3), 'reset': round(many['reset'], 3),
         'single environment': round(one['environment']),
     }  # fmt: skip
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, and prints what was found."""
+    if arguments.json is not None:
+        files.check_path(arguments.json, ('.json',))
+    result = bench(arguments.id, arguments.rows, arguments.threads, arguments.seconds)
+    if arguments.json is not None:
+        files.write_json(result, arguments.json)
+    print(f'{result["id"]}, {result["rows"]} rows, {result["threads"]} threads, random actions')
+    print(f'  on {result["machine"]}')
+    for name, text in (
+        ('control steps', f'{result["control steps per second"]} per second, resets included'),
+        ('physics', f'{result["ratio to Batch.step"]:.2f} of the rate of raw mujoco.batch.Batch.step'),
+        ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
+        ('', f'{result["share of the physics"]:.0%} of the time is physics'),
+        ('reset', f'{result["reset"]:.2f} ms per row'),
+        ('alone', f'{result["single environment"]} control steps per second in a single environment'),
+    ):  # fmt: skip
+        print(f'  {name:<14} {text}')

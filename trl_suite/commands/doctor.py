@@ -8,6 +8,7 @@ OpenGL to be in order.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -26,7 +27,8 @@ TIMEOUT = 120.0  # s, for every process that is started
 # What an extra brings, by the name under which it is imported.
 EXTRAS = {
     'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'gymnasium': ('gymnasium',),
-    'sb3': ('stable_baselines3',), 'train': ('torch',), 'clips': ('pybvh',),
+    'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',), 'rllib': ('ray',), 'shimmy': ('shimmy',),
+    'train': ('torch',), 'clips': ('pybvh',),
 }  # fmt: skip
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',
@@ -213,3 +215,14 @@ def report(found: Iterable[Finding]) -> Iterator[str]:
         yield f'{finding.state:<6}  {finding.text}'
         if finding.remedy:
             yield f'        -> {finding.remedy}'
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints what is found, and returns 1 if anything is wrong."""
+    found = []
+    for finding in findings():  # some take seconds
+        found.append(finding.state)
+        print('\n'.join(report([finding])), flush=True)
+    failed = found.count(FAILED)
+    print(f'\n{failed} thing{"" if failed == 1 else "s"} to mend' if failed else '\nall is well')
+    return int(failed > 0)

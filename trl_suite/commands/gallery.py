@@ -10,6 +10,7 @@ that it shows has been replaced.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import fnmatch
@@ -19,6 +20,7 @@ import io
 import itertools
 import json
 import pathlib
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -349,3 +351,12 @@ def _source(path: pathlib.Path) -> str:
         kept = image.info.get('comment', '')
         return kept.decode() if isinstance(kept, bytes) else kept
     return ''
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Makes pictures, and returns 1 if any failed."""
+    written, failed = make(arguments.output, arguments.only, arguments.again)
+    for path, error in failed.items():
+        print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
+    print(f'{len(written)} pictures written to {arguments.output}, {len(failed)} failed')
+    return int(bool(failed))

@@ -15,6 +15,7 @@ import numpy as np
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.motion import quaternion
+from trl_suite.tasks.reference import tabulated
 from trl_suite.tasks.task import consecutive
 from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
@@ -291,21 +292,10 @@ def stacked(
       poses: (n, columns of a pose).
       rates: (n, columns of a velocity).
     """
-    data = mujoco.MjData(model)
     names = ('qpos', 'qvel', 'xpos', 'xquat', 'xipos', 'cvel', 'subtree_com')
-    rows = []
-    for pose, rate in zip(poses, rates, strict=True):
-        data.qpos[kinematics.pose_qpos] = pose
-        data.qvel[kinematics.pose_dof] = rate
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        rows.append([getattr(data, name).copy() for name in names])
-    return SimpleNamespace(
-        **{
-            name: np.stack(arrays)
-            for name, arrays in zip(names, zip(*rows, strict=True), strict=True)
-        }
-    )
+    everything = dict.fromkeys(names, slice(None))
+    pose_qpos, pose_dof = kinematics.pose_qpos, kinematics.pose_dof
+    return SimpleNamespace(**tabulated(model, pose_qpos, pose_dof, poses, rates, everything))
 
 
 def polar(way: np.ndarray, found: SimpleNamespace) -> np.ndarray:

@@ -108,11 +108,10 @@ class Footsteps(Tracking):
             raise ValueError(f'character {character.row.name!r} has no two feet to place')
         if miss is not None and not 0 < miss < np.inf:
             raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
-        for name, scale in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
-            if not np.size(scale) or not np.all(
-                (0 <= np.array(scale)) & (np.array(scale) < np.inf)
-            ):
-                raise ValueError(f'{name} is {scale}; expected 0 or more')
+        for name, given in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
+            scales = np.atleast_1d(given)
+            if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
+                raise ValueError(f'{name} is {given}; expected 0 or more')
         self._footstep_scales = np.atleast_1d(footstep_scale).tolist()
         self._heading_scale = heading_scale
         self.plans = options(Plans, 'plans', {} if plans is None else plans)

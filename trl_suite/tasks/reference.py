@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
@@ -54,30 +56,26 @@ class Reference:
         """
         self.clip = clip
         self.period = clip.duration
-        data = mujoco.MjData(model)
         times = np.arange(SAMPLES + 1) / SAMPLES * self.period
         poses, rates = clip.pose(times), clip.velocity(times)
+        parts = {
+            'xipos': links, 'cvel': links, 'subtree_com': links[:1], 'xpos': effectors,
+            'geom_xpos': geoms, 'geom_xmat': geoms,
+        }  # fmt: skip
+        found = tabulated(model, pose_qpos, pose_dof, poses, rates, parts)
         mass = model.body_mass[links]
         share = mass / mass.sum()
-        rows = []
-        for pose, rate in zip(poses, rates, strict=True):
-            data.qpos[pose_qpos] = pose
-            data.qvel[pose_dof] = rate
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            centres = data.xipos[links][:, ::2]
-            com = share @ centres
-            velocity = link_velocities(centres, data.cvel[links], data.subtree_com[links[0], ::2])
-            ahead = com[0] if about == 'com' else pose[0]
-            effector = data.xpos[effectors][:, ::2] - (ahead, 0)
-            rows.append(
-                np.concatenate([
-                    pose[2:], rate[2:], effector.T.ravel(), share @ velocity,
-                    pose[1:2], (centres - pose[:2]).ravel(), velocity.ravel(), rate[:2],
-                    link_extents(model, data, geoms, pose[:2]).ravel(),
-                ])
-            )  # fmt: skip
-        table = np.array(rows)
+        centres, places = found['xipos'][..., ::2], poses[:, None, :2]
+        com = share @ centres
+        velocity = link_velocities(centres, found['cvel'], found['subtree_com'][..., ::2])
+        effector = found['xpos'][..., ::2]
+        effector[..., 0] -= com[:, :1] if about == 'com' else poses[:, :1]
+        extents = _extents(found['geom_xpos'], found['geom_xmat'], model.geom_aabb[geoms], places)
+        features = (
+            poses[:, 2:], rates[:, 2:], effector.swapaxes(1, 2), share @ velocity, poses[:, 1:2],
+            centres - places, velocity, rates[:, :2], extents,
+        )  # fmt: skip
+        table = np.concatenate([part.reshape(SAMPLES + 1, -1) for part in features], axis=1)
         quarter = np.repeat(np.eye(bins), SAMPLES // bins, axis=0)
         phase = np.arange(SAMPLES)[:, None] / SAMPLES
         self._table = np.concatenate([table[:-1], phase, quarter], axis=1)
@@ -122,19 +120,59 @@ class Reference:
         return found
 
 
+def tabulated(
+    model: mujoco.MjModel,
+    pose_qpos: np.ndarray,
+    pose_dof: np.ndarray,
+    poses: np.ndarray,
+    rates: np.ndarray,
+    parts: Mapping[str, np.ndarray | slice],
+) -> dict[str, np.ndarray]:
+    """Puts a model into many states and reads positions and velocities, nothing else simulated.
+
+    Args:
+      model: the compiled model.
+      pose_qpos: addresses in qpos of the columns of a pose.
+      pose_dof: addresses in qvel of those of a velocity.
+      poses: (n, columns).
+      rates: (n, columns).
+      parts: which rows of which fields of MjData are wanted.
+
+    Returns:
+      By name the fields (n, rows, ...).
+    """
+    data = mujoco.MjData(model)
+    views = [getattr(data, name) for name in parts]  # they stay current
+    found = {
+        name: np.empty((len(poses), *view[part].shape))
+        for view, (name, part) in zip(views, parts.items(), strict=True)
+    }
+    copies = list(zip(found.values(), views, parts.values(), strict=True))
+    for i, (pose, rate) in enumerate(zip(poses, rates, strict=True)):
+        data.qpos[pose_qpos] = pose
+        data.qvel[pose_dof] = rate
+        # Contacts, inertia and forces would take most of the time.
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        for rows, view, part in copies:
+            rows[i] = view[part]
+    return found
+
+
 def link_velocities(centres: np.ndarray, cvel: np.ndarray, about: np.ndarray) -> np.ndarray:
     """Velocities of link centres in the x-z plane.
 
     Args:
-      centres: link centres, x and z, m, shape (links, 2).
-      cvel: spatial velocities (angular, linear) about `about`, shape (links, 6).
-      about: centre of mass of the whole tree, where MuJoCo keeps cvel, x and z, m.
+      centres: link centres, x and z, m, shape (..., links, 2).
+      cvel: spatial velocities (angular, linear) about `about`, shape (..., links, 6).
+      about: centre of mass of the whole tree, where MuJoCo keeps cvel, x and z, m, (..., 1, 2).
 
     Returns:
-      Velocities in x and z, m/s, shape (links, 2).
+      Velocities in x and z, m/s, shape (..., links, 2).
     """
-    offset = (centres - about)[:, ::-1] * (1, -1)
-    return cvel[:, 3:6:2] + cvel[:, 1:2] * offset
+    offset = (centres - about)[..., ::-1] * (1, -1)
+    return cvel[..., 3:6:2] + cvel[..., 1:2] * offset
 
 
 def link_extents(
@@ -145,7 +183,13 @@ def link_extents(
     Returns:
       Centres in x, half lengths in x, and lowest points, shape (3, geoms).
     """
-    frames, boxes = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms, None]
-    centre = (data.geom_xpos[geoms] + (frames * boxes[..., :3]).sum(2))[:, ::2] - root
-    half = (np.abs(frames) * boxes[..., 3:]).sum(2)
-    return np.stack([centre[:, 0], half[:, 0], centre[:, 1] - half[:, 2]])
+    return _extents(data.geom_xpos[geoms], data.geom_xmat[geoms], model.geom_aabb[geoms], root)
+
+
+def _extents(
+    places: np.ndarray, matrices: np.ndarray, boxes: np.ndarray, root: np.ndarray
+) -> np.ndarray:
+    frames, boxes = matrices.reshape(*matrices.shape[:-1], 3, 3), boxes[:, None]
+    centre = (places + (frames * boxes[..., :3]).sum(-1))[..., ::2] - root
+    half = (np.abs(frames) * boxes[..., 3:]).sum(-1)
+    return np.stack([centre[..., 0], half[..., 0], centre[..., 1] - half[..., 2]], axis=-2)

@@ -1,0 +1,244 @@
+"""Programs that use the suite through other libraries: the examples run, and get what they expect."""
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import math
+import pathlib
+import re
+import runpy
+import sys
+import unittest
+from unittest import mock
+
+import gymnasium
+import numpy as np
+import pytest
+from absl.testing import absltest, parameterized
+
+import trl_suite.gym
+from trl_suite import suite
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / 'examples'
+FLAT, GAPS = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0'
+
+
+def needs(module, extra):
+    """Skips a class of tests where the extra is not installed."""
+    return unittest.skipUnless(
+        importlib.util.find_spec(module), f"needs {module}: pip install 'trl_suite[{extra}]'"
+    )
+
+
+def output(name, *arguments):
+    """Runs an example as a program in this process; returns what it printed."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), mock.patch.object(sys, 'argv', [name, *arguments]):
+        runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
+    return out.getvalue()
+
+
+def run_page(word):
+    """Runs the code of docs/clients.md that has a word in it; returns its names."""
+    page = (ROOT / 'docs' / 'clients.md').read_text(encoding='utf-8')
+    (code,) = (
+        found for found in re.findall('```python\n(.*?)```', page, re.DOTALL) if word in found
+    )
+    names = {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        exec(compile(code, 'clients.md', 'exec'), names)
+    return names
+
+
+def load(name):
+    """Imports an example."""
+    with mock.patch.object(sys, 'path', [str(EXAMPLES), *sys.path]):
+        return importlib.import_module(name)
+
+
+class GymnasiumTest(absltest.TestCase):
+    def test_example(self):
+        out = output('gymnasium_rollout')
+        self.assertRegex(out, r'^one: return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
+        # Random actions fell a walker within a second or so: 16 rows of 256 steps.
+        self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
+
+    def test_rows_say_how_they_are_reset(self):
+        """As an attribute too, as Gymnasium's own vector environments: TorchRL asks for it."""
+        for mode in gymnasium.vector.AutoresetMode:
+            envs = trl_suite.gym.SuiteVectorEnv(GAPS, 2, num_threads=1, autoreset_mode=mode)
+            self.assertIs(envs.autoreset_mode, mode)
+
+
+@needs('stable_baselines3', 'sb3')
+class StableBaselinesTest(absltest.TestCase):
+    @pytest.mark.slow
+    def test_example(self):
+        out = output(
+            'stable_baselines_ppo', '--minutes', '1.5', '--every', '4096', '--num_threads', '1'
+        )
+        returns = [float(line.split()[1]) for line in out.splitlines()[1:]]
+        self.assertGreater(max(returns), returns[0] + 4)
+
+
+@needs('torchrl', 'torchrl')
+class TorchRLTest(parameterized.TestCase):
+    """TorchRL's wrappers: of a single environment, and of rows on threads."""
+
+    def setUp(self):
+        super().setUp()
+        import logging
+
+        logging.getLogger('torchrl').setLevel('ERROR')
+
+    def make(self, rows, **options):
+        from torchrl.envs import GymEnv, GymWrapper
+
+        if not rows:
+            return GymEnv(f'trl_suite/{GAPS}', **options)
+        return GymWrapper(
+            gymnasium.make_vec(
+                f'trl_suite/{GAPS}', num_envs=rows, autoreset_mode='Disabled', **options
+            )
+        )
+
+    @parameterized.product(rows=(0, 3), flat_observation=(True, False))
+    def test_specs(self, rows, flat_observation):
+        from torchrl.envs import check_env_specs
+
+        environment = self.make(rows, flat_observation=flat_observation)
+        check_env_specs(environment)
+        blocks = {'terrain': 50, 'pose': 25, 'velocity': 24, 'phase': 5}
+        sizes = {'observation': 104} if flat_observation else blocks
+        found = {name: spec.shape[-1] for name, spec in environment.observation_spec.items()}
+        self.assertEqual(found, sizes)
+
+    @parameterized.parameters(0, 3)
+    def test_a_seed_is_an_episode(self, rows):
+        import torch
+
+        rollouts = []
+        for seed in (5, 5, 6):
+            environment = self.make(rows)
+            environment.set_seed(seed)
+            torch.manual_seed(0)
+            rollouts.append(environment.rollout(30, break_when_any_done=False))
+        self.assertTrue((rollouts[0] == rollouts[1]).all())
+        self.assertFalse((rollouts[0] == rollouts[2]).all())
+
+    def test_rows_are_those_of_the_suite(self):
+        """What a rollout over ends of episodes says, in every row, a single environment does."""
+        import torch
+
+        environment = self.make(3)
+        environment.set_seed(5)
+        torch.manual_seed(0)
+        found = environment.rollout(60, break_when_any_done=False)
+        self.assertGreater(int(found['next', 'done'].sum()), 3)
+        for row, seed in enumerate(np.random.SeedSequence(5).generate_state(3)):
+            single = trl_suite.gym.SuiteEnv(GAPS)
+            single.reset(seed=int(seed))  # as TorchRL does when it is given a seed
+            observation, _ = single.reset()
+            for step in found[row]:
+                np.testing.assert_array_equal(step['observation'], observation)
+                observation, reward, terminated, truncated, _ = single.step(step['action'].numpy())
+                np.testing.assert_array_equal(step['next', 'observation'], observation)
+                self.assertEqual(step['next', 'reward'].item(), np.float32(reward))
+                self.assertEqual(step['next', 'terminated'].item(), terminated)
+                self.assertEqual(step['next', 'truncated'].item(), truncated)
+                if terminated or truncated:
+                    observation, _ = single.reset()
+
+    def test_page(self):
+        names = run_page('torchrl')
+        self.assertEqual(names['rows'].batch_size, (16,))
+        self.assertEqual(names['one'].batch_size, ())
+
+    @pytest.mark.slow
+    def test_example(self):
+        out = output('torchrl_ppo', '--samples', '24576')
+        returns = [float(found) for found in re.findall(r'return +([\d.]+)\n', out)]
+        self.assertLen(returns, 12)
+        self.assertGreater(np.mean(returns[-3:]), 1.2 * np.mean(returns[:3]))
+
+
+@needs('shimmy', 'shimmy')
+class ShimmyTest(parameterized.TestCase):
+    @parameterized.parameters(
+        GAPS, 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_General_Step-v0',
+        'PD_Biped3D_HLC_Soccer-v0',
+    )  # fmt: skip
+    def test_passes_the_checker(self, id_):
+        from gymnasium.utils.env_checker import check_env
+        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+
+        check_env(DmControlCompatibilityV0(suite.make(id_)), skip_render_check=True)
+
+    def test_a_seed_is_an_episode(self):
+        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+
+        env = DmControlCompatibilityV0(suite.make(GAPS))
+        expected = suite.make(GAPS, {'random': 3})
+        observation, _ = env.reset(seed=3)
+        time_step, random = expected.reset(), np.random.default_rng(0)
+        while not time_step.last():
+            action = random.uniform(-1, 1, 11)
+            time_step = expected.step(action)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            self.assertEqual(reward, time_step.reward)
+            self.assertEqual((terminated, truncated), (time_step.last(), False))  # it falls
+            for name, block in time_step.observation.items():
+                np.testing.assert_array_equal(observation[name], block)
+
+    def test_page(self):
+        expected = suite.make(FLAT, {'random': 1}).reset().observation
+        for name, block in run_page('shimmy')['observation'].items():
+            np.testing.assert_array_equal(block, expected[name])
+
+    def test_example(self):
+        out = output('shimmy_rollout')
+        self.assertRegex(out, r'^return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
+        self.assertEndsWith(out, 'picture of shape (240, 320, 3)\n')
+
+
+@needs('ray', 'rllib')
+class RLlibTest(absltest.TestCase):
+    def test_configuration(self):
+        configuration = load('rllib_ppo').configuration(GAPS, runners=3, rows=8, seed=7)
+        configuration.validate()
+        self.assertEqual(configuration.total_train_batch_size, 3 * 8 * 32)
+
+    @pytest.mark.slow
+    def test_two_runners_on_ground_of_their_own(self):
+        import ray
+
+        example = load('rllib_ppo')
+        # The other processes cannot import it, nor this test.
+        ray.cloudpickle.register_pickle_by_value(example)
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level='ERROR')
+        self.addCleanup(ray.shutdown)
+        algorithm = example.configuration(FLAT, runners=2, rows=16, seed=7).build_algo()
+        self.addCleanup(algorithm.stop)
+        for updates in range(1, 4):
+            found = algorithm.train()
+            sampled = found['env_runners']['num_env_steps_sampled_lifetime']
+            self.assertBetween(sampled, updates * 1024, updates * 1100)
+        mean = found['env_runners']['episode_return_mean']
+        self.assertBetween(mean, 5, 256)
+        self.assertTrue(math.isfinite(found['learners']['default_policy']['total_loss']))
+        self.assertEqual(found['fault_tolerance']['num_healthy_workers'], 2)
+
+        states = algorithm.env_runner_group.foreach_env_runner(
+            lambda runner: runner.env.unwrapped.environment.get_state(), local_env_runner=False
+        )
+        for runner, state in enumerate(states, 1):
+            expected = np.random.SeedSequence(7 + runner).generate_state(16)
+            np.testing.assert_array_equal(state['seeds'], expected)
+            self.assertGreater(state['steps'].sum(), 16)
+        self.assertFalse(np.array_equal(*(state['world'][0] for state in states)))
+
+
+if __name__ == '__main__':
+    absltest.main()

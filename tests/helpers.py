@@ -1,0 +1,188 @@
+"""What several test modules share: looks at a simulation, and checks of rows and of saved states."""
+
+import pathlib
+import pickle
+import tempfile
+
+import numpy as np
+from absl.testing import parameterized
+
+from trl_suite import suite, terrain
+from trl_suite.vector import VectorEnvironment
+
+RIGHT, LEFT = 0, 1
+STEP_WEIGHTS = {  # of the reward of footsteps
+    name: weight / 1.05
+    for name, weight in (
+        ('pose', 0.5), ('velocity', 0.05), ('end_effector', 0.2), ('com', 0.1), ('root', 0.1),
+        ('heading', 0.1),
+    )
+}  # fmt: skip
+
+
+# What a simulation holds, by named access.
+
+
+def body(environment, field, link):
+    name = environment.task.character.row.name
+    return getattr(environment.physics.named.data, field)[f'{name}/{link}'].copy()
+
+
+def ankles(environment):
+    """Right and left, (2, 3) m."""
+    return np.stack([body(environment, 'xpos', f'{side}_ankle') for side in ('right', 'left')])
+
+
+def heading_of(environment):
+    ahead = body(environment, 'xmat', 'root').reshape(3, 3)[:, 0]
+    return np.arctan2(ahead[1], ahead[0])
+
+
+def ground(environment, x, y):
+    """Height of three-dimensional ground, by a copy of it, m."""
+    return terrain.Ground.from_state(environment.task.arena.grounds[0].state()).height(x, y)
+
+
+def links_on_ground(environment):
+    """Names of the links that touch the terrain, as the engine's list of contacts says."""
+    model, contact = environment.physics.model.ptr, environment.physics.data.ptr.contact
+    pairs = model.geom_bodyid[contact.geom]
+    pairs = pairs[(pairs == model.body('terrain').id).any(1)]
+    return {model.body(b).name.split('/')[-1] for b in pairs.ravel()} - {'terrain'}
+
+
+def put(environment, pose, rate):
+    """Puts the character into a pose of a clip: root and joints in link order."""
+    task, data = environment.task, environment.physics.data
+    data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
+    environment.physics.forward()
+
+
+def angle_between(a, b):
+    return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def flattened(angle):
+    """Matrix that takes world axes to axes turned about z by an angle."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+
+
+def assert_uniform(values, low, high):
+    """Kolmogorov-Smirnov at a significance of 1 in 1000."""
+    values = np.sort(np.ravel(values))
+    assert values[0] >= low and values[-1] <= high, (values[0], values[-1])
+    share = (values - low) / (high - low)
+    distance = np.abs(share - (np.arange(len(share)) + 0.5) / len(share)).max()
+    assert distance < 1.95 / np.sqrt(len(share)), distance
+
+
+# Rows and single environments, saved states.
+
+
+def assert_rows_are_singles(
+    id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2
+):
+    """Checks that rows return what single environments with their seeds do, bit for bit.
+
+    One single environment plays the rows, one after the other: building many would take most of the
+    time, and what it did before must not matter either.
+
+    Args:
+      id_: of the environment.
+      n: rows.
+      steps: of all rows; those that end begin anew.
+      step_limit: after which episodes are cut.
+      options: of the task.
+      scale: of the random actions, a number or one for each row, (n, 1).
+      seed: of the rows.
+      num_threads: of the rows.
+
+    Returns:
+      What the rows returned, a list of `Step`, and how many episodes ended.
+    """
+    options = options or {}
+    rows = VectorEnvironment(id_, n, num_threads, seed, step_limit=step_limit, task_kwargs=options)
+    rng, size = np.random.default_rng(0), len(rows.action_map)
+    actions = [scale * rng.uniform(-1, 1, (n, size)) for _ in range(steps)]
+    first, found = rows.reset(), []
+    for action in actions:
+        found.append(rows.step(action))
+    task_kwargs = {'random': int(rows.seeds[0]), 'step_limit': step_limit, **options}
+    one, ends = suite.make(id_, task_kwargs, {'flat_observation': True}), 0
+    for row, own in enumerate(rows.seeds.tolist()):
+        if row:
+            one.random_state.seed(own)
+        where = f'{id_}, row {row}'
+        expected = one.reset().observation['observations']
+        np.testing.assert_array_equal(first[row], expected, f'{where}, reset')
+        for i, (step, action) in enumerate(zip(found, actions, strict=True)):
+            time_step, where = one.step(action[row]), f'{id_}, row {row}, step {i}'
+            expected = time_step.observation['observations']
+            np.testing.assert_array_equal(step.observation[row], expected, where)
+            last, cut = time_step.last(), time_step.discount == 1
+            ours = step.reward[row], step.terminated[row], step.truncated[row]
+            theirs = time_step.reward or 0.0, last and not cut, last and cut
+            np.testing.assert_equal(ours, theirs, where)
+            _assert_same_info(step.info, one.info, row, where)
+            ends += last
+    rows.close()
+    one.close()
+    return found, ends
+
+
+def _assert_same_info(of_rows, of_one, row, where):
+    assert set(of_rows) == set(of_one), where
+    for name, value in of_one.items():
+        if isinstance(value, dict):
+            _assert_same_info(of_rows[name], value, row, f'{where}, {name}')
+        else:
+            np.testing.assert_array_equal(of_rows[name][row], value, f'{where}, {name}')
+
+
+def advance(environment, seed, steps, scale, look=lambda environment: ()):
+    """Random actions; returns all that came back, and what is looked at, as one array."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(steps):
+        step = environment.step(scale * rng.uniform(-1, 1, len(environment.action_map)))
+        result = [step.reward or 0.0, int(step.step_type)]
+        found.append(np.concatenate([result, *step.observation.values(), *look(environment)]))
+    return np.array(found)
+
+
+def assert_goes_on(environment, other, go, before=lambda environment: None):
+    """Checks that a pickled twin and one that took over its state go on like an environment.
+
+    Args:
+      environment: in the middle of an episode.
+      other: built alike, with another seed; somewhere else.
+      go: function of (environment, seed): goes on with random actions and returns what came back.
+      before: called with all three, before they go on.
+    """
+    twin = pickle.loads(pickle.dumps(environment))
+    other.set_state(pickle.loads(pickle.dumps(environment.get_state())))
+    for each in (twin, other):
+        np.testing.assert_equal(each.info, environment.info)
+    for each in (environment, twin, other):
+        before(each)
+    expected, info = go(environment, 1), environment.info
+    following = environment.reset().observation
+    again = go(environment, 2)
+    for each in (twin, other):
+        np.testing.assert_array_equal(go(each, 1), expected)
+        np.testing.assert_equal(each.info, info)
+        for name, value in each.reset().observation.items():
+            np.testing.assert_array_equal(value, following[name])
+        np.testing.assert_array_equal(go(each, 2), again)
+
+
+class FolderTest(parameterized.TestCase):
+    """Has a temporary folder."""
+
+    def setUp(self):
+        super().setUp()
+        self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def assert_only(self, *names):
+        """Checks what the folder holds."""
+        self.assertCountEqual([path.name for path in self.folder.iterdir()], names)

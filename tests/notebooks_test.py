@@ -1,0 +1,147 @@
+"""The notebooks in colab/: whole, with outputs, naming what exists; and run again (slow)."""
+
+import ast
+import importlib.util
+import json
+import pathlib
+import re
+import sys
+import types
+
+import pytest
+from absl.testing import absltest, parameterized
+
+from trl_suite import catalogue, terrain
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+FOLDER = ROOT / 'colab'
+NAMES = (
+    'first_steps', 'train_a_biped', 'terrain', 'own_character', 'hierarchical_soccer',
+    'continual_learning',
+)  # fmt: skip
+LARGEST = 600e3  # bytes
+COLUMNS = 100
+_ID = re.compile(r'\b\w[\w-]*-v0\b')
+_FILE = re.compile(r'\b(?:docs|examples|trained)/[\w/]+\.\w+')
+_LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')
+_ABSOLUTE = re.compile(r'(?<![\w/.:])/\w+/\w')
+_MAGIC = re.compile(r'^(\s*)[%!].*$', re.MULTILINE)
+
+
+def read(name):
+    return json.loads((FOLDER / f'{name}.ipynb').read_text(encoding='utf-8'))
+
+
+def text(lines):
+    return lines if isinstance(lines, str) else ''.join(lines)
+
+
+def sources(notebook, kind):
+    return [text(cell['source']) for cell in notebook['cells'] if cell['cell_type'] == kind]
+
+
+def program(notebook):
+    """The code of a notebook as one tree, without what is for the notebook's shell."""
+    return ast.parse('\n'.join(_MAGIC.sub(r'\1pass', cell) for cell in sources(notebook, 'code')))
+
+
+def imported(tree):
+    """What of the suite is imported, by name; a name that does not exist raises."""
+    found = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).split('.')[0] == 'trl_suite':
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f'{node.module}.{alias.name}')
+                found[alias.asname or alias.name] = getattr(module, alias.name)
+    return found
+
+
+class StoredTest(parameterized.TestCase):
+    """The files as they are."""
+
+    def test_all_are_known(self):
+        self.assertCountEqual(NAMES, [path.stem for path in FOLDER.glob('*.ipynb')])
+        readme = (FOLDER / 'README.md').read_text(encoding='utf-8')
+        for name in NAMES:
+            self.assertIn(f'({name}.ipynb)', readme)
+
+    @parameterized.parameters(*NAMES)
+    def test_form(self, name):
+        notebook = read(name)
+        self.assertEqual((notebook['nbformat'], notebook['nbformat_minor']), (4, 5))
+        self.assertEqual(notebook['metadata'], {
+            'kernelspec': {'display_name': 'Python 3', 'language': 'python', 'name': 'python3'},
+            'language_info': {'name': 'python'},
+        })  # fmt: skip
+        cells = notebook['cells']
+        self.assertLen({cell['id'] for cell in cells}, len(cells))
+        for cell in cells:
+            self.assertIn(cell['cell_type'], ('code', 'markdown'))
+            self.assertEqual(cell['metadata'], {})
+            for line in text(cell['source']).splitlines():
+                self.assertLessEqual(len(line), COLUMNS, line)
+        self.assertStartsWith(text(cells[0]['source']), '# ')
+
+    @parameterized.parameters(*NAMES)
+    def test_outputs(self, name):
+        """All of one run from top to bottom, with pictures, without errors, warnings and places."""
+        self.assertLess((FOLDER / f'{name}.ipynb').stat().st_size, LARGEST)
+        code = [cell for cell in read(name)['cells'] if cell['cell_type'] == 'code']
+        self.assertEqual([cell['execution_count'] for cell in code], list(range(1, len(code) + 1)))
+        outputs = [output for cell in code for output in cell['outputs']]
+        self.assertNotEmpty(outputs)
+        pictures = 0
+        for output in outputs:
+            self.assertIn(output['output_type'], ('stream', 'display_data', 'execute_result'))
+            data = output.get('data', {})
+            pictures += 'image/jpeg' in data or 'image/png' in data
+            self.assertNotEqual(output.get('name'), 'stderr')
+            said = text(output.get('text', '')) + text(data.get('text/plain', ''))
+            self.assertNotRegex(said, _ABSOLUTE)
+        self.assertGreaterEqual(pictures, 2)
+
+    @parameterized.parameters(*NAMES)
+    def test_what_is_named_exists(self, name):
+        notebook = read(name)
+        tree, words = program(notebook), sources(notebook, 'markdown')
+        for cell in (*words, *sources(notebook, 'code')):
+            for id_ in _ID.findall(cell):
+                self.assertIn(id_, catalogue.BY_ID)
+        for cell in words:
+            for file in _FILE.findall(cell):
+                self.assertTrue((ROOT / file).is_file(), file)
+            for link in _LINK.findall(cell):
+                self.assertTrue((FOLDER / link).exists(), link)
+        modules = {k: v for k, v in imported(tree).items() if isinstance(v, types.ModuleType)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                owner = modules.get(node.value.id)
+                self.assertTrue(owner is None or hasattr(owner, node.attr), ast.unparse(node))
+            if isinstance(node, ast.keyword) and node.arg == 'terrain':
+                preset = getattr(node.value, 'value', None)
+                if isinstance(preset, str):
+                    terrain.load(preset)
+
+
+class RunTest(parameterized.TestCase):
+    """The notebooks from top to bottom; those that learn do so for next to no time."""
+
+    @parameterized.parameters(*NAMES)
+    @pytest.mark.slow
+    def test_run(self, name):
+        for module in ('nbclient', 'ipykernel', 'stable_baselines3'):
+            if importlib.util.find_spec(module) is None:
+                self.skipTest(f"needs {module}: pip install -e '.[notebooks]'")
+        sys.path.insert(0, str(FOLDER))
+        self.addCleanup(sys.path.remove, str(FOLDER))
+        import execute
+
+        notebook = execute.tidy(execute.execute(FOLDER / f'{name}.ipynb', short=True))
+        counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == 'code']
+        self.assertEqual(counts, list(range(1, len(counts) + 1)))
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,222 @@
+"""The command view: what reaches dm_control's viewer, and what that draws, in a window that is none."""
+
+import importlib
+import types
+import warnings
+from unittest import mock
+
+import cli_test
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite import suite
+from trl_suite.commands import view
+from trl_suite.environment import Environment
+
+GAPS = cli_test.GAPS
+DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
+HILLS = 'PD_Biped3D_Imitate-Hills_Terrain-v0'
+FRAME = 1 / 30  # s
+
+with warnings.catch_warnings():  # GLFW's, where there is no screen
+    warnings.simplefilter('ignore')
+    window = importlib.import_module('trl_suite.commands.window')
+
+
+class CommandTest(cli_test.CommandTest):
+    def view(self, *arguments):
+        """Runs the command; returns the environment, the policy and the title that were shown."""
+        with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
+            self.assertEqual(self.output('view', *arguments), '')
+        return shown.call_args.args
+
+    @parameterized.parameters(
+        (GAPS, 'reference'), ('PD_Dog2D_Flat-v0', 'clip'), (DOG, 'zero'), (PLANS, 'scripted'),
+        ('FSM_Hopper2D_Terrain_Gaps-v0', 'random'),
+    )  # fmt: skip
+    def test_what_is_shown(self, id_, name):
+        environment, policy, title = self.view(id_, '--policy', name, '--seed', '3')
+        self.assertEqual(title, f'{id_}: {name}')
+        expected = suite.make(id_, {'random': 3}).reset().observation
+        time_step = environment.reset()
+        for block, value in time_step.observation.items():
+            np.testing.assert_array_equal(value, expected[block])
+        self.assertEqual(policy(time_step).shape, environment.action_spec().shape)
+
+    def test_the_best_there_is(self):
+        """Trying policies costs no episode: it is that of the seed."""
+        environment, _, title = self.view('plaid/biped_gaps', '--seed', '3')
+        self.assertEqual(title, f'{GAPS}: reference')
+        expected = suite.make(GAPS, {'random': 3}).reset().observation['terrain']
+        np.testing.assert_array_equal(environment.reset().observation['terrain'], expected)
+
+    def test_a_file(self):
+        policy = cli_test.save_policy('mine.npz', GAPS)
+        environment, found, title = self.view(GAPS, '--policy', 'mine.npz')
+        self.assertEqual(title, f'{GAPS}: mine.npz')
+        time_step = environment.reset()
+        np.testing.assert_array_equal(found(time_step), policy(time_step.observation))
+
+    @parameterized.parameters(
+        ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
+        ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
+        ('No such file', GAPS, '--policy', 'none.npz'),
+        ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
+        (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
+    )
+    def test_refusals(self, message, *arguments):
+        with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
+            self.assert_refused(message, 'view', *arguments)
+        shown.assert_not_called()
+
+    def test_no_screen(self):
+        nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}
+        with mock.patch.dict('os.environ', nothing), mock.patch('sys.platform', 'linux'):
+            self.assert_refused(
+                'neither DISPLAY nor WAYLAND_DISPLAY .* trl-suite rollout', 'view', GAPS
+            )
+        with (
+            mock.patch.dict('os.environ', {'DISPLAY': ':1', 'MUJOCO_GL': 'egl'}),
+            mock.patch(
+                'glfw.init', lambda: warnings.warn('Failed to open display :1', stacklevel=1)
+            ),
+        ):
+            self.assert_refused(
+                r'GLFW can use \(Failed to open display :1\); .* --video', 'view', GAPS
+            )
+
+
+class FramesTest(parameterized.TestCase):
+    @parameterized.parameters(DOG, PLANS)
+    def test_long_steps_frame_by_frame(self, id_):
+        environment, expected = (suite.make(id_, {'random': 2}) for _ in range(2))
+        random, asked = np.random.default_rng(0), []
+
+        def policy(time_step):
+            asked.append(random.uniform(-0.1, 0.1, expected.action_spec().shape))
+            return asked[-1]
+
+        frames = view.Frames(environment, policy)
+        time_step, end, times = frames.reset(), expected.reset(), [0.0]
+        for step in range(3):
+            while len(asked) <= step or frames._left:
+                time_step = frames.step(frames.policy(time_step))
+                times.append(frames.physics.data.time)
+            self.assertLen(asked, step + 1)
+            end = expected.step(asked[-1])
+            self.assertEqual((time_step.reward, time_step.discount), (end.reward, end.discount))
+            for block, value in end.observation.items():
+                np.testing.assert_array_equal(time_step.observation[block], value)
+            np.testing.assert_array_equal(frames.physics.data.qpos, expected.physics.data.qpos)
+        passed = np.diff(times)
+        self.assertGreater(len(passed), 25)
+        self.assertBetween(passed.min(), -1e-9, FRAME)
+        self.assertLess(passed.max(), FRAME + 1e-9)
+
+    def test_a_reset_within_a_step(self):
+        frames = view.Frames(suite.make(DOG, {'random': 2}), lambda time_step: np.zeros(29))
+        time_step = frames.reset()
+        for _ in range(3):
+            time_step = frames.step(frames.policy(time_step))
+        self.assertTrue(time_step.mid())
+        self.assertNotEmpty(frames._left)
+        self.assertTrue(frames.reset().first())
+        self.assertEqual(frames.physics.data.time, 0)
+        self.assertLess(frames.step(np.zeros(29)) and frames.physics.data.time, 1.01 * FRAME)
+
+    def test_only_long_steps(self):
+        for id_, kind in ((DOG, view.Frames), (GAPS, Environment)):
+            environment = suite.make(id_)
+            with mock.patch.object(window, 'Window') as shown:
+                view.view(environment, lambda time_step: np.zeros(29), 'a title')
+            shown.assert_called_once_with(environment, 'a title')
+            self.assertIsInstance(shown().launch.call_args.args[0], kind)
+
+
+class NoWindow:
+    """What the viewer needs of a window; it is closed after some pictures, which it keeps."""
+
+    def __init__(self, width, height, title):
+        names = ('on_move', 'on_click', 'on_double_click', 'on_scroll', 'on_key')
+        events = {name: window.application.util.QuietSet() for name in names}
+        self.mouse = types.SimpleNamespace(position=np.zeros(2, int), **events)
+        self.keyboard, self.shape, self.title = self.mouse, (160, 120), title
+        self.count, self.pictures, self.after = 20, [], lambda i: None
+
+    def event_loop(self, tick_func):
+        for i in range(self.count):
+            self.pictures.append(tick_func().astype(int))
+            self.after(i)
+
+    def close(self):
+        pass
+
+
+class WindowTest(parameterized.TestCase):
+    """The viewer itself, which draws into memory."""
+
+    def setUp(self):
+        super().setUp()
+        self.enterContext(mock.patch.object(window.application.gui, 'RenderWindow', NoWindow))
+
+    def window(self, environment):
+        shown = window.Window(environment, 'a title')
+        clock = types.SimpleNamespace(tick=lambda: FRAME, measured_time=FRAME)
+        shown._frame_timer = clock  # that of the machine may be slow
+        shown._viewer_layout = (
+            window.application.views.ViewportLayout()
+        )  # no figures over the picture
+        return shown, shown._window
+
+    @parameterized.parameters(GAPS, DOG, PLANS)
+    def test_moves_and_is_followed(self, id_):
+        environment, times = suite.make(id_, {'random': 1}), []
+        _, policy = view.acting.best(environment, id_)
+        shown, screen = self.window(environment)
+        screen.after = lambda i: times.append(environment.physics.data.time)
+        with mock.patch.object(window, 'Window', return_value=shown):
+            view.view(environment, policy, 'a title')
+        self.assertEqual(screen.title, 'a title')
+        # In the time of the clock: a frame each, now and then none or two.
+        self.assertAlmostEqual(times[-1], 20 * FRAME, delta=2.01 * FRAME)
+        self.assertLess(np.diff(times).max(), 2.01 * FRAME)
+        changes = np.abs(np.diff(screen.pictures[1:], axis=0)).mean((1, 2, 3))
+        self.assertGreater(np.mean(changes > 0.05), 0.6)
+        self.assertGreater(screen.pictures[-1].std(), 10)
+        body = shown._viewer.camera.settings.trackbodyid
+        name = environment.physics.model.id2name(body, 'body')
+        self.assertEqual(name, f'{environment.task.character.row.name}/')
+
+    def test_ground_that_changes_is_drawn_as_it_is(self):
+        environment = suite.make(HILLS, {'random': 1})
+        shown, screen = self.window(environment)
+        shown._pause_subject.toggle()
+
+        def flatten(i):
+            if i == 1:
+                environment.physics.model.hfield_data[:] = 0
+
+        screen.count, screen.after = 4, flatten
+        shown.launch(environment, None)
+        first, again, flat, still = screen.pictures
+        np.testing.assert_array_equal(first, again)
+        self.assertGreater(np.abs(flat - first).mean(), 1)
+        np.testing.assert_array_equal(flat, still)
+
+    def test_what_a_task_marks_is_drawn(self):
+        pictures = []
+        for markers in (True, False):
+            environment = suite.make(PLANS, {'random': 1})
+            environment.step(np.zeros(5))
+            shown, screen = self.window(environment)
+            shown._pause_subject.toggle()
+            if not markers:
+                environment.task.markers = lambda row: []
+            screen.count = 2
+            shown.launch(environment, None)
+            pictures.append(screen.pictures[-1])
+        self.assertGreater(np.abs(np.diff(pictures, axis=0)).max(), 50)
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,47 @@
+"""`trl-suite clip`: carries a motion file over to a character, and checks it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from trl_suite import files, rendering
+from trl_suite.commands import engine
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carries a motion file over to a character, and prints what is wrong with the clip."""
+    for path, suffixes in (
+        (arguments.output, ('.npz',)),
+        (arguments.strip, rendering.IMAGE_SUFFIXES),
+    ):
+        if path is not None:
+            files.check_path(path, suffixes)
+    if arguments.cycle and len(arguments.cycle) != 2:
+        raise ValueError(f'--cycle: {len(arguments.cycle)} times; expected none or two')
+    engine.load()
+    from trl_suite import clip_check, retargeting
+    from trl_suite.mannequin import Mannequin
+
+    chosen = None
+    if arguments.map is not None:
+        chosen = json.loads(files.existing(arguments.map, ('.json',)).read_text(encoding='utf-8'))
+    name = arguments.character
+    motion = retargeting.read(arguments.file, name, arguments.skeleton)
+    clip = retargeting.retarget(motion, name, chosen, arguments.scale)
+    if arguments.cycle is not None:
+        clip = retargeting.cycle(clip, *arguments.cycle)
+    report = clip_check.check(clip, name)
+    print(report)
+    for fault in report.faults if arguments.frames else ():
+        print(
+            f'frame {fault.frame}, {fault.time:.3f} s: {fault.kind}, {fault.name}, '
+            f'{fault.amount:.3g} {fault.unit}'
+        )
+    if arguments.output is not None:
+        clip.save(arguments.output)
+        print(arguments.output)
+    if arguments.strip is not None:
+        image = Mannequin(name).film_strip(clip, height=240, width=320)
+        rendering.film_strip([image], arguments.strip)
+        print(arguments.strip)

@@ -1,0 +1,37 @@
+"""`trl-suite terrain`: plots draws of a terrain, or writes one as a mesh."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+
+import numpy as np
+
+from trl_suite import rendering, terrain
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Plots draws of a terrain, or writes one as a mesh, and prints the file's name."""
+    name = pathlib.Path(arguments.terrain)
+    known = name.name if name.suffix not in ('.json', '.txt') else name.stem
+    output = arguments.output or pathlib.Path(f'terrain_{known}.png')
+    if output.suffix.lower() in terrain.WRITTEN:
+        _write_mesh(arguments, output)
+        return
+    rendering.plot_terrain(
+        arguments.terrain, output, arguments.draws, arguments.length, arguments.seed,
+        arguments.blend,
+    )  # fmt: skip
+    print(output)
+
+
+def _write_mesh(arguments: argparse.Namespace, output: pathlib.Path) -> None:
+    source = terrain.load(arguments.terrain)
+    draw = terrain.Ground if source.spatial else terrain.Strip
+    # As the first of the plots.
+    ground = draw(source, np.random.SeedSequence((arguments.seed, 0)), blend=arguments.blend)
+    low, high = (-2.0, arguments.length)
+    if source.spatial:
+        low, high = -0.5 * arguments.length, 0.5 * arguments.length
+    terrain.save_mesh(ground, output, low, high)
+    print(output)
