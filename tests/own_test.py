@@ -413,6 +413,17 @@ class Rise(Walk):
 class TaskTest(parameterized.TestCase):
     """Tasks from parts."""
 
+    @parameterized.parameters('PD_Biped2D_Flat-v0', 'PD_Biped3D_Imitate-v0')
+    def test_parts_are_as_they_were_when_asked(self, id):
+        environment = suite.make(id, {'random': 1})
+        environment.reset()
+        names = ('height', 'root', 'speed', 'heading', 'upright', 'joint_angles', 'joint_rates')
+        found = [np.asarray(getattr(parts, name)(environment.task)) for name in names]
+        before = [array.copy() for array in found]
+        environment.step(np.ones(environment.action_spec().shape))
+        for name, array, expected in zip(names, found, before, strict=True):
+            np.testing.assert_array_equal(array, expected, name)
+
     @parameterized.parameters(
         'PD_Biped2D_Gaps_Terrain-v0', 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
     )

@@ -342,6 +342,13 @@ class SpatialTest(FolderTest):
         np.testing.assert_array_equal(again, image)
         np.testing.assert_array_equal(iio.imread(path), image)
 
+    def test_height_map_of_what_a_plan_is_made_from(self):
+        environment = suite.make('PD_Biped3D_HLC_Forest-v0', {'random': 1})
+        environment.reset()
+        image = rendering.height_map(environment, reach=1.0).astype(int)
+        brown = (image[..., 0] - image[..., 2] > 100).mean()
+        self.assertBetween(brown, 0.001, 0.3)  # some pillars on level ground
+
     def test_height_map_refusals(self):
         for make, options, message in (
             (lambda: suite.make(GAPS), {}, 'Imitation task.*no map'),

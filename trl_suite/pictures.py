@@ -290,10 +290,10 @@ def height_map(
     """
     task: Any = environment.task
     part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
-    if part.stop - part.start != SAMPLES**2 or not getattr(task, 'terrain_map', False):
+    if part.stop - part.start != SAMPLES**2:
         raise ValueError(
             f'a {type(task).__name__} task that observes no map of {SAMPLES} x {SAMPLES} heights has '
-            'none to draw; those in three dimensions do with the option terrain_map=True'
+            'none to draw; 3D imitation and footsteps observe one with the option terrain_map=True'
         )
     if not 0 < reach < np.inf:
         raise ValueError(f'reach is {reach}; expected a positive number of metres')

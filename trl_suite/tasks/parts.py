@@ -63,7 +63,7 @@ def effort(task: Any) -> np.ndarray:
 def root(task: Any) -> np.ndarray:
     """Where the root is, m, (n, 3)."""
     figure = task.figure.kinematics if _spatial(task) else task.figure
-    return task.world.xpos[:, figure.links[0]]
+    return task.world.xpos[:, figure.links[0]].copy()
 
 
 def _spatial(task: Any) -> bool:
