@@ -38,7 +38,7 @@ from trl_suite.vector import VectorEnvironment
 class Settings:
     """What a run depends on besides environment and seed."""
 
-    samples: float = 6e3  # decisions that the search makes, one per cycle
+    samples: float = 4e3  # decisions that the search makes, one per cycle
     num_envs: int = 16  # half of them driven by the search, half by the network
     cycles: int = 2  # that the search looks ahead; all but the first as the network would
     alive: float = 2.0  # worth of not having fallen by then, in rewards of a cycle

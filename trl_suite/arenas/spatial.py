@@ -248,7 +248,12 @@ class SpatialTerrain(composer.Arena):
         level, floor = ground.layout.level, 0.0
         if self._plane >= 0:
             floor = PARKED if level is None else level
-            model.geom_pos[self._plane] = x, y, floor
+            place = np.array([x, y, floor])
+            if not (around.windowed or len(self._bodies)) and np.array_equal(
+                model.geom_pos[self._plane], place
+            ):
+                return  # nothing but a plane, which lies there already
+            model.geom_pos[self._plane] = place
         if self._field >= 0:
             heights = around.grid(row)
             lowest, highest = float(heights.min()), float(heights.max())

@@ -206,7 +206,7 @@ class Clip:
         start, end = t - VELOCITY_STEP / 2, t + VELOCITY_STEP / 2
         if not self.loop:
             start, end = np.clip([start, end], 0, self.duration)
-        velocity = self.layout.change(self.pose(start), self.pose(end))
+        velocity = self.layout.change(*self.pose(np.stack([start, end])))
         if self.loop:
             return velocity / VELOCITY_STEP
         inside = (t >= 0) & (t <= self.duration)

@@ -5,6 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 _SMALL = 1e-8  # rad; below it sin(x)/x is 1 to double precision
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns what `numpy.cross` does of (..., 3); of few vectors ten times as fast."""
+    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 def slerp(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -36,7 +42,7 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     aw, av = a[..., :1], a[..., 1:]
     bw, bv = b[..., :1], b[..., 1:]
     w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    return np.concatenate([w, aw * bv + bw * av + np.cross(av, bv)], axis=-1)
+    return np.concatenate([w, aw * bv + bw * av + cross(av, bv)], axis=-1)
 
 
 def rotation_vector(q: np.ndarray) -> np.ndarray:
@@ -58,11 +64,11 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns the shortest turn of the direction `a` into `b`, both (..., 3), any length."""
     a = a / np.linalg.norm(a, axis=-1, keepdims=True)
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
-    across = np.cross(a, b)
+    across = cross(a, b)
     sine = np.linalg.norm(across, axis=-1, keepdims=True)
     angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
     # Opposite directions have no shortest turn; any one across them will do.
-    other = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    other = cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
     flat = sine < _SMALL
     axis = np.where(flat, other, across)
     return from_vector(angle * axis / np.linalg.norm(axis, axis=-1, keepdims=True))
@@ -77,8 +83,8 @@ def angle_about(q: np.ndarray, axis: np.ndarray) -> np.ndarray:
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Returns vectors (..., 3) after rotations (..., 4); leading axes broadcast."""
     w, axis = q[..., :1], q[..., 1:]
-    across = 2 * np.cross(axis, v)
-    return v + w * across + np.cross(axis, across)
+    across = 2 * cross(axis, v)
+    return v + w * across + cross(axis, across)
 
 
 def reflect(q: np.ndarray) -> np.ndarray:
@@ -95,11 +101,14 @@ def about_z(angle: np.ndarray) -> np.ndarray:
 
 def heading(q: np.ndarray) -> np.ndarray:
     """Returns the direction of the turned x axis in the ground plane, rad, shape (...)."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
+    w, x, y, z = (q[..., i] for i in range(4))
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def turned(way: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Returns (x, y) turned by an angle about the vertical; broadcasts (..., 2) and (...)."""
     x, y, cos, sin = way[..., 0], way[..., 1], np.cos(angle), np.sin(angle)
-    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    result = np.empty((*np.broadcast_shapes(x.shape, np.shape(angle)), 2))
+    result[..., 0] = cos * x - sin * y
+    result[..., 1] = sin * x + cos * y
+    return result

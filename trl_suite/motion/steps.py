@@ -152,7 +152,7 @@ class Steps:
         time = np.clip(time, 0, self.duration)
         start = np.maximum(time - VELOCITY_STEP / 2, 0)
         end = np.minimum(time + VELOCITY_STEP / 2, self.duration)
-        change = self.layout.change(self.pose(which, start), self.pose(which, end))
+        change = self.layout.change(*self.pose(which, np.stack([start, end])))
         velocity = change / (end - start)[..., None]
         return _mirrored(mirrored, velocity, self.layout.mirror.velocity)
 

@@ -21,6 +21,10 @@ from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
 
 CLEARANCE = 0.001  # m; left under every link at the start
+_ACROSS, _ACROSS_SIGN = (
+    np.array([3, 2, 1, 0]),
+    np.array([-1.0, -1.0, 1.0, 1.0]),
+)  # z times (w, x, y, z)
 
 
 class Kinematics:
@@ -96,7 +100,7 @@ class Kinematics:
         com = world.subtree_com[:, body]
         # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
         spins = cvel[..., :3]
-        velocities = cvel[..., 3:] + np.cross(spins, centres - com[:, None])
+        velocities = cvel[..., 3:] + quaternion.cross(spins, centres - com[:, None])
         # Row by row, so that a row's sum does not depend on how many rows there are.
         com_velocity = np.matmul(velocities.reshape(n, 1, -1), self._share)[:, 0]
 
@@ -117,8 +121,7 @@ class Kinematics:
         positions, relative, spins, effectors = np.split(vectors, [links, 2 * links, 3 * links], 1)
         effectors[..., 2] = feet[..., 2] - ground[:, 1:]
         half = 0.5 * heading
-        away = np.stack([np.cos(half), -np.sin(half)], axis=1)[:, :, None]
-        orientations = _without_heading(quaternions, away[:, 0], away[:, 1])
+        orientations = _without_heading(quaternions, np.cos(half), -np.sin(half))
         features = np.concatenate(
             [
                 orientations[:, 0], world.qpos.take(self._balls, 1),
@@ -311,6 +314,5 @@ def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
 
 
 def _without_heading(q: np.ndarray, w: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Returns rotations (n, k, 4), then turned about the vertical by (w, 0, 0, z), both (n, 1)."""
-    a, b, c, d = np.moveaxis(q, -1, 0)
-    return np.stack([w * a - z * d, w * b - z * c, w * c + z * b, w * d + z * a], axis=-1)
+    """Returns rotations (n, k, 4), then turned about the vertical by (w, 0, 0, z), both (n,)."""
+    return w[:, None, None] * q + z[:, None, None] * (q.take(_ACROSS, -1) * _ACROSS_SIGN)

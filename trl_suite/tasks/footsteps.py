@@ -191,23 +191,29 @@ class Footsteps(Tracking):
         self.landing_error[rows] = self.heading_error[rows] = 0.0
         self.landed[rows] = False
         self._push_end[rows] = 0
-        for row in rows.tolist():
+        aside, sizes = np.zeros(len(rows)), np.zeros((len(rows), 2, 2))
+        for i, row in enumerate(rows.tolist()):
             if self.pushes:
                 self._push_begin[row] = self._steps_within(row, self.pushes.interval)
-            place, angle = self._origin[row, :2], self._origin[row, 2]
-            stance = int(self.stance[row])
             self._redraw_step(row, always=True)
-            # The line of the plan goes through the start, half a width beside each foot.
-            along, _ = quaternion.turned(found.feet[row, stance, :2] - place, -angle)
-            aside = 0.5 * SIDE[stance] * self._width[row]
-            anchor = place + quaternion.turned(np.array([along, aside]), angle)
-            self.heading[row] = angle
+            aside[i] = self._width[row]
             if self.goal_given:
+                place = self._origin[row, :2]
                 self.goal[row] = self.arena.goal(row, self._random[row], place, 'step')
-                self._head_for_goal(row, found.root[row, :2])
-                anchor = found.feet[row, stance, :2]
-            self._lay(row, 0, self._next(row, 1 - stance, anchor))
-            self._lay(row, 1, self._next(row, stance, self.landing[row, 0, :2]))
+            sizes[i] = self._next_size(row), self._next_size(row)
+        places, angles = self._origin[rows, :2], self._origin[rows, 2]
+        self.heading[rows] = angles
+        stance = self.stance[rows]
+        anchors = found.feet[rows, stance, :2]
+        if self.goal_given:
+            self._head_for_goals(rows, found.root[rows, :2])
+        else:
+            # The line of the plan goes through the start, half a width beside each foot.
+            line = quaternion.turned(anchors - places, -angles)
+            line[:, 1] = 0.5 * SIDE[stance] * aside
+            anchors = places + quaternion.turned(line, angles)
+        for which, foot in enumerate((1 - stance, stance)):
+            anchors = self._lay(rows, which, foot, anchors, sizes[:, which])
         self._put_reference(rows, found, np.full(len(rows), self._first))
 
     def _redraw_step(self, row: int, always: bool = False) -> None:
@@ -217,22 +223,40 @@ class Footsteps(Tracking):
             self._length[row] = random.uniform(*plans.length)
             self._width[row] = random.uniform(*plans.width)
 
-    def _next(self, row: int, foot: int, place: np.ndarray) -> np.ndarray:
-        """Returns where a foot lands while the other one stands at a place (x, y)."""
+    def _next_size(self, row: int) -> tuple[float, float]:
+        """Returns length and width of the next step, which perhaps are drawn anew, m."""
         self._redraw_step(row)
-        step = np.array([self._length[row], SIDE[foot] * self._width[row]])
-        return place + quaternion.turned(step, self.heading[row])
+        return float(self._length[row]), float(self._width[row])
 
-    def _lay(self, row: int, which: int, place: np.ndarray) -> None:
-        """Enters a landing place (x, y) into the plan, on the ground."""
-        rows = np.array([row])
-        height = self.arena.height(place[None, :1], place[None, 1:], rows)
-        self.landing[row, which] = *place, height[0, 0]
+    def _lay(
+        self, rows: np.ndarray, which: int, feet: np.ndarray, places: np.ndarray, sizes: np.ndarray
+    ) -> np.ndarray:
+        """Enters into the plans where feet land while the other ones stand at places, on the ground.
 
-    def _head_for_goal(self, row: int, place: np.ndarray) -> None:
-        way = self.goal[row, :2] - place
-        if np.hypot(*way) > NEAR_GOAL:
-            self.heading[row] = np.arctan2(way[1], way[0])
+        Args:
+          rows: which simulations, (m,).
+          which: of the plan's two steps.
+          feet: which ones step, (m,).
+          places: (m, 2) m.
+          sizes: lengths and widths of the steps, (m, 2) m.
+
+        Returns:
+          The landing places, (m, 2) m.
+        """
+        steps = sizes.copy()
+        steps[:, 1] *= SIDE[feet]
+        places = places + quaternion.turned(steps, self.heading[rows])
+        self.landing[rows, which, :2] = places
+        heights = self.arena.height(places[:, :1], places[:, 1:], rows)
+        self.landing[rows, which, 2] = heights[:, 0]
+        return places
+
+    def _head_for_goals(self, rows: np.ndarray, places: np.ndarray) -> None:
+        """Plans to head from places (m, 2) for the goals, where these are not too near."""
+        way = self.goal[rows, :2] - places
+        headings = np.arctan2(way[:, 1], way[:, 0])
+        far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
+        self.heading[rows[far]] = headings[far]
 
     def _steps_within(self, row: int, seconds: tuple[float, float]) -> int:
         return round(self._random[row].uniform(*seconds) / self.control_timestep)
@@ -262,34 +286,47 @@ class Footsteps(Tracking):
         gap = found.feet[rows, stance[rows], :2] - self.landing[rows, 0, :2]
         self.landing_error[rows] = np.hypot(gap[:, 0], gap[:, 1])
         self.heading_error[rows] = np.abs(rewards.wrap(self.heading[rows] - found.heading[rows]))
-        for row in rows.tolist():
-            self._replan(row, found)
+        self._replan(rows, found)
         self._put_reference(rows, found, self._choose(rows, found))
 
-    def _replan(self, row: int, found: SimpleNamespace) -> None:
-        """Makes the next plan of one simulation, at a switch of stance."""
-        plans, random = self.plans, self._random[row]
-        stance = int(self.stance[row])
-        if plans.from_root and random.uniform() < plans.from_root:
-            off = np.clip(random.normal(0, plans.root_turn), -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
-            self.heading[row] = found.heading[row] + off
-            place = found.feet[row, stance, :2]
-            for which, foot in enumerate((1 - stance, stance)):
-                ahead = random.uniform(*plans.root_length)
-                step = ahead, SIDE[foot] * random.uniform(*plans.root_width)
-                place = place + quaternion.turned(np.array(step), self.heading[row])
-                self._lay(row, which, place)
-            return
-        if self.goal_given:
-            if np.hypot(*(found.root[row, :2] - self.goal[row, :2])) < GOAL_REACHED:
-                self.goal[row] = self.arena.goal(row, random, found.root[row, :2], 'step')
-            self._head_for_goal(row, self.landing[row, :, :2].mean(0))
-        elif plans.sharp and random.uniform() < plans.sharp:
-            self.heading[row] += random.uniform(-np.pi, np.pi)
-        elif plans.turn:
-            self.heading[row] += random.normal(0, plans.turn)
-        self.landing[row, 0] = self.landing[row, 1]
-        self._lay(row, 1, self._next(row, stance, self.landing[row, 0, :2]))
+    def _replan(self, rows: np.ndarray, found: SimpleNamespace) -> None:
+        """Makes the next plans of some simulations, at a switch of stance."""
+        plans, count = self.plans, len(rows)
+        by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
+        for i, row in enumerate(rows.tolist()):
+            random = self._random[row]
+            if plans.from_root and random.uniform() < plans.from_root:
+                by_root[i] = True
+                turns[i] = random.normal(0, plans.root_turn)
+                for which in (0, 1):
+                    ahead = random.uniform(*plans.root_length)
+                    sizes[i, which] = ahead, random.uniform(*plans.root_width)
+                continue
+            if self.goal_given:
+                root = found.root[row, :2]
+                if np.hypot(*(root - self.goal[row, :2])) < GOAL_REACHED:
+                    self.goal[row] = self.arena.goal(row, random, root, 'step')
+            elif plans.sharp and random.uniform() < plans.sharp:
+                turns[i] = random.uniform(-np.pi, np.pi)
+            elif plans.turn:
+                turns[i] = random.normal(0, plans.turn)
+            sizes[i, 1] = self._next_size(row)
+        stance = self.stance[rows]
+        on = ~by_root
+        if on.any():
+            going = rows[on]
+            if self.goal_given:
+                self._head_for_goals(going, self.landing[going, :, :2].mean(1))
+            self.heading[going] += turns[on]
+            self.landing[going, 0] = self.landing[going, 1]
+            self._lay(going, 1, stance[on], self.landing[going, 0, :2], sizes[on, 1])
+        if by_root.any():
+            going, foot = rows[by_root], stance[by_root]
+            off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            self.heading[going] = found.heading[going] + off
+            places = found.feet[going, foot, :2]
+            for which, feet in enumerate((1 - foot, foot)):
+                places = self._lay(going, which, feet, places, sizes[by_root, which])
 
     def _choose(self, rows: np.ndarray, found: SimpleNamespace) -> np.ndarray:
         """Returns the steps nearest to the plans of some simulations."""

@@ -1,0 +1,76 @@
+"""What a high-level step costs against the footstep controller's own stepping; ratios of one run.
+
+    python benchmarks/hierarchy.py [--rows N] [--seconds S] [ID ...]
+
+Prints, on one thread, per 1/30 s of one simulation and resets included:
+
+- the footstep environment driven by the shipped controller: its time, and the share of `Batch.step`;
+- each high-level environment under small random actions: its time as a multiple of that, and the share
+  of `Batch.step`, which counts more where boxes move or stand about.
+"""
+
+import argparse
+import time
+
+import numpy as np
+
+from trl_suite import catalogue
+from trl_suite.commands import bench
+from trl_suite.controllers import llc
+from trl_suite.vector import VectorEnvironment
+
+HALF_RANGE = 0.1  # of the random plans about action 0, straight on
+WARM = 2  # steps; the first ones are cold
+
+
+def measured(environments, act, frames, seconds):
+    """Steps for some seconds; returns s per frame of a simulation, and the share of the physics."""
+    observation = environments.reset()
+    for _ in range(WARM):
+        observation = environments.step(act(observation)).observation
+    physics, count = bench._counted(environments), 0
+    begin = time.perf_counter()
+    while time.perf_counter() - begin < seconds:
+        observation = environments.step(act(observation)).observation
+        count += frames(environments)
+    total = time.perf_counter() - begin
+    return total / count, physics.seconds / total
+
+
+def footsteps(rows, seconds):
+    """The footstep environment, driven by the shipped controller."""
+    controller = llc.load()
+    with_rows = VectorEnvironment(llc.DEFAULT, rows, 1, 0)
+    return measured(with_rows, lambda o: np.clip(controller(o), -1, 1), lambda e: rows, seconds)
+
+
+def high_level(id_, rows, seconds):
+    """A high-level environment under random actions."""
+    environments, random = VectorEnvironment(id_, rows, 1, 0), np.random.default_rng(0)
+    shape = (rows, len(environments.action_map))
+    return measured(
+        environments, lambda o: random.uniform(-HALF_RANGE, HALF_RANGE, shape),
+        lambda e: round(e.info['duration'].sum() * 30), seconds,
+    )  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    all_ = [id_ for id_ in catalogue.BY_ID if '_HLC_' in id_]
+    parser.add_argument('ids', nargs='*', metavar='ID', default=all_)
+    parser.add_argument('--rows', type=int, default=64)
+    parser.add_argument('--seconds', type=float, default=4.0, help='per measurement')
+    arguments = parser.parse_args()
+    base, share = footsteps(arguments.rows, arguments.seconds)
+    print(f'{llc.DEFAULT}: {1e6 * base:.0f} us, {share:.2f} of it in Batch.step')
+    for id_ in arguments.ids:
+        cost, share = high_level(id_, arguments.rows, arguments.seconds)
+        print(
+            f'{id_}: {cost / base:.2f} times as much, {share:.2f} of it in Batch.step', flush=True
+        )
+    again, _ = footsteps(arguments.rows, arguments.seconds)
+    print(f'the first measurement again: {again / base:.2f} times as much')
+
+
+if __name__ == '__main__':
+    main()
