@@ -1,6 +1,6 @@
 """What learning costs: samples per second of examples/ppo.py against random actions alone.
 
-    python benchmarks/training.py [--seconds S]
+    python benchmarks/training.py [--seconds S] [--threads N] [--torch-threads N]
 
 Both numbers come from one process with as many rows and threads, by turns; the ratio is what counts.
 """
@@ -29,9 +29,10 @@ IDS = (
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=20.0, help='per environment and kind')
-    parser.add_argument('--threads', type=int, default=2)
+    parser.add_argument('--threads', type=int, default=2, help='of the simulation')
+    parser.add_argument('--torch-threads', type=int, default=1, help='of the networks')
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
+    torch.set_num_threads(arguments.torch_threads)
     print('samples per second, learning / random actions: ratio')
     for id_ in IDS:
         trainer = ppo.Trainer(id_, 0, ppo.settings_for(id_), arguments.threads)

@@ -689,7 +689,7 @@ def train(
 ) -> list[dict[str, Any]]:
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve."""
     folder.mkdir(parents=True, exist_ok=True)
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    torch.set_num_threads(1)  # for networks so small a second one costs more than it brings
     trainer = Trainer(id_, seed, settings, threads)
     if (folder / 'checkpoint.pt').exists():
         trainer.restore(folder)

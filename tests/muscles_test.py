@@ -74,6 +74,19 @@ SAMPLES = {
     },
 }  # fmt: skip
 CASES = tuple((name, muscle) for name, table in SAMPLES.items() for muscle in table)
+SETS = (  # a muscle of each set that was optimised for a motion
+    (
+        'raptor', 'run', 'right_VAS', 0.136791, 0.211811, 5692.86906,
+        {'right_knee': (0.046858, -0.871852, -1.19406)},
+    ),
+    (
+        'biped2d', 'walk', 'left_SOL', 0.071519, 0.245616, 4115.28,
+        {'left_ankle': (-0.055327, -0.249141, 0.155117)},
+    ),
+    ('biped2d', 'run', 'right_GLU', 0.14532, 0.127926, 2157.21, {'right_hip': (-0.06043, None, 1.73281)}),
+    ('dog', 'bound', 'torso_bot', 0.04458, 0.046537, 3283.75, {'torso': (-0.077986, -0.05925, 0.268007)}),
+    ('dog', 'bound', 'back_toe1', 0.05, 0.15, 1000, {'toe': (0.037, 0.0708, -0.4492)}),
+)  # fmt: skip
 COUNTS = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
 # How many muscles span each joint; the last tail units are told apart by the joint they span.
 SPANS = {
@@ -136,7 +149,7 @@ class TableTest(parameterized.TestCase):
 
     @parameterized.parameters(*COUNTS.items())
     def test_counts(self, name, count):
-        units = muscles.MUSCLES[name]
+        units = muscles.MUSCLES[name]['plain']
         self.assertLen(units, count)
         self.assertLen({unit.name for unit in units}, count)
         spanned = {arm.joint for unit in units for arm in unit.arms}
@@ -145,26 +158,52 @@ class TableTest(parameterized.TestCase):
     @parameterized.parameters(*CASES)
     def test_row(self, name, muscle):
         l_opt, l_slack, f_max, pennation, arms = SAMPLES[name][muscle]
-        unit = next(unit for unit in muscles.MUSCLES[name] if unit.name == muscle)
+        unit = next(unit for unit in muscles.MUSCLES[name]['plain'] if unit.name == muscle)
         self.assertEqual(unit[1:5], (l_opt, l_slack, f_max, pennation))
         self.assertEqual({a.joint: (a.arm, a.peak, a.rest) for a in unit.arms}, arms)
 
     @parameterized.parameters('dog', 'raptor')
     def test_muscles_per_joint(self, name):
         for joint, count in SPANS[name].items():
-            arms = [arm for unit in muscles.MUSCLES[name] for arm in unit.arms]
+            arms = [arm for unit in muscles.MUSCLES[name]['plain'] for arm in unit.arms]
             self.assertLen([arm for arm in arms if arm.joint == joint], count, joint)
+
+    @parameterized.parameters(*SETS)
+    def test_optimised(self, name, chosen, muscle, l_opt, l_slack, f_max, arms):
+        sets = muscles.MUSCLES[name]
+        unit = next(unit for unit in sets[chosen] if unit.name == muscle)
+        np.testing.assert_allclose(unit[1:4], (l_opt, l_slack, f_max), rtol=1e-5)
+        self.assertEqual({a.joint: (a.arm, a.peak, a.rest) for a in unit.arms}, arms)
+        self.assertEqual([u.name for u in sets[chosen]], [u.name for u in sets['plain']])
+        for unit, plain in zip(sets[chosen], sets['plain'], strict=True):
+            self.assertEqual([a.joint for a in unit.arms], [a.joint for a in plain.arms])
+            self.assertEqual(unit.pennation, plain.pennation)
+
+    def test_sets_are_chosen_by_name(self):
+        raptor = characters.make('raptor')
+        chosen = actuation.character_muscles(raptor, 'run')
+        self.assertEqual(chosen, muscles.MUSCLES['raptor']['run'])
+        with self.assertRaisesRegex(ValueError, "muscle set of 'raptor'.*'rum'.*'run'"):
+            actuation.character_muscles(raptor, 'rum')
+        with self.assertRaisesRegex(ValueError, 'for muscle control, not for position'):
+            suite.make('PD_Raptor2D_LLC_Imitate_Flat-v0', task_kwargs={'muscle_set': 'run'})
+        id_ = 'MTU_Raptor2D_LLC_Imitate_Flat-v0'
+        for name, peak in (('plain', 6000), ('run', 5692.86906)):
+            with suite.make(id_, task_kwargs={'random': 1, 'muscle_set': name}) as environment:
+                model = environment.physics.model
+                row = model.name2id('raptor/right_VAS', 'actuator')
+                self.assertAlmostEqual(model.actuator_gainprm[row, 2], peak, delta=0.01)
 
     @parameterized.parameters(*COUNTS)
     def test_muscles_pull_every_joint_both_ways(self, name):
-        units = muscles.MUSCLES[name]
+        units = muscles.MUSCLES[name]['plain']
         for joint in {arm.joint for unit in units for arm in unit.arms}:
             signs = {np.sign(a.arm) for unit in units for a in unit.arms if a.joint == joint}
             self.assertEqual(signs, {-1, 1}, joint)
 
     def test_legs_are_mirrored(self):
         for name in ('biped2d', 'raptor'):
-            units = {unit.name: unit for unit in muscles.MUSCLES[name]}
+            units = {unit.name: unit for unit in muscles.MUSCLES[name]['plain']}
             for unit in units.values():
                 if unit.name.startswith('right_'):
                     other = units[unit.name.replace('right_', 'left_')]

@@ -366,8 +366,10 @@ def _angle_axis(character: Character) -> AngleAxisMap:
     )  # fmt: skip
 
 
-def _add_muscle(character: Character, timestep: float, **_: object) -> ActionMap:
-    units = character_muscles(character)
+def _add_muscle(
+    character: Character, timestep: float, muscle_set: str = muscle_tables.PLAIN, **_: object
+) -> ActionMap:
+    units = character_muscles(character, muscle_set)
     _prepare(character, timestep, character.torque_limits / MUSCLE_DAMPING_DIVISOR)
     joints = dict(zip(character.row.joints, character.joints, strict=True))
     for unit in units:
@@ -396,19 +398,23 @@ _MODELS: dict[str, Callable[..., ActionMap]] = {
 ACTUATIONS = tuple(_MODELS)
 
 
-def character_muscles(character: Character) -> tuple[Muscle, ...]:
-    """Returns a character's muscles.
+def character_muscles(
+    character: Character, muscle_set: str = muscle_tables.PLAIN
+) -> tuple[Muscle, ...]:
+    """Returns a character's muscles: one of the sets of `trl_suite.characters.muscles.MUSCLES`.
 
     Raises:
-      ValueError: the character has none.
+      ValueError: the character has none, or no such set.
     """
-    try:
-        return muscle_tables.MUSCLES[character.row.name]
-    except KeyError:
+    name = character.row.name
+    sets = muscle_tables.MUSCLES.get(name)
+    if sets is None:
         raise ValueError(
-            f'character {character.row.name!r} has no muscles; '
-            f'those who have: {", ".join(muscle_tables.MUSCLES)}'
-        ) from None
+            f'character {name!r} has no muscles; those who have: {", ".join(muscle_tables.MUSCLES)}'
+        )
+    if muscle_set not in sets:
+        raise ValueError(errors.unknown(f'muscle set of {name!r}', muscle_set, sets))
+    return sets[muscle_set]
 
 
 def add(character: Character, model: str, timestep: float, **options: object) -> ActionMap:
@@ -422,7 +428,8 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
         where prismatic); by default the working posture, and 1.5 rad, half the range of a prismatic
         joint, or for joints that hardly move twice their range. `rotations`: how actions describe
         the rotation of a ball joint: by a rotation vector, 'vector', or by an angle and an axis,
-        'angle_axis', in the manner and range of the original.
+        'angle_axis', in the manner and range of the original. For 'muscle', `muscle_set`: 'plain',
+        or the name of a motion that the muscles were optimised for.
 
     Returns:
       The map from actions to controls, in the order of the actuators.

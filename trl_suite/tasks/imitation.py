@@ -16,6 +16,7 @@ import numpy as np
 from trl_suite import actuation, errors, hill
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
+from trl_suite.characters.muscles import PLAIN, Muscle
 from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure import PlanarFigure
@@ -62,6 +63,7 @@ class Imitation(Task):
         substeps: int = SUBSTEPS,
         centre: str = 'clip',
         half_range: float | None = None,
+        muscle_set: str = PLAIN,
         start_phase: float | None = None,
         spawn: str = 'intended',
         blend: float = 0.0,
@@ -80,6 +82,7 @@ class Imitation(Task):
             character's working 'posture', or the 'original' map, whose [-1, 1] spans four times the
             joint range about its middle.
           half_range: for position control, rad per unit action (default 1.5).
+          muscle_set: for muscle control, 'plain' or the motion that the muscles were optimised for.
           start_phase: phase of every start, in [0, 1); drawn uniformly if None.
           spawn: where the flat start lies: 'intended' (1 m to both sides of the start) or
             'upstream' (where the original's construction puts it, depending on the start phase).
@@ -101,12 +104,17 @@ class Imitation(Task):
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
 
         options: dict[str, Any] = {}
+        muscles: tuple[Muscle, ...] = ()
         if actuation_model == 'position':
             options = position_range(character, clip, centre, half_range)
+        elif actuation_model == 'muscle':
+            options = {'muscle_set': muscle_set}
+            muscles = actuation.character_muscles(character, muscle_set)
+        if muscle_set != PLAIN and not muscles:
+            raise ValueError(f'muscle_set is for muscle control, not for {actuation_model} control')
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
-        muscles = actuation.character_muscles(character) if actuation_model == 'muscle' else ()
         self.blocks = consecutive({
             **self.figure.blocks,
             'strain': len(muscles),
