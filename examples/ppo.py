@@ -175,9 +175,6 @@ CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulat
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
     'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
 }  # fmt: skip
-# Whose episodes are cut early starts as often in every phase: where starts are hard and soon fail,
-# they would be few among the long episodes of the easy ones.
-SHORT = ((0.0, {'step_limit': 40}),)
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
@@ -212,7 +209,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         for name, n in (('Biped2D', 3e6), ('Dog2D', 1.2e6), ('Raptor2D', 1.2e6))
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
-    ('MTU_Raptor2D_*', {'samples': 1.6e6, 'lessons': SHORT}),
+    ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
     # In three dimensions the planar noise fells the body before it has learnt anything.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),

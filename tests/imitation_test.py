@@ -9,6 +9,7 @@ from trl_suite.arenas import PlanarTerrain
 from trl_suite.environment import Environment
 from trl_suite.tasks import rewards
 from trl_suite.tasks.imitation import Imitation
+from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
 DOG, RAPTOR = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Raptor2D_Slopes_Terrain-v0'
@@ -385,9 +386,25 @@ class ResetTest(parameterized.TestCase):
         for _ in range(3):
             self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-12)
             step = environment.reset()
-        for bad in (1.0, -0.1, np.nan):
+        bad_pairs = ((), (0.2, 0.4), ((0.4, 0.2),), ((0.2, 0.5), (0.4, 0.6)), ((0.5, 1.1),))
+        for bad in (1.0, -0.1, np.nan, 'early', *bad_pairs):
             with self.assertRaisesRegex(ValueError, 'start_phase'):
                 suite.make(BIPED, {'start_phase': bad})
+
+    def test_start_phases_between_numbers(self):
+        pairs = ((0.1, 0.2), (0.5, 0.8))
+        rows = VectorEnvironment(BIPED, 400, 1, 5, task_kwargs={'start_phase': pairs})
+        rows.reset()
+        phases = rows.task.phase
+        first, second = ((phases >= low) & (phases < high) for low, high in pairs)
+        self.assertTrue((first | second).all())
+        self.assertAlmostEqual(first.mean(), 0.25, delta=0.07)  # 3 standard deviations
+        self.assertAlmostEqual(phases[second].mean(), 0.65, delta=0.02)
+
+    def test_raptor_with_muscles_starts_in_the_air(self):
+        rows = VectorEnvironment('MTU_Raptor2D_LLC_Imitate_Flat-v0', 64, 1, 5)
+        rows.reset()
+        self.assertTrue((rows.task.phase % 0.5 >= 0.25).all())
 
     def test_terrain_is_drawn_anew(self):
         environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': 3})

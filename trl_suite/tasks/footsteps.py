@@ -79,7 +79,7 @@ class Footsteps(Tracking):
         substeps: int = SUBSTEPS,
         centre: str = 'clip',
         half_range: float | None = None,
-        start_phase: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
         blend: float = 0.0,
     ) -> None:
         """Composes the task.

@@ -66,7 +66,7 @@ class PlanarFootsteps(Imitation):
         substeps: int = SUBSTEPS,
         centre: str = 'clip',
         half_range: float | None = None,
-        start_phase: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
         spawn: str = 'intended',
         blend: float = 0.0,
     ) -> None:

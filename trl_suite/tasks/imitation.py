@@ -21,7 +21,13 @@ from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.reference import Reference
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive, drawn_seed
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Task,
+    consecutive,
+    drawn_seed,
+    start_phases,
+)
 from trl_suite.terrain import Strip
 from trl_suite.world import World
 
@@ -64,7 +70,7 @@ class Imitation(Task):
         centre: str = 'clip',
         half_range: float | None = None,
         muscle_set: str = PLAIN,
-        start_phase: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
         spawn: str = 'intended',
         blend: float = 0.0,
     ) -> None:
@@ -83,7 +89,8 @@ class Imitation(Task):
             joint range about its middle.
           half_range: for position control, rad per unit action (default 1.5).
           muscle_set: for muscle control, 'plain' or the motion that the muscles were optimised for.
-          start_phase: phase of every start, in [0, 1); drawn uniformly if None.
+          start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
+            drawn uniformly if None.
           spawn: where the flat start lies: 'intended' (1 m to both sides of the start) or
             'upstream' (where the original's construction puts it, depending on the start phase).
           blend: which mixture of the terrain's parameter sets to draw from.
@@ -91,13 +98,10 @@ class Imitation(Task):
         Raises:
           ValueError: options out of range, or a clip that does not fit the character.
         """
-        self._check(
-            character, clip, actuation_model, centre, half_range, start_phase, substeps,
-            terrain_samples,
-        )  # fmt: skip
+        self._check(character, clip, actuation_model, centre, half_range, substeps, terrain_samples)
         self.character, self.arena, self.clip = character, arena, clip
         self.actuation_model = actuation_model
-        self._start_phase, self._spawn, self._blend = start_phase, spawn, blend
+        self._start_phase, self._spawn, self._blend = start_phases(start_phase), spawn, blend
         self.figure = PlanarFigure(
             character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_samples, 'contact' in self.EXTRAS
         )
@@ -128,7 +132,7 @@ class Imitation(Task):
     @staticmethod
     def _check(
         character: Character, clip: Clip, model: str, centre: str, half_range: float | None,
-        start_phase: float | None, substeps: int, terrain_samples: int,
+        substeps: int, terrain_samples: int,
     ) -> None:  # fmt: skip
         if tuple(clip.joints) != tuple(character.row.joints) or clip.root != 'planar':
             raise ValueError(
@@ -144,8 +148,6 @@ class Imitation(Task):
             raise ValueError(f'centre and half_range shape position control, not {model} control')
         if half_range is not None and not 0 < half_range < np.inf:
             raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-        if start_phase is not None and not 0 <= start_phase < 1:
-            raise ValueError(f'start_phase is {start_phase}; expected a number in [0, 1)')
         if int(terrain_samples) != terrain_samples or terrain_samples < 0 or terrain_samples == 1:
             raise ValueError(f'terrain_samples is {terrain_samples}; expected 0, or at least 2')
         if int(substeps) != substeps or substeps < 4:
@@ -224,7 +226,7 @@ class Imitation(Task):
         for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
-            phases[i] = drawn if self._start_phase is None else self._start_phase
+            phases[i] = self._start_phase(drawn)
             if self._spawn == 'upstream':
                 # Where the original's segments meet: it builds them before it moves the root to 0.
                 centre = self.clip.pose(phases[i : i + 1] * self.reference.period)[0, 0] - 0.5

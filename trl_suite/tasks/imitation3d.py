@@ -62,7 +62,7 @@ class SpatialImitation(Tracking):
         substeps: int = SUBSTEPS,
         centre: str = 'clip',
         half_range: float | None = None,
-        start_phase: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
         blend: float = 0.0,
     ) -> None:
         """Composes the task.
@@ -81,7 +81,8 @@ class SpatialImitation(Tracking):
             an axis for every ball joint, in the original's range.
           half_range: for position control, rad per unit action (1 about the clip, 1.5 about the
             posture).
-          start_phase: phase of every start, in [0, 1); drawn uniformly if None.
+          start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
+            drawn uniformly if None.
           blend: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
@@ -127,7 +128,7 @@ class SpatialImitation(Tracking):
         for row, random_state in zip(rows.tolist(), random_states, strict=True):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
-            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
+            self._start_cycles[row] = self._start_phase(drawn)
             ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
             self.arena.begin_episode(row, ground)
         times = self._start_cycles[rows] * self.period

@@ -57,7 +57,7 @@ class Journey(SpatialImitation):
         substeps: int = SUBSTEPS,
         centre: str = 'clip',
         half_range: float | None = None,
-        start_phase: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
         blend: float = 0.0,
     ) -> None:
         """Composes the task.
@@ -377,7 +377,7 @@ def journey(
     substeps: int = SUBSTEPS,
     centre: str = 'clip',
     half_range: float | None = None,
-    start_phase: float | None = None,
+    start_phase: float | Sequence[Sequence[float]] | None = None,
     blend: float = 0.0,
 ) -> Journey | HiddenSteps:
     """Composes what one of the rewards is for.

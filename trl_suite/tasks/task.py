@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 import collections
-from collections.abc import Sequence
+import numbers
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -178,6 +179,41 @@ def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarra
     """Draws a way on the ground in any direction, of any length from low to high, (2,) m."""
     angle = random.uniform(-np.pi, np.pi)
     return random.uniform(low, high) * np.array([np.cos(angle), np.sin(angle)])
+
+
+def start_phases(
+    option: float | Sequence[Sequence[float]] | None,
+) -> Callable[[float], float]:
+    """Returns what turns a uniform draw from [0, 1) into the phase of a start.
+
+    Args:
+      option: None: the phase is the draw. A number in [0, 1): it is always this. Pairs of numbers,
+        ascending in [0, 1]: it lies between the numbers of a pair, as likely anywhere there.
+
+    Raises:
+      ValueError: anything else.
+    """
+    if option is None:
+        return lambda drawn: drawn
+    if np.ndim(option) == 0:
+        phase = float(option) if isinstance(option, numbers.Real) else -1.0
+        if not 0 <= phase < 1:
+            raise ValueError(f'start_phase is {option}; expected a number in [0, 1), or pairs')
+        return lambda drawn: phase
+    pairs = np.asarray(option, float)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not (
+        (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()
+        and pairs[0, 0] >= 0 and pairs[-1, 1] <= 1
+    ):  # fmt: skip
+        raise ValueError(f'start_phase is {option}; expected ascending pairs of numbers in [0, 1]')
+    ends = np.cumsum(np.diff(pairs, axis=1))
+
+    def phase_of(drawn: float) -> float:
+        way = drawn * ends[-1]
+        i = min(int(np.searchsorted(ends, way, side='right')), len(ends) - 1)
+        return float(pairs[i, 1] - (ends[i] - way))
+
+    return phase_of
 
 
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:

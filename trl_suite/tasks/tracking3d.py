@@ -18,7 +18,13 @@ from trl_suite.symmetry import Mirror, blocks, exchanged
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.reference3d import SpatialReference, mean_targets
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive, drawn_seed
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Task,
+    consecutive,
+    drawn_seed,
+    start_phases,
+)
 from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
@@ -57,7 +63,7 @@ class Tracking(Task):
         substeps: int,
         centre: str,
         half_range: float | None,
-        start_phase: float | None,
+        start_phase: float | Sequence[Sequence[float]] | None,
         terrain_map: bool,
         mirrored: bool,
         blend: float,
@@ -86,8 +92,6 @@ class Tracking(Task):
             raise ValueError("centre 'original' has ranges of its own: give no half_range")
         if half_range is not None and not 0 < half_range < np.inf:
             raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-        if start_phase is not None and not 0 <= start_phase < 1:
-            raise ValueError(f'start_phase is {start_phase}; expected a number in [0, 1)')
         if int(substeps) != substeps or substeps < 6:
             raise ValueError(
                 f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
@@ -101,7 +105,7 @@ class Tracking(Task):
             raise ValueError('mirrored observations need the phase, which tells left from right')
         self.character, self.arena, self.motion = character, arena, motion
         self.actuation_model, self.terrain_map = actuation_model, terrain_map
-        self._start_phase, self._blend = start_phase, blend
+        self._start_phase, self._blend = start_phases(start_phase), blend
         self.figure = SpatialFigure(character, arena, terrain_map)
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
         self.action_map = actuation.add(
@@ -231,7 +235,7 @@ class Tracking(Task):
         spawns = np.zeros((len(rows), 3))
         for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
             drawn = random_state.random_sample()
-            self._start_cycles[row] = drawn if self._start_phase is None else self._start_phase
+            self._start_cycles[row] = self._start_phase(drawn)
             ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
             self._random[row] = np.random.default_rng(drawn_seed(random_state))
             spawns[i] = ground.spawn(self._random[row])
