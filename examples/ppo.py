@@ -21,6 +21,7 @@ import json
 import os
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ import torch
 import tqdm
 from torch import nn
 
-from trl_suite import characters, evaluation, policies, suite
+from trl_suite import characters, evaluation, policies, suite, terrain
 from trl_suite.catalogue import Row
 from trl_suite.tasks import rewards
 from trl_suite.terrain import surroundings
@@ -70,8 +71,8 @@ class Settings:
     mirrored: bool = False
     # What the network sees of a map of the terrain: how far ahead and to each side, m; None: all.
     view: tuple[float, float] | None = None
-    # Lessons: from which share of the samples on, with which options of the task. Evaluations have
-    # those of the environment.
+    # Lessons: from which share of the samples on, with which options of the task; and on which
+    # `terrain`, if another. Evaluations have those of the environment.
     lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
     # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
     # weights, its scales and its noise. What it did not observe begins without influence. Or with
@@ -82,6 +83,22 @@ class Settings:
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
+
+
+def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
+    """Lessons of equal length on a terrain that comes ever closer to a preset, and at last on it.
+
+    Args:
+      preset: of the terrain.
+      low: what is different at height 0.
+      heights: from 0 to less than 1, the preset.
+    """
+    preset_ = terrain.load(preset)
+    full = dict(preset_.parameter_sets[0])
+    ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
+    lessons: list[dict[str, Any]] = [{'terrain': ground, 'blend': height} for height in heights]
+    lessons.append({})
+    return tuple((i / len(lessons), lesson) for i, lesson in enumerate(lessons))
 
 
 # What differs from the defaults, by the pattern of an id; a later row wins.
@@ -175,6 +192,8 @@ CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulat
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
     'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
 }  # fmt: skip
+# A biped that walks over walls of 0.25 m falls at three of four that are up to 0.4 m high.
+LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
@@ -209,6 +228,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         for name, n in (('Biped2D', 3e6), ('Dog2D', 1.2e6), ('Raptor2D', 1.2e6))
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
+    ('PD_Biped2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
     # In three dimensions the planar noise fells the body before it has learnt anything.
@@ -377,10 +397,13 @@ class Trainer:
         if self.current > 1:
             sequence = np.random.SeedSequence((self.seed, self.current))
             seed = sequence.generate_state(s.num_envs).tolist()
+        options = dict(s.lessons[self.current - 1][1]) if self.current else {}
+        given = self.environment
+        row = suite.find(given) if isinstance(given, str) else given
+        row = dataclasses.replace(row, terrain=options.pop('terrain', row.terrain))
         self.environments = VectorEnvironment(
-            self.environment, s.num_envs, self.threads, seed, autoreset='disabled',
-            task_kwargs=s.lessons[self.current - 1][1] if self.current else None,
-        )  # fmt: skip
+            row, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
+        )
         self.observation = self.environments.reset()
         self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
         self.shares = {name: np.ones(s.num_envs) for name in s.least_share}

@@ -175,6 +175,20 @@ class RunTest(parameterized.TestCase):
             trainer.curve = [{'fraction': fraction} for fraction in fractions]
             self.assertEqual(trainer.has_learnt(), expected)
 
+    def test_lessons_on_ever_higher_walls(self):
+        lessons = ppo.rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
+        settings = ppo.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        trainer = ppo.Trainer('PD_Biped2D_Mixed_Terrain-v0', 0, settings, 1)
+        heights = []
+        for samples in (0, 100, 200):
+            trainer.samples = samples
+            trainer.begin_lesson()
+            strips = (trainer.environments.task.arena.strips[i] for i in range(TINY['num_envs']))
+            ranges = {tuple(s.parameters[f'WallH{end}'] for end in ('Min', 'Max')) for s in strips}
+            heights += ranges
+        np.testing.assert_allclose(heights, [(0.1, 0.2), (0.175, 0.3), (0.25, 0.4)])
+        self.assertEqual(trainer.environments.row.terrain, 'mixed_humanoid')
+
     def test_near_parts_of_maps(self):
         """Both maps of velocities are cut as that of heights."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
