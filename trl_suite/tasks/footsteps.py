@@ -353,7 +353,11 @@ class Footsteps(Tracking):
     def _gone(self) -> np.ndarray | bool:
         if self.miss is None:
             return False
-        return self.landed & (self.landing_error > self.miss)
+        missed = self.landed & (self.landing_error > self.miss)
+        if self.pushes and self.pushes.grace:
+            over = self._push_end + self.pushes.grace / self.control_timestep
+            missed &= (self._push_end == 0) | (self._count > over)
+        return missed
 
     def _compare(self, found: SimpleNamespace) -> None:
         n, kinematics = len(found.features), self.figure.kinematics
