@@ -3,9 +3,9 @@
     python examples/compare_gaits.py                          # all of them, from trained/
     python examples/compare_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --policy policy.npz
 
-Prints how far either gets before it falls, and writes what it found of the policies that ship into
-`trained/default_gaits.json`: ID -> evaluation of the default gait, whose episodes are those of the
-evaluation in `trained/ID.json`.
+Prints how far either gets before it falls: of a policy that ships as `trained/ID.json` has it, in the
+same episodes. Writes what it found of the default gaits of these into `trained/default_gaits.json`:
+ID -> evaluation.
 """
 
 from __future__ import annotations
@@ -36,14 +36,19 @@ def main() -> None:
     stored = json.loads(path.read_text()) if path.exists() else {}
     episodes = train_all.EPISODES, train_all.SEED, arguments.threads
     for id_ in arguments.ids or train_all.GAITS:
-        file = arguments.policy or path.with_name(f'{id_}.npz')
-        if not file.exists():
+        if arguments.policy is None and not path.with_name(f'{id_}.json').exists():
             print(f'{id_}: no policy')
             continue
         print(f'{id_}: median distance (quartiles) of {train_all.EPISODES} episodes', flush=True)
         default = evaluation.evaluate(id_, evaluation.zero, *episodes, factory=True)
         print(line('default gait', default), flush=True)
-        own = evaluation.evaluate(id_, policies.load(file), *episodes)
+        if arguments.policy is None:
+            entry = json.loads(path.with_name(f'{id_}.json').read_text())
+            own = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])[
+                'evaluation'
+            ]
+        else:
+            own = evaluation.evaluate(id_, policies.load(arguments.policy), *episodes)
         ratio = np.median(own['distances']) / np.median(default['distances'])
         print(f'{line("policy", own)}; {ratio:.1f} times', flush=True)
         stored[id_] = default

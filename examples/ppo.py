@@ -109,7 +109,8 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
 # Then it does not, and who is pushed may leave the plan to keep standing; then it must come back, from
 # so far away that the reward has to reach there, and be accurate again. At last a foot that lands far
-# away ends the episode but for two seconds after a push: without that it drifts off the plan.
+# away ends the episode but for two seconds after a push or a sharp turn: without that it drifts off
+# the plan.
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
@@ -151,11 +152,9 @@ LESSONS = (
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
     (18 / 21, {
-        'footstep_scale': 8.0, 'heading_scale': 4.0, 'miss': 0.4,
+        'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
-        'pushes': {
-            'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5), 'grace': 2.0,
-        },
+        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.

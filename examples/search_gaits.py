@@ -52,9 +52,13 @@ class Settings:
     evaluation_episodes: int = 32
 
 
+# A cycle of theirs is one step; two steps ahead they are still up when they cannot be saved any more.
+OVERRIDES = {'Biped2D': {'cycles': 4, 'samples': 2e3}, 'Hopper2D': {'cycles': 4, 'samples': 2e3}}
+
+
 def settings_for(id_: str, **changes: Any) -> Settings:
-    """The settings of an environment: of all the same."""
-    return Settings(**changes)
+    """The settings of an environment."""
+    return Settings(**{**OVERRIDES.get(id_.split('_')[1], {}), **changes})
 
 
 class Search:

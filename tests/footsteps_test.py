@@ -711,14 +711,23 @@ class PushTest(parameterized.TestCase):
         np.testing.assert_array_equal(pushed, ([False] * 15 + [True] * 6) * 2 + [False] * 15
                                       + [True] * 3)  # fmt: skip
 
-    @parameterized.parameters((0.05, True), (0.1, False))
+    @parameterized.parameters((0.03, True), (0.1, False))
     def test_who_was_pushed_may_miss(self, grace, ends):
+        # A push is over after 4/30 s, when grace begins; the foot lands after 6/30 s.
         pushes = {'force': (0, 0), 'duration': (1 / 30,) * 2, 'interval': (0.1, 0.1)}
-        pushes['grace'] = grace  # s from 4/30 s on, when the push is over
-        environment, _ = started(start_phase=0.3, miss=0.01, pushes=pushes)
+        environment, _ = started(start_phase=0.3, miss=0.01, grace=grace, pushes=pushes)
         for i in range(1, 7):
-            step = environment.step(np.zeros(17))
-            self.assertEqual(step.last(), ends and i == 6)  # when the foot lands, after 6/30 s
+            self.assertEqual(environment.step(np.zeros(17)).last(), ends and i == 6)
+
+    @parameterized.parameters((0.0, True), (0.6, False))
+    def test_who_is_to_turn_sharply_may_miss(self, grace, ends):
+        # The plan turns when a foot lands, after 6/30 s; the next one lands 15/30 s later.
+        environment, _ = started(start_phase=0.3, miss=1.0, grace=grace, plans={'sharp': 1.0})
+        for _ in range(6):
+            held(environment)
+        environment.task.miss = 1e-3
+        ended = [held(environment).last() for _ in range(15)]
+        self.assertEqual(ended, [False] * 14 + [ends])
 
 
 class SaveTest(parameterized.TestCase):
@@ -810,7 +819,7 @@ class HelperTest(parameterized.TestCase):
         ({'plans': {'lenght': (0.5, 0.5)}}, "unknown option of plans 'lenght'; did you mean 'length'"),
         ({'plans': 0.5}, 'plans is 0.5'),
         ({'pushes': {'power': 1}}, "unknown option of pushes 'power'"),
-        ({'pushes': {'force': (3, 2)}}, 'force is'), ({'pushes': {'grace': -1}}, 'grace is -1'),
+        ({'pushes': {'force': (3, 2)}}, 'force is'), ({'grace': -1}, 'grace is -1'),
         ({'miss': 0}, 'miss is 0'), ({'miss': np.nan}, 'miss is nan'),
         ({'footstep_scale': -1}, 'footstep_scale is -1'),
         ({'footstep_scale': ()}, 'footstep_scale is '),

@@ -25,7 +25,7 @@ from trl_suite.tasks.plans import (
 )
 from trl_suite.tasks.reference3d import SpatialReference
 from trl_suite.tasks.task import Marker
-from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
+from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
 from trl_suite.world import World
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
@@ -72,6 +72,7 @@ class Footsteps(Tracking):
         goal: bool = False,
         pushes: Pushes | Mapping[str, Any] | None = None,
         miss: float | None = None,
+        grace: float = 0.0,
         footstep_scale: float | Sequence[float] = 1.0,
         heading_scale: float = 1.0,
         terrain_map: bool = False,
@@ -94,6 +95,7 @@ class Footsteps(Tracking):
           goal: plans head for a goal on the terrain instead, one after the other.
           miss: an episode fails where a foot lands farther than this from its place, m. The original
             meant to fail at 1 m and does not.
+          grace: s after a push or a sharp turn in which no foot misses its place.
           footstep_scale: times the squared distance between swing foot and landing place in the
             reward; more than 1 teaches accuracy sooner. Of several, the mean of their rewards counts:
             a small one reaches far, a large one is accurate.
@@ -108,6 +110,8 @@ class Footsteps(Tracking):
             raise ValueError(f'character {character.row.name!r} has no two feet to place')
         if miss is not None and not 0 < miss < np.inf:
             raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
+        if not 0 <= grace < np.inf:
+            raise ValueError(f'grace is {grace}; expected seconds, 0 or more')
         for name, given in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
             scales = np.atleast_1d(given)
             if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
@@ -119,7 +123,7 @@ class Footsteps(Tracking):
         if self.pushes:
             self.fields = (*self.fields, 'xfrc_applied')
         self.steps, self.period = steps, 2 * steps.duration
-        self.goal_given, self.miss = goal, miss
+        self.goal_given, self.miss, self._grace = goal, miss, round(grace / CONTROL_TIMESTEP)
         mean = np.mean(self.plans.length)
         # The straight step of about the planned length, from which episodes start.
         straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
@@ -159,6 +163,8 @@ class Footsteps(Tracking):
         self._push = np.zeros((n, 3))  # N
         # Control steps of an episode at which the push ends and the next one begins.
         self._push_end, self._push_begin = np.zeros((2, n), int)
+        self._missed: np.ndarray | bool = False  # who ends so
+        self._excused = np.zeros(n, int)  # control step of an episode until which no foot misses
 
     @property
     def step_phase(self) -> np.ndarray:
@@ -190,7 +196,7 @@ class Footsteps(Tracking):
         found = self.figure.measure()
         self.landing_error[rows] = self.heading_error[rows] = 0.0
         self.landed[rows] = False
-        self._push_end[rows] = 0
+        self._push_end[rows] = self._excused[rows] = 0
         aside, sizes = np.zeros(len(rows)), np.zeros((len(rows), 2, 2))
         for i, row in enumerate(rows.tolist()):
             if self.pushes:
@@ -272,6 +278,7 @@ class Footsteps(Tracking):
             self._push[row] = force * np.cos(angle), force * np.sin(angle), 0.0
             self._push_end[row] = self._count[row] + self._steps_within(row, pushes.duration)
             self._push_begin[row] = self._push_end[row] + self._steps_within(row, pushes.interval)
+            self._excused[row] = self._push_end[row] + self._grace
         pushing = (self._count < self._push_end)[:, None]
         self.world.xfrc_applied[:, self._torso, :3] = self._push * pushing
 
@@ -279,6 +286,7 @@ class Footsteps(Tracking):
         stance = (self.phase >= 0.5).astype(int)
         switched = (stance != self.stance) & ~self.diverged  # what breaks down lands nowhere
         self.landed = switched
+        self._missed = False
         if not switched.any():
             return
         rows = np.flatnonzero(switched)
@@ -286,6 +294,9 @@ class Footsteps(Tracking):
         gap = found.feet[rows, stance[rows], :2] - self.landing[rows, 0, :2]
         self.landing_error[rows] = np.hypot(gap[:, 0], gap[:, 1])
         self.heading_error[rows] = np.abs(rewards.wrap(self.heading[rows] - found.heading[rows]))
+        if self.miss is not None:  # by the plan that was to be met
+            self._missed = switched & (self.landing_error > self.miss)
+            self._missed &= self._count > self._excused
         self._replan(rows, found)
         self._put_reference(rows, found, self._choose(rows, found))
 
@@ -308,6 +319,7 @@ class Footsteps(Tracking):
                     self.goal[row] = self.arena.goal(row, random, root, 'step')
             elif plans.sharp and random.uniform() < plans.sharp:
                 turns[i] = random.uniform(-np.pi, np.pi)
+                self._excused[row] = self._count[row] + self._grace
             elif plans.turn:
                 turns[i] = random.normal(0, plans.turn)
             sizes[i, 1] = self._next_size(row)
@@ -351,13 +363,7 @@ class Footsteps(Tracking):
     # Reward and observation.
 
     def _gone(self) -> np.ndarray | bool:
-        if self.miss is None:
-            return False
-        missed = self.landed & (self.landing_error > self.miss)
-        if self.pushes and self.pushes.grace:
-            over = self._push_end + self.pushes.grace / self.control_timestep
-            missed &= (self._push_end == 0) | (self._count > over)
-        return missed
+        return self._missed
 
     def _compare(self, found: SimpleNamespace) -> None:
         n, kinematics = len(found.features), self.figure.kinematics
@@ -467,5 +473,5 @@ class Footsteps(Tracking):
 
     _KEPT: tuple[str, ...] = (
         'stance', 'landing', 'heading', '_length', '_width', '_track', '_turned', '_shift', 'goal',
-        'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin',
+        'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin', '_excused',
     )  # fmt: skip

@@ -79,19 +79,15 @@ class Pushes:
       force: N: least and most.
       duration: s of each, in whole control steps.
       interval: s from the end of one, or the start of the episode, to the next.
-      grace: s after the end of one in which no foot misses its place.
     """
 
     force: tuple[float, float] = (50.0, 150.0)
     duration: tuple[float, float] = (0.2, 0.4)
     interval: tuple[float, float] = (1.0, 2.0)
-    grace: float = 0.0
 
     def __post_init__(self) -> None:
         _check_ranges(self, ('force',), 'N')
         _check_ranges(self, ('duration', 'interval'), 's')
-        if not 0 <= self.grace < np.inf:
-            raise ValueError(f'grace is {self.grace}; expected seconds, 0 or more')
 
 
 def _check_ranges(instance: Any, names: Sequence[str], unit: str) -> None:
