@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import fnmatch
 import json
 import pathlib
 import time
@@ -53,12 +54,20 @@ class Settings:
 
 
 # A cycle of theirs is one step; two steps ahead they are still up when they cannot be saved any more.
-OVERRIDES = {'Biped2D': {'cycles': 4, 'samples': 2e3}, 'Hopper2D': {'cycles': 4, 'samples': 2e3}}
+OVERRIDES: dict[str, dict[str, Any]] = {
+    'FSM_Biped2D_*': {'cycles': 4, 'samples': 2e3},
+    'FSM_Hopper2D_*': {'cycles': 4, 'samples': 2e3},
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {'samples': 3e3},
+}
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """The settings of an environment."""
-    return Settings(**{**OVERRIDES.get(id_.split('_')[1], {}), **changes})
+    values: dict[str, Any] = {}
+    for pattern, row in OVERRIDES.items():
+        if fnmatch.fnmatchcase(id_, pattern):
+            values |= row
+    return Settings(**{**values, **changes})
 
 
 class Search:
