@@ -156,6 +156,11 @@ LESSONS = (
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
+    (19.3 / 21, {
+        'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
+        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
+        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
+    }),
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
