@@ -117,49 +117,54 @@ LESSONS = (
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.9 / 21, {
+    (0.9 / 23, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (2.1 / 21, {
+    (2.1 / 23, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (6 / 21, {
+    (6 / 23, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
-    (9 / 21, {
+    (9 / 23, {
         'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (10 / 21, {
+    (10 / 23, {
         'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (12 / 21, {
+    (12 / 23, {
         'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (15 / 21, {
+    (15 / 23, {
         'footstep_scale': 8.0, 'heading_scale': 3.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (18 / 21, {
+    (18 / 23, {
         'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
-    (19.3 / 21, {
+    (19.3 / 23, {
         'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
+    }),
+    (21 / 23, {
+        'footstep_scale': 15.0, 'heading_scale': 3.0, 'miss': 0.5, 'grace': 2.5,
+        'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
+        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
@@ -178,7 +183,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 21e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 23e6, 'gamma': 0.97, 'lessons': LESSONS}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
