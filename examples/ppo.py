@@ -96,9 +96,12 @@ def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tupl
     preset_ = terrain.load(preset)
     full = dict(preset_.parameter_sets[0])
     ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
-    lessons: list[dict[str, Any]] = [{'terrain': ground, 'blend': height} for height in heights]
-    lessons.append({})
-    return tuple((i / len(lessons), lesson) for i, lesson in enumerate(lessons))
+    return evenly([*({'terrain': ground, 'blend': height} for height in heights), {}])
+
+
+def evenly(lessons: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
+    """Lessons of equal length, one after the other."""
+    return tuple((i / len(lessons), options) for i, options in enumerate(lessons))
 
 
 # What differs from the defaults, by the pattern of an id; a later row wins.
@@ -184,6 +187,7 @@ RUN_LESSONS = (
     }),
 )  # fmt: skip
 FOOTSTEPS = {'samples': 23e6, 'gamma': 0.97, 'lessons': LESSONS}
+SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
@@ -258,8 +262,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # Its observation is mirrored.
-    ('PD_Biped3D_LLC_Symetric_Step-v0', {'samples': 2e6, 'mirrored': False}),
-    ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, 'samples': 2e6, 'lessons': LESSONS[:2]}),
+    ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
+    ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_HLC_*', PLANS),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
