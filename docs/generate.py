@@ -421,7 +421,8 @@ def speed_page() -> str:
         '## Other libraries',
         'In the same run, as a share of the `mj_step` rate of their own models; none of them has terrain.',
         table(('', 'share'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
-        'All figures: [vector_environment.json](../benchmarks/vector_environment.json).',
+        'All figures: [vector_environment.json](../benchmarks/vector_environment.json). What learning '
+        'costs, and high-level steps, `benchmarks/training.py` and `benchmarks/hierarchy.py` print.',
     )  # fmt: skip
 
 
