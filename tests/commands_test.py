@@ -141,12 +141,12 @@ class GalleryTest(CommandTest):
         self.assertLen([item for item in items if item.source], 2 * shipped)
 
     def test_pictures(self):
-        out = self.output('gallery', '--only', 'Hopper2D_Terrain_Gaps-', '--output', 'g')
+        out = self.output('gallery', '--only', 'Hopper2D_Terrain_Walls-', '--output', 'g')
         self.assertEqual(out, '1 pictures written to g, 0 failed\n')
         for only in ('characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}', 'families/plaid'):
             self.output('gallery', '--only', only, '--output', 'g')
         files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
-        strip = 'FSM_Hopper2D_Terrain_Gaps-v0.jpg'
+        strip = 'FSM_Hopper2D_Terrain_Walls-v0.jpg'
         self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png', 'plaid.jpg'])
         for path in files.values():
             self.assertBetween(path.stat().st_size, 1000, gallery.LARGEST)
