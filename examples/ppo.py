@@ -28,6 +28,7 @@ import numpy as np
 import torch
 import tqdm
 from torch import nn
+from torch.optim import swa_utils
 
 from trl_suite import characters, evaluation, policies, suite, terrain
 from trl_suite.catalogue import Row
@@ -62,6 +63,9 @@ class Settings:
     initial_std: float = 0.2  # of actions in [-1, 1]
     bound_cost: float = 0.1  # times the squared excess of a mean action over 1
     gradient_norm: float = 0.5
+    # What is evaluated and ships has the mean of the weights over about so many samples, the later
+    # ones counting more (Polyak averaging); 0: the weights of now.
+    averaged: float = 0.0
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
     # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
     # local optimum. Evaluations are without it.
@@ -120,53 +124,58 @@ LESSONS = (
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.9 / 23, {
+    (0.9 / 25, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (2.1 / 23, {
+    (2.1 / 25, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (6 / 23, {
+    (6 / 25, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
-    (9 / 23, {
+    (9 / 25, {
         'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (10 / 23, {
+    (10 / 25, {
         'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (12 / 23, {
+    (12 / 25, {
         'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (15 / 23, {
+    (15 / 25, {
         'footstep_scale': 8.0, 'heading_scale': 3.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (18 / 23, {
+    (18 / 25, {
         'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
-    (19.3 / 23, {
+    (19.3 / 25, {
         'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
     }),
-    (21 / 23, {
+    (21 / 25, {
         'footstep_scale': 15.0, 'heading_scale': 3.0, 'miss': 0.5, 'grace': 2.5,
         'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
+        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
+    }),
+    (23 / 25, {
+        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
+        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
 )  # fmt: skip
@@ -186,7 +195,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 23e6, 'gamma': 0.97, 'lessons': LESSONS}
+FOOTSTEPS = {'samples': 25e6, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
@@ -398,6 +407,10 @@ class Trainer:
         if s.start and s.start not in evaluation.BASELINES:
             self.begin_with(policies.reference(s.start))
             self.begun = True
+        decay = 1 - s.num_envs * s.horizon / s.averaged if s.averaged else 0.0
+        self.average = swa_utils.AveragedModel(
+            self.policy, multi_avg_fn=swa_utils.get_ema_multi_avg_fn(decay)
+        )
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
@@ -612,7 +625,8 @@ class Trainer:
 
     def exported(self) -> policies.Policy:
         """The policy of now, without PyTorch."""
-        layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
+        network_ = self.average.module if self.settings.averaged else self.policy
+        layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
@@ -672,7 +686,7 @@ class Trainer:
         state = {name: getattr(self, name) for name in _STATE}
         state |= {
             'settings': self.settings,
-            'networks': [part.state_dict() for part in (self.policy, self.value)],
+            'networks': [part.state_dict() for part in (self.policy, self.value, self.average)],
             'log_std': self.log_std.detach().clone(),
             'optimizer': self.optimizer.state_dict(),
             'scales': (self.scales.count, self.scales.mean, self.scales.square),
@@ -700,7 +714,9 @@ class Trainer:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
             setattr(self, name, state[name])
-        for network_, saved in zip((self.policy, self.value), state['networks'], strict=True):
+        for network_, saved in zip(
+            (self.policy, self.value, self.average), state['networks'], strict=True
+        ):
             network_.load_state_dict(saved)
         self.log_std.data.copy_(state['log_std'])
         self.optimizer.load_state_dict(state['optimizer'])
@@ -750,6 +766,7 @@ def train(
             batch = trainer.collect()
             middle = time.perf_counter()
             divergence = trainer.learn(batch)
+            trainer.average.update_parameters(trainer.policy)
             end = time.perf_counter()
             trainer.seconds['simulation'] += middle - begin
             trainer.seconds['learning'] += end - middle

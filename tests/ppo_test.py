@@ -115,6 +115,17 @@ class RunTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'other settings'):
             self.train('whole', clip=0.1)
 
+    def test_the_exported_policy_may_be_an_average(self):
+        batch = TINY['num_envs'] * TINY['horizon']
+        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY, averaged=4 * batch), 1)
+        bias, expected = trainer.policy[-1].bias, None
+        for value in (1.0, 3.0, -5.0):
+            with torch.no_grad():
+                bias.fill_(value)
+            trainer.average.update_parameters(trainer.policy)
+            expected = value if expected is None else 0.75 * expected + 0.25 * value
+        np.testing.assert_allclose(trainer.exported().biases[-1], expected, rtol=1e-6)
+
     def test_the_exported_policy_is_the_network(self):
         trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY), 1)
         for _ in range(3):
