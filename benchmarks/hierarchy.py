@@ -28,7 +28,7 @@ def measured(environments, act, frames, seconds):
     observation = environments.reset()
     for _ in range(WARM):
         observation = environments.step(act(observation)).observation
-    physics, count = bench._counted(environments), 0
+    physics, count = bench.counted(environments), 0
     begin = time.perf_counter()
     while time.perf_counter() - begin < seconds:
         observation = environments.step(act(observation)).observation
@@ -40,8 +40,8 @@ def measured(environments, act, frames, seconds):
 def footsteps(rows, seconds):
     """The footstep environment, driven by the shipped controller."""
     controller = llc.load()
-    with_rows = VectorEnvironment(llc.DEFAULT, rows, 1, 0)
-    return measured(with_rows, lambda o: np.clip(controller(o), -1, 1), lambda e: rows, seconds)
+    environments = VectorEnvironment(llc.DEFAULT, rows, 1, 0)
+    return measured(environments, lambda o: np.clip(controller(o), -1, 1), lambda e: rows, seconds)
 
 
 def high_level(id_, rows, seconds):
@@ -50,7 +50,7 @@ def high_level(id_, rows, seconds):
     shape = (rows, len(environments.action_map))
     return measured(
         environments, lambda o: random.uniform(-HALF_RANGE, HALF_RANGE, shape),
-        lambda e: round(e.info['duration'].sum() * 30), seconds,
+        lambda e: round(e.info['duration'].sum() / bench.CONTROL_TIMESTEP), seconds,
     )  # fmt: skip
 
 

@@ -44,9 +44,7 @@ def main() -> None:
         print(line('default gait', default), flush=True)
         if arguments.policy is None:
             entry = json.loads(path.with_name(f'{id_}.json').read_text())
-            own = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])[
-                'evaluation'
-            ]
+            own = train_all.shipped(entry)['evaluation']
         else:
             own = evaluation.evaluate(id_, policies.load(arguments.policy), *episodes)
         ratio = np.median(own['distances']) / np.median(default['distances'])

@@ -40,7 +40,7 @@ def main() -> None:
             row.id, policies.load(flat), train_all.EPISODES, train_all.SEED, arguments.threads
         )
         runs = json.loads(entry.read_text())
-        own = next(r for r in runs['runs'] if r['seed'] == runs['shipped'])['evaluation']
+        own = train_all.shipped(runs)['evaluation']
         print(
             f'{row.id}: {own["distance"]:.1f} m, {own["full"]:.0%} complete; that of flat ground '
             f'{found["distance"]:.1f} m, {found["full"]:.0%}',

@@ -21,7 +21,7 @@ import json
 import os
 import pathlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -118,62 +118,63 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # so far away that the reward has to reach there, and be accurate again. At last a foot that lands far
 # away ends the episode but for two seconds after a push or a sharp turn: without that it drifts off
 # the plan.
+WALKER = 25e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
         'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
-    (0.9 / 25, {
+    (0.9e6 / WALKER, {
         'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
-    (2.1 / 25, {
+    (2.1e6 / WALKER, {
         'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (6 / 25, {
+    (6e6 / WALKER, {
         'footstep_scale': 8.0, 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
-    (9 / 25, {
+    (9e6 / WALKER, {
         'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (10 / 25, {
+    (10e6 / WALKER, {
         'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (12 / 25, {
+    (12e6 / WALKER, {
         'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (15 / 25, {
+    (15e6 / WALKER, {
         'footstep_scale': 8.0, 'heading_scale': 3.0,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
-    (18 / 25, {
+    (18e6 / WALKER, {
         'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
-    (19.3 / 25, {
+    (19.3e6 / WALKER, {
         'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
     }),
-    (21 / 25, {
+    (21e6 / WALKER, {
         'footstep_scale': 15.0, 'heading_scale': 3.0, 'miss': 0.5, 'grace': 2.5,
         'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
-    (23 / 25, {
+    (23e6 / WALKER, {
         'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
@@ -195,7 +196,7 @@ RUN_LESSONS = (
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': 25e6, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
+FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
 STEPS_ON = {  # on other grounds and plans
@@ -279,13 +280,18 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-def settings_for(id_: str, **changes: Any) -> Settings:
-    """The settings of an environment."""
+def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
+    """What rows say of an environment; a later row wins."""
     values: dict[str, Any] = {}
-    for pattern, row in OVERRIDES:
+    for pattern, row in rows:
         if fnmatch.fnmatchcase(id_, pattern):
             values.update(row)
-    return Settings(**{**values, **changes})
+    return values
+
+
+def settings_for(id_: str, **changes: Any) -> Settings:
+    """The settings of an environment."""
+    return Settings(**{**matching(id_, OVERRIDES), **changes})
 
 
 class Scales:
@@ -384,12 +390,12 @@ class Trainer:
 
     def __init__(self, environment: str | Row, seed: int, settings: Settings, threads: int) -> None:
         torch.manual_seed(seed)
-        self.environment, self.seed = environment, seed
+        self.row = suite.find(environment) if isinstance(environment, str) else environment
+        self.seed = seed
         self.settings, self.threads = settings, threads
         s = settings
         self.samples = 0
         self.begin_lesson()
-        self.row = self.environments.row
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
             raise ValueError(f'{self.row.id} has no left and right to mirror')
@@ -407,10 +413,14 @@ class Trainer:
         if s.start and s.start not in evaluation.BASELINES:
             self.begin_with(policies.reference(s.start))
             self.begun = True
-        decay = 1 - s.num_envs * s.horizon / s.averaged if s.averaged else 0.0
-        self.average = swa_utils.AveragedModel(
-            self.policy, multi_avg_fn=swa_utils.get_ema_multi_avg_fn(decay)
-        )
+        self.networks = [self.policy, self.value]
+        self.average: swa_utils.AveragedModel | None = None
+        if s.averaged:
+            decay = max(0.0, 1 - s.num_envs * s.horizon / s.averaged)
+            self.average = swa_utils.AveragedModel(
+                self.policy, multi_avg_fn=swa_utils.get_ema_multi_avg_fn(decay)
+            )
+            self.networks.append(self.average)
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
@@ -432,9 +442,7 @@ class Trainer:
             sequence = np.random.SeedSequence((self.seed, self.current))
             seed = sequence.generate_state(s.num_envs).tolist()
         options = dict(s.lessons[self.current - 1][1]) if self.current else {}
-        given = self.environment
-        row = suite.find(given) if isinstance(given, str) else given
-        row = dataclasses.replace(row, terrain=options.pop('terrain', row.terrain))
+        row = dataclasses.replace(self.row, terrain=options.pop('terrain', self.row.terrain))
         self.environments = VectorEnvironment(
             row, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
         )
@@ -625,7 +633,7 @@ class Trainer:
 
     def exported(self) -> policies.Policy:
         """The policy of now, without PyTorch."""
-        network_ = self.average.module if self.settings.averaged else self.policy
+        network_ = self.average.module if self.average else self.policy
         layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
@@ -686,7 +694,7 @@ class Trainer:
         state = {name: getattr(self, name) for name in _STATE}
         state |= {
             'settings': self.settings,
-            'networks': [part.state_dict() for part in (self.policy, self.value, self.average)],
+            'networks': [part.state_dict() for part in self.networks],
             'log_std': self.log_std.detach().clone(),
             'optimizer': self.optimizer.state_dict(),
             'scales': (self.scales.count, self.scales.mean, self.scales.square),
@@ -714,9 +722,7 @@ class Trainer:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
             setattr(self, name, state[name])
-        for network_, saved in zip(
-            (self.policy, self.value, self.average), state['networks'], strict=True
-        ):
+        for network_, saved in zip(self.networks, state['networks'], strict=True):
             network_.load_state_dict(saved)
         self.log_std.data.copy_(state['log_std'])
         self.optimizer.load_state_dict(state['optimizer'])
@@ -766,7 +772,8 @@ def train(
             batch = trainer.collect()
             middle = time.perf_counter()
             divergence = trainer.learn(batch)
-            trainer.average.update_parameters(trainer.policy)
+            if trainer.average:
+                trainer.average.update_parameters(trainer.policy)
             end = time.perf_counter()
             trainer.seconds['simulation'] += middle - begin
             trainer.seconds['learning'] += end - middle

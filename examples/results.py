@@ -36,10 +36,6 @@ def load() -> dict[str, dict[str, Any]]:
     return {id_: json.loads(p.read_text()) for id_, p in paths.items() if p.exists()}
 
 
-def shipped(entry: dict[str, Any]) -> dict[str, Any]:
-    return next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
-
-
 def million(samples: float) -> str:
     return f'{samples / 1e6:.2g} M'
 
@@ -56,7 +52,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def environment_row(id_: str, entry: dict[str, Any]) -> list[str]:
-    run = shipped(entry)
+    run = train_all.shipped(entry)
     found = run['evaluation']
     minutes = sum(run['curve'][-1]['seconds'].values()) / 60
     interval = found['return_interval'] / found['step_limit']
@@ -106,7 +102,7 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     for id_, entry in entries.items():
         if catalogue.BY_ID[id_].rules != 'gait' or id_ not in stored:
             continue
-        run = shipped(entry)
+        run = train_all.shipped(entry)
         own, default = (
             float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
         )
@@ -140,7 +136,7 @@ def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     rows = []
     for id_, flat in json.loads(path.read_text()).items():
         if id_ in entries:
-            own = shipped(entries[id_])['evaluation']
+            own = train_all.shipped(entries[id_])['evaluation']
             rows.append([
                 f'`{id_}`', f'{own["distance"]:.1f}', f'{flat["distance"]:.1f}',
                 f'{own["distance"] / flat["distance"]:.1f}', f'{own["full"]:.0%}',

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import fnmatch
 import json
 import pathlib
 import time
@@ -63,11 +62,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """The settings of an environment."""
-    values: dict[str, Any] = {}
-    for pattern, row in OVERRIDES.items():
-        if fnmatch.fnmatchcase(id_, pattern):
-            values |= row
-    return Settings(**{**values, **changes})
+    return Settings(**{**ppo.matching(id_, OVERRIDES.items()), **changes})
 
 
 class Search:

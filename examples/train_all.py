@@ -67,6 +67,11 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
     return sorted(found, key=lambda job: (job[1], depth(job[0])))  # sorting is stable
 
 
+def shipped(entry: dict[str, Any]) -> dict[str, Any]:
+    """The run of `trained/ID.json` whose policy is in `trained/ID.npz`."""
+    return next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
+
+
 def program(id_: str) -> ModuleType:
     """The program that trains an environment."""
     return search_gaits if catalogue.BY_ID[id_].rules == 'gait' else ppo

@@ -387,8 +387,9 @@ class ResetTest(parameterized.TestCase):
             self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-12)
             step = environment.reset()
         bad_pairs = ((), (0.2, 0.4), ((0.4, 0.2),), ((0.2, 0.5), (0.4, 0.6)), ((0.5, 1.1),))
+        bad_pairs = (*bad_pairs, ((0.1, 0.2), (0.3,)), (('a', 'b'),), ((0.1, np.nan),))
         for bad in (1.0, -0.1, np.nan, 'early', *bad_pairs):
-            with self.assertRaisesRegex(ValueError, 'start_phase'):
+            with self.assertRaisesRegex(ValueError, 'start_phase is'):
                 suite.make(BIPED, {'start_phase': bad})
 
     def test_start_phases_between_numbers(self):

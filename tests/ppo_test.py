@@ -189,7 +189,7 @@ class RunTest(parameterized.TestCase):
     def test_lessons_on_ever_higher_walls(self):
         lessons = ppo.rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
         settings = ppo.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
-        trainer = ppo.Trainer('PD_Biped2D_Mixed_Terrain-v0', 0, settings, 1)
+        trainer = first = ppo.Trainer('PD_Biped2D_Mixed_Terrain-v0', 0, settings, 1)
         heights = []
         for samples in (0, 100, 200):
             trainer.samples = samples
@@ -199,6 +199,7 @@ class RunTest(parameterized.TestCase):
             heights += ranges
         np.testing.assert_allclose(heights, [(0.1, 0.2), (0.175, 0.3), (0.25, 0.4)])
         self.assertEqual(trainer.environments.row.terrain, 'mixed_humanoid')
+        self.assertEqual(first.row.terrain, 'mixed_humanoid')  # where it is evaluated
 
     def test_near_parts_of_maps(self):
         """Both maps of velocities are cut as that of heights."""

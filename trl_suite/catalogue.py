@@ -117,7 +117,8 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> R
 
 
 # Phases in the air. Where the clip brakes in stance, its hips turn at 12 rad/s, and the raptor's hip
-# extensors, which shorten as fast, pull with a third of what it takes: no start there is survived.
+# extensors, which shorten as fast, pull with a third of what it takes: hardly a start there is
+# survived.
 _FLIGHT = ((0.25, 0.5), (0.75, 1.0))
 
 

@@ -72,13 +72,13 @@ def warmed(id: str, rows: int, threads: int) -> tuple[VectorEnvironment, Iterato
     environments = VectorEnvironment(id, rows, threads, seed=0)
     environments.reset()
     drawn = actions(-1, 1, (rows, len(environments.action_map)))
-    physics = _counted(environments)
+    physics = counted(environments)
     while physics.items * environments.task.physics_timestep < WARM * rows:
         environments.step(next(drawn))
     return environments, drawn
 
 
-def _counted(environments: VectorEnvironment) -> Stopwatch:
+def counted(environments: VectorEnvironment) -> Stopwatch:
     """Has the time and number of all physics steps added up from now on, those of each row."""
     world: Any = environments._world
     step = type(world).step.__get__(world)
@@ -104,7 +104,7 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
     """
     environments, drawn = warmed(id, rows, threads)
     world: Any = environments._world
-    physics, begin = _counted(environments), Stopwatch(environments._begin, len)
+    physics, begin = counted(environments), Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
     control = Stopwatch(environments.step, lambda action: rows)
     start = time.perf_counter()

@@ -195,17 +195,23 @@ def start_phases(
     """
     if option is None:
         return lambda drawn: drawn
-    if np.ndim(option) == 0:
-        phase = float(option) if isinstance(option, numbers.Real) else -1.0
+    if isinstance(option, numbers.Real):
+        phase = float(option)
         if not 0 <= phase < 1:
             raise ValueError(f'start_phase is {option}; expected a number in [0, 1), or pairs')
         return lambda drawn: phase
-    pairs = np.asarray(option, float)
+    try:
+        pairs = np.asarray(option, float)
+    except (TypeError, ValueError):
+        pairs = np.empty(0)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not (
         (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()
         and pairs[0, 0] >= 0 and pairs[-1, 1] <= 1
     ):  # fmt: skip
-        raise ValueError(f'start_phase is {option}; expected ascending pairs of numbers in [0, 1]')
+        raise ValueError(
+            f'start_phase is {option}; expected a number in [0, 1), or ascending pairs '
+            'of numbers in [0, 1]'
+        )
     ends = np.cumsum(np.diff(pairs, axis=1))
 
     def phase_of(drawn: float) -> float:
