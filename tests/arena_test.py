@@ -68,7 +68,7 @@ class Ground:
             self.model, self.data, np.array(start, float), np.array(direction, float), None, True,
             -1, geom, normal,
         )  # fmt: skip
-        ground = geom[0] >= 0 and self.model.body(self.model.geom_bodyid[geom[0]]).name == 'terrain'
+        ground = geom[0] >= 0 and self.model.geom_bodyid[geom[0]] == 0
         return distance, normal, ground
 
     def heights(self, xs):
@@ -366,7 +366,7 @@ class LongWalkTest(parameterized.TestCase):
                 if disturb and i in (7, 19, 20):
                     x = environment.info['distance']
                     far = np.flatnonzero(
-                        (model.geom_pos[:, 0] > x + 6) & (model.geom_bodyid == 1)
+                        (model.geom_pos[:, 0] > x + 6) & (model.geom_bodyid == 0)
                     )  # fmt: skip
                     self.assertGreater(len(far), 20)
                     model.geom_pos[far, 0] += 3.0

@@ -47,8 +47,9 @@ def links_on_ground(environment):
     """Names of the links that touch the terrain, as the engine's list of contacts says."""
     model, contact = environment.physics.model.ptr, environment.physics.data.ptr.contact
     pairs = model.geom_bodyid[contact.geom]
-    pairs = pairs[(pairs == model.body('terrain').id).any(1)]
-    return {model.body(b).name.split('/')[-1] for b in pairs.ravel()} - {'terrain'}
+    names = np.array([model.body(b).name.split('/')[-1] for b in pairs.ravel()]).reshape(-1, 2)
+    ground = np.isin(names, ('world', 'terrain'))
+    return set(names[ground.any(1)][~ground[ground.any(1)]])
 
 
 def put(environment, pose, rate):

@@ -38,9 +38,9 @@ class PlanarTerrain(composer.Arena):
         root = self._mjcf_root
         stage.prepare(root)
         _paint(root)
-        ground = root.worldbody.add('body', name='terrain')
         self.boxes = [
-            ground.add(
+            # In the world's own body: of any other body all geoms are gone through in every substep.
+            root.worldbody.add(
                 'geom', name=f'terrain_{i}', type='box', size=(0.1, boxes.HALF_WIDTH, 0.1),
                 # Laid out along x, so that the bounding volumes made by the compiler fit.
                 pos=(0.1 * i, 0, PARKED), friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
@@ -52,12 +52,12 @@ class PlanarTerrain(composer.Arena):
     @property
     def ground_body(self) -> str:
         """Name of the body that carries the ground, for contact sensors."""
-        return 'terrain'
+        return 'world'
 
     def bind(self, world: World) -> None:
         """Resolves the arena's geoms in a world and makes room for its n strips."""
         self._world = world
-        # The boxes of one body are neighbours in the model.
+        # Geoms of one body are neighbours in the model.
         first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         pool = slice(first, first + len(self.boxes))
         self._placed = [

@@ -35,9 +35,10 @@ class SpatialTerrain(composer.Arena):
     arena to a world of n simulations, each with a ground of its own. Queries answer from the
     `Surroundings`, never from the collision geometry.
 
-    Moving boxes are children of the ground's body, on sliding joints with a huge inertia, so that
-    they move in every substep and push and carry with the velocity they have. Contact sensors that
-    are to notice them too name the ground as `subtree2`, not as `body2`.
+    Moving boxes are on sliding joints with a huge inertia, so that they move in every substep and push
+    and carry with the velocity they have. They are children of the body that has plane and height
+    field. Static boxes are the world's own: collision detection goes through all geoms of any other
+    body in every substep, and through most of them where a plane without end is among them.
     """
 
     def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
@@ -71,14 +72,14 @@ class SpatialTerrain(composer.Arena):
             )  # fmt: skip
         # Laid out along x, so that the bounding volumes made by the compiler fit.
         self.boxes = [
-            ground.add(
+            root.worldbody.add(
                 'geom', name=f'box_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 0, PARKED),
                 material='block' if holds.level else 'ground', **common,
             )
             for i in range(holds.boxes)
         ]  # fmt: skip
         self.belts = [
-            ground.add(
+            root.worldbody.add(
                 # Unless one belt runs when it is compiled, none ever will.
                 'geom', name=f'belt_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 1, PARKED),
                 surfacevel=(1, 0, 0, 0, 0, 0), material='belt', **common,
@@ -100,9 +101,10 @@ class SpatialTerrain(composer.Arena):
         self._physics: Any = None
 
     @property
-    def ground_body(self) -> str:
-        """Name of the body that carries the ground, for contact sensors; see `subtree2` above."""
-        return 'terrain'
+    def touched(self) -> tuple[dict[str, str], ...]:
+        """Attributes of the contact sensors that notice the ground: one of these sensors, or more."""
+        static = ({'body2': 'world'},) if self.boxes or self.belts else ()
+        return ({'subtree2': 'terrain'}, *static)
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self._physics = physics  # to show new height fields to whoever draws
@@ -111,7 +113,7 @@ class SpatialTerrain(composer.Arena):
         """Resolves the arena's geoms in a world and makes room for its n grounds."""
         self._world = world
         self.surroundings = Surroundings(world.n, self.capacity)
-        # The boxes of one body are neighbours in the model.
+        # Geoms of one body are neighbours in the model.
         self._pool = _range(world, self.boxes)
         self._belts = _range(world, self.belts)
         self._plane, self._field = (

@@ -175,7 +175,7 @@ class SpatialFigure:
         self.character, self.arena, self.terrain_map = character, arena, terrain_map
         (self._root,) = character.create_root_joints(arena.attach(character))
         self._sensors = {
-            kind: [self._add_sensor(name, kind) for name in names]
+            kind: [self._add_sensors(name, kind) for name in names]
             for kind, names in (
                 ('fall', character.row.fall_links),
                 ('contact', character.row.end_effectors),
@@ -188,13 +188,16 @@ class SpatialFigure:
             'velocity': 6 * links,
         }
 
-    def _add_sensor(self, link: str, kind: str) -> str:
-        name = f'{self.character.mjcf_model.model}_{link}_{kind}'
-        self.arena.mjcf_model.sensor.add(
-            'contact', name=name, body1=self.character.mjcf_model.find('body', link),
-            subtree2=self.arena.ground_body, num=1, data='found',
-        )  # fmt: skip
-        return name
+    def _add_sensors(self, link: str, kind: str) -> list[str]:
+        """Adds sensors of the contacts between a link and the ground; returns their names."""
+        names = []
+        for i, ground in enumerate(self.arena.touched):
+            names.append(f'{self.character.mjcf_model.model}_{link}_{kind}_{i}')
+            self.arena.mjcf_model.sensor.add(
+                'contact', name=names[-1], body1=self.character.mjcf_model.find('body', link),
+                num=1, data='found', **ground,
+            )  # fmt: skip
+        return names
 
     def bind(self, world: World, about: str) -> None:
         """Resolves ids in a compiled world; `about` as for `Kinematics`."""
@@ -203,7 +206,8 @@ class SpatialFigure:
         self.kinematics = Kinematics(self.character, world, self._root.full_identifier, about)
         self.pose_qpos, self.pose_dof = self.kinematics.pose_qpos, self.kinematics.pose_dof
         self._fall, self._contact = (
-            world.sensor_addresses(names) for names in self._sensors.values()
+            np.array([world.sensor_addresses(of_link) for of_link in names])
+            for names in self._sensors.values()
         )
         model = world.models[0]
         geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
@@ -222,8 +226,9 @@ class SpatialFigure:
         They are `fall` (n, F) and `contact` (n, E): whether links touch the ground.
         """
         found = self.kinematics.measure(self._world, self.arena.height, self._surface)
-        found.fall = self._world.sensordata.take(self._fall, 1)
-        found.contact = (self._world.sensordata.take(self._contact, 1) > 0).astype(float)
+        sensed = self._world.sensordata
+        found.fall = sensed.take(self._fall, 1).max(2)
+        found.contact = (sensed.take(self._contact, 1).max(2) > 0).astype(float)
         return found
 
     def write(
