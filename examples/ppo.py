@@ -221,7 +221,7 @@ PLANAR_STEPS = {
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
     'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 1e-4,
-    'last_learning_rate': 3e-5, 'initial_std': 0.06, 'mirrored': False,
+    'last_learning_rate': 3e-5, 'initial_std': 0.06,
     'view': (6.0, 3.0), 'start': 'scripted', 'evaluate_every': 2e4, 'evaluation_episodes': 16,
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
@@ -507,8 +507,9 @@ class Trainer:
         std = self.log_std.exp().detach().numpy()
         while len(seen) * s.num_envs < s.cloned:
             action = teacher(self.observation)
-            seen.append(self.observation.copy())
-            shown.append(action)
+            observation, left = self.seen(self.observation)
+            seen.append(observation.copy())
+            shown.append(self.mirror.answered(action, left) if self.mirror else action)
             noise = self.random.standard_normal(action.shape)
             step = environments.step(np.clip(action + std * noise, -1, 1))
             ended = step.terminated | step.truncated

@@ -7,11 +7,12 @@ import tempfile
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import policies, suite
+from trl_suite import policies, scripted, suite
 from trl_suite.symmetry import Mirror, blocks, exchanged
 from trl_suite.tasks.imitation3d import joint_targets
 from trl_suite.vector import VectorEnvironment
 
+SOCCER = 'PD_Biped3D_HLC_Soccer-v0'
 # Character, actuation, terrain, rules, options. Stairs and ramp are the same on either side of the
 # line of the start.
 WALK = ('biped3d', 'position', 'plane', 'imitation', {})
@@ -213,6 +214,100 @@ class TaskTest(parameterized.TestCase):
         self.assertIsNone(suite.make('PD_Biped3D_Imitate-Track-v0').task.mirror)
 
 
+class PlanTest(parameterized.TestCase):
+    """The mirror of tasks whose actions are plans: no phase is seen, the foot that is ahead stands."""
+
+    def soccer(self, phase):
+        environment = suite.make(
+            SOCCER, {'random': 3, 'step_limit': None, 'start_phases': (phase,)},
+            {'flat_observation': True},
+        )  # fmt: skip
+        environment.reset()
+        return environment
+
+    def reflect(self, environment, other):
+        """Puts the state of an environment, seen in a mirror, into another."""
+        pose, rate = state(environment)
+        mirror = environment.task.motion.layout.mirror
+        columns, dof = environment.task.ball.qpos, environment.task.ball.dof
+        here, there = (each.physics.data for each in (environment, other))
+        there.qpos[columns] = here.qpos[columns] * [1, -1, 1, 1, -1, 1, -1]
+        there.qvel[dof] = here.qvel[dof] * [1, -1, 1, -1, 1, -1]
+        put(other, mirror.pose(pose), mirror.velocity(rate))
+        put(environment, pose, rate)
+        for each in (environment, other):
+            each.task.goal[0] = (3.0, 2.0 if each is environment else -2.0, 0.0)
+
+    def test_a_reflected_game(self):
+        environment, other = self.soccer(0.0), self.soccer(0.5)
+        mirror = environment.task.mirror
+        data, columns = environment.physics.data, environment.task.ball.qpos
+        data.qpos[columns[:3]] = 1.5, 0.4, 0.2
+        data.qvel[environment.task.ball.dof] = 0.5, -0.7, 0, 1, 2, 3
+        self.reflect(environment, other)
+        first, second = observed(environment), observed(other)
+        np.testing.assert_allclose(mirror.observation(second[None])[0], first, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(
+            mirror.left(np.stack([first, second])),
+            [environment.task.stance[0], other.task.stance[0]],
+        )
+        # At the clamp of an orientation actuator the last bit decides about its damping.
+        plan = np.array([0.0, 0.05, 0.0, 0.05, 0.15])
+        mine, theirs = environment.step(plan), other.step(mirror.action(plan[None])[0])
+        self.assertAlmostEqual(mine.reward, theirs.reward, delta=0.02)
+        again = mirror.observation(theirs.observation['observations'][None])[0]
+        turned = mine.observation['observations'][105] - first[105]  # where the goal is seen
+        self.assertGreater(abs(turned), 0.2)
+        shown = np.r_[environment.blocks['pose'], environment.blocks['target'], 107:109]
+        np.testing.assert_allclose(
+            again[shown], mine.observation['observations'][shown], rtol=0, atol=0.06
+        )
+
+    @parameterized.parameters('Forest', 'Conveyors_Wide', 'LargeBlocks', 'PathFollowing_Run')
+    def test_maps(self, name):
+        environment = suite.make(f'PD_Biped3D_HLC_{name}-v0', {'random': 1})
+        blocks_, mirror = environment.blocks, environment.task.mirror
+        size = len(mirror.observation_index)
+        mirror.check(size, len(environment.action_map))
+        seen = np.random.default_rng(0).normal(size=(2, size))
+        reflected = mirror.observation(seen)
+        np.testing.assert_array_equal(mirror.observation(reflected), seen)
+        np.testing.assert_array_equal(mirror.left(reflected), ~mirror.left(seen))
+        lines = lambda o, name: o[:, blocks_[name]].reshape(2, -1, 32, 32)[:, :, ::-1]  # noqa: E731
+        for name, signs in (('terrain', (1,)), ('surface', (1, -1))):
+            if name in blocks_:
+                expected = lines(seen, name) * np.reshape(signs, (-1, 1, 1))
+                np.testing.assert_array_equal(
+                    reflected[:, blocks_[name]], expected.reshape(2, -1), err_msg=name
+                )
+
+    def test_every_footstep_begins_with_a_foot_ahead(self):
+        rows = VectorEnvironment(SOCCER, 16, 1, seed=0)
+        plan, observation = scripted.scripted(rows), rows.reset()
+        for _ in range(6):
+            left = rows.task.mirror.left(observation)
+            np.testing.assert_array_equal(left, rows.task.stance == 1)
+            observation = rows.step(plan(observation)).observation
+
+    def test_who_acts_joints_too_has_none(self):
+        self.assertIsNone(suite.make(SOCCER, {'interface': 'frame'}).task.mirror)
+
+    def test_saved_and_loaded(self):
+        mirror = suite.make(SOCCER).task.mirror
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        path = pathlib.Path(folder.name) / 'p.npz'
+        policy = policy_for(self.soccer(0.0))
+        policies.save(policy, path)
+        again = policies.load(path)
+        for field in dataclasses.fields(Mirror):
+            np.testing.assert_array_equal(
+                getattr(again.mirror, field.name), getattr(mirror, field.name)
+            )
+        observation = np.random.default_rng(0).normal(size=(5, 116))
+        np.testing.assert_array_equal(again(observation), policy(observation))
+
+
 class MirrorTest(parameterized.TestCase):
     """Mirrors as data."""
 
@@ -235,6 +330,13 @@ class MirrorTest(parameterized.TestCase):
         np.testing.assert_array_equal(mirror.answered(action, left), [[0.1, 0.2], [0.2, 0.1]])
         np.testing.assert_array_equal(action, [[0.1, 0.2], [0.1, 0.2]])
 
+    def test_by_the_foot_ahead(self):
+        mirror = self.make(phase=None, feet=(1, 2))
+        mirror.check(4, 2)
+        observation = np.array([[1.0, 2, 3, 0.25], [1.0, 3, 2, 0.25], [1.0, 2, 2, 0.25]])
+        np.testing.assert_array_equal(mirror.left(observation), [True, False, False])
+        np.testing.assert_array_equal(mirror.observation(observation[:1]), [[1, -3, -2, 0.25]])
+
     def test_blocks(self):
         np.testing.assert_array_equal(exchanged(4, [(1, 3)]), [0, 3, 2, 1])
         index, sign = blocks(np.array([1, 0]), (1.0, -1.0, 1.0))
@@ -248,6 +350,10 @@ class MirrorTest(parameterized.TestCase):
         ({'action_index': np.array([1, 2])}, 'mirror_action_index'),
         ({'action_sign': np.ones(3)}, 'mirror_action_sign'),
         ({'phase': 4}, 'mirror_phase'), ({'phase': -1}, 'mirror_phase'),
+        ({'phase': None}, 'mirror_phase, mirror_feet'), ({'feet': (1, 2)}, 'mirror_phase, mirror_feet'),
+        ({'phase': None, 'feet': (1, 1)}, 'mirror_feet'),
+        ({'phase': None, 'feet': (4, 1)}, 'mirror_feet'),
+        ({'phase': None, 'feet': (1,)}, 'mirror_feet'),
     )  # fmt: skip
     def test_refused(self, changes, message):
         self.make().check(4, 2)

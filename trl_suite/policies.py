@@ -31,7 +31,8 @@ there are `columns`):
 
 and, if the policy sees left stance as right stance in a mirror (see `trl_suite.symmetry`):
 
-    mirror_phase              int ()    column of the phase
+    mirror_phase              int ()    column of the phase; or
+    mirror_feet               int (2,)  columns of how far ahead the right and the left foot are
     mirror_observation_index  int (k,)  what stands where in a reflected observation
     mirror_observation_sign   float (k,)
     mirror_action_index       int (a,)
@@ -81,9 +82,10 @@ _FIELDS = {
     'info': ('U', 0),
 }  # fmt: skip
 _MIRROR = {
-    'phase': ('iu', 0), 'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
+    'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
     'action_index': ('iu', 1), 'action_sign': ('f', 1),
 }  # fmt: skip
+_SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
 _OPTIONAL = {'columns': ('iu', 1), 'choices': ('f', 2)}
 
 
@@ -318,7 +320,8 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         fields[f'weight_{i}'], fields[f'bias_{i}'] = weight, bias
     if policy.mirror is not None:
-        for name, (kind, _) in _MIRROR.items():
+        side = 'phase' if policy.mirror.feet is None else 'feet'
+        for name, (kind, _) in {**_MIRROR, side: _SIDES[side]}.items():
             value = np.asarray(getattr(policy.mirror, name))
             fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
@@ -355,21 +358,22 @@ def load(path: str | os.PathLike[str]) -> Policy:
                 into.append(_read(archive, field, 'f', axes))
         mirror = None
         if any(name.startswith('mirror_') for name in archive.files):
+            side = 'feet' if 'mirror_feet' in archive else 'phase'
             parts: dict[str, Any] = {}
-            for name, (kind, axes) in _MIRROR.items():
+            for name, (kind, axes) in {**_MIRROR, side: _SIDES[side]}.items():
                 field = f'mirror_{name}'
                 parts[name] = _read(archive, field, kind, axes)
-            mirror = Mirror(**{**parts, 'phase': int(parts['phase'])})
+            mirror = Mirror(**{**parts, side: parts[side].tolist()})
         for field in _OPTIONAL.keys() & archive.files:
             fields[field] = _read(archive, field, *_OPTIONAL[field])
         field = 'info'
         fields[field] = json.loads(fields[field])
         for field in archive:
             known = field in _FIELDS or field in _OPTIONAL
-            known |= field.removeprefix('mirror_') in _MIRROR
+            known |= field.removeprefix('mirror_') in (*_MIRROR, *_SIDES)
             if not known and field.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
-        expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) if mirror else 0)
+        expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) + 1 if mirror else 0)
         expected += len(_OPTIONAL.keys() & archive.files)
         if len(archive.files) != expected:
             field = 'layers'

@@ -20,13 +20,16 @@ class Mirror:
         phase half a cycle less or more; (size,).
       action_index, action_sign: a reflected action is `a[:, index] * sign`, (k,).
       phase: the column that holds the phase of the cycle; from 0.5 on the left foot stands.
+      feet: if no column does, those of how far ahead the right foot and the left foot are: where a step
+        begins, the foot stands that is ahead.
     """
 
     observation_index: np.ndarray
     observation_sign: np.ndarray
     action_index: np.ndarray
     action_sign: np.ndarray
-    phase: int
+    phase: int | None = None
+    feet: tuple[int, int] | None = None
 
     def check(self, observations: int, actions: int) -> None:
         """Checks that this reflects observations and actions of so many numbers.
@@ -40,18 +43,30 @@ class Mirror:
                 raise ValueError(f'mirror_{kind}_index: expected each of 0 to {size - 1} once')
             if np.shape(sign) != (size,) or not np.isin(sign, (-1, 1)).all():
                 raise ValueError(f'mirror_{kind}_sign: expected {size} numbers, each 1 or -1')
-        if not 0 <= self.phase < observations:
+        if (self.phase is None) == (self.feet is None):
+            raise ValueError('mirror_phase, mirror_feet: expected one of them')
+        if self.phase is not None and not 0 <= self.phase < observations:
             raise ValueError(f'mirror_phase: {self.phase} is no column of {observations}')
+        if self.feet is not None:
+            right, left = self.feet if len(self.feet) == 2 else (-1, -1)
+            if not 0 <= right < observations or self.observation_index[right] != left:
+                raise ValueError(
+                    f'mirror_feet: {tuple(self.feet)} are no two of {observations} columns that stand '
+                    'for each other'
+                )
 
     def left(self, observation: np.ndarray) -> np.ndarray:
         """Returns which observations are of left stance, (n,) bool."""
+        if self.feet is not None:
+            return observation[:, self.feet[1]] > observation[:, self.feet[0]]
         return observation[:, self.phase] >= 0.5
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """Reflects observations (n, size)."""
         reflected = observation.take(self.observation_index, 1) * self.observation_sign
-        phase = reflected[:, self.phase]
-        reflected[:, self.phase] = np.where(phase >= 0.5, phase - 0.5, phase + 0.5)
+        if self.phase is not None:
+            phase = reflected[:, self.phase]
+            reflected[:, self.phase] = np.where(phase >= 0.5, phase - 0.5, phase + 0.5)
         return reflected
 
     def action(self, action: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ SOCCER_TERMS = {
     'approach': (0.2 / 1.2, SPEED_SHARPNESS), 'near': (0.2 / 1.2, BALL_SHARPNESS),
     'dribble': (0.4 / 1.2, SPEED_SHARPNESS), 'goal': (0.4 / 1.2, GOAL_SHARPNESS),
 }  # fmt: skip
+MIRRORED = (-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # signs of what is seen, in a mirror
 _WEIGHTS = np.array([weight for weight, _ in SOCCER_TERMS.values()])
 
 

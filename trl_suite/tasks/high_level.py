@@ -6,8 +6,8 @@ deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from types import SimpleNamespace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,14 @@ from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import llc
 from trl_suite.motion import Steps, quaternion
+from trl_suite.symmetry import Mirror
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
 from trl_suite.tasks.plans import span
 from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed, drawn_way
 from trl_suite.tasks.trace import Trace
-from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
+from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, POSE, SUBSTEPS
 from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
@@ -35,6 +36,7 @@ SIGHTS = ('height', 'velocity')
 # What action 0 means, in step lengths, and what 1 adds: x and y of both landing places, m; turn of the
 # heading, rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
+PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
 PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
@@ -66,6 +68,8 @@ class HighLevel(Footsteps):
 
     TERMS = HIKE_TERMS
     GOAL_REACHED = GOAL_REACHED  # m; by default
+    # Blocks that say where to go, with the sign that each number has in a mirror.
+    GOAL_BLOCKS: Mapping[str, tuple[float, ...]] = MappingProxyType({'target': (-1.0, 1.0)})
 
     watch: Callable[[], None] | None = None  # called at every 1/30 s of the first simulation
 
@@ -134,7 +138,6 @@ class HighLevel(Footsteps):
         self._goal_distance = goal_distance
         self._start_phases = tuple(start_phases)
         self._frame = substeps
-        self.mirror = None
         low = max(part.stop for part in self._full.values())
         centre, half_range, names = step_length * PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
         if interface == 'frame':
@@ -150,16 +153,31 @@ class HighLevel(Footsteps):
             'terrain': SAMPLES**2 if 'height' in sight else 0,
             'surface': 2 * SAMPLES**2 if 'velocity' in sight else 0,
             **pose,
-            **self._goal_blocks(),
+            **{name: len(signs) for name, signs in self.GOAL_BLOCKS.items()},
             'low_level': low if interface == 'frame' else 0,
         })  # fmt: skip
+        mirrors = interface == 'plan' and self.character.row.mirror
+        self.mirror = self._plan_mirror() if mirrors else None
 
     def _furnish(self, arena: SpatialTerrain) -> None:
         """Adds what is there beside the ground."""
 
-    def _goal_blocks(self) -> dict[str, int]:
-        """Blocks, with their sizes, that say where to go."""
-        return {'target': 2}
+    def _plan_mirror(self) -> Mirror:
+        """How observations and plans are reflected."""
+        parts = self._body_mirror()
+        lines, _ = parts['terrain']
+        ahead = np.ones(len(lines))
+        parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
+        for name, signs in self.GOAL_BLOCKS.items():
+            parts[name] = np.arange(len(signs)), np.array(signs)
+        index = np.concatenate([part.start + parts[name][0] for name, part in self.blocks.items()])
+        sign = np.concatenate([parts[name][1] for name in self.blocks])
+        links = list(self.character.row.links)
+        feet = [links.index(name) for name in self.character.row.end_effectors]
+        right, left = self.blocks['pose'].start + 1 + len(POSE) * np.array(feet)
+        return Mirror(
+            index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
+        )
 
     def bind(self, world: World) -> None:
         super().bind(world)

@@ -283,7 +283,7 @@ class BallJourney(Journey):
 
     def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         if name == 'ball':
-            return np.arange(9), np.array([-1.0, 1, 1, 1, -1, 1, -1, 1, -1])
+            return np.arange(len(ball.MIRRORED)), np.array(ball.MIRRORED)
         return super()._extra_mirror(name)
 
     def infos(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Source: the soccer scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,12 +34,10 @@ class Soccer(HighLevel):
 
     TERMS = ball.SOCCER_TERMS
     GOAL_REACHED = ball.AT_GOAL
+    GOAL_BLOCKS = MappingProxyType({**HighLevel.GOAL_BLOCKS, 'ball': ball.MIRRORED})
 
     def _furnish(self, arena: SpatialTerrain) -> None:
         self.ball = ball.Ball(arena)
-
-    def _goal_blocks(self) -> dict[str, int]:
-        return {'target': 2, 'ball': 9}
 
     def bind(self, world: World) -> None:
         super().bind(world)

@@ -36,8 +36,9 @@ PHASE_BINS = 4
 MIRRORED_BINS = 2  # of the phase of a single step
 CENTRES = ('clip', 'posture', 'original')  # of position control
 _DIGITS = 9  # of the clock, in cycles
-_VECTOR, _QUATERNION = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)  # reflected in the x-z plane
-_SPIN = (-1.0, 1.0, -1.0)
+# Signs in a mirror, the x-z plane.
+_VECTOR, _QUATERNION, _SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
+POSE = (*_VECTOR, *_QUATERNION)  # of what the block of the pose has for each link
 
 
 class Tracking(Task):
@@ -343,19 +344,23 @@ class Tracking(Task):
 
     # Left and right.
 
-    def _mirror(self) -> Mirror:
-        """How full observations and actions are reflected."""
+    def _body_mirror(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """How the blocks of the body and of the map around it are reflected: index and sign."""
         row = self.character.row
         names = list(row.links)
         pairs = [(names.index(a), names.index(b)) for a, b in row.mirror]
         links = exchanged(len(names), pairs)
-        parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        if 'terrain' in self._full:
-            grid = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1]  # lines from the left
-            parts['terrain'] = grid.ravel(), np.ones(grid.size)
-        index, sign = blocks(links, (*_VECTOR, *_QUATERNION))
-        parts['pose'] = np.append(0, 1 + index), np.append(1.0, sign)
-        parts['velocity'] = blocks(links, (*_VECTOR, *_SPIN))
+        grid = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1]  # lines from the left
+        index, sign = blocks(links, POSE)
+        return {
+            'terrain': (grid.ravel(), np.ones(grid.size)),
+            'pose': (np.append(0, 1 + index), np.append(1.0, sign)),
+            'velocity': blocks(links, (*_VECTOR, *_SPIN)),
+        }
+
+    def _mirror(self) -> Mirror:
+        """How full observations and actions are reflected."""
+        parts = self._body_mirror()
         bins = np.roll(np.arange(PHASE_BINS), PHASE_BINS // 2)
         parts['phase'] = np.append(0, 1 + bins), np.ones(1 + PHASE_BINS)
         for name in self._full:
