@@ -268,6 +268,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
+    ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
     ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
