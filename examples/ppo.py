@@ -41,6 +41,7 @@ OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
 CLONING_RATE, CLONING_EPOCHS = 1e-3, 30
+CLOSER = 2 / 3  # times the spacing of obstacles
 START_COUNT = 2e4  # observations that the scales of a policy one begins with count as
 
 
@@ -101,6 +102,20 @@ def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tupl
     full = dict(preset_.parameter_sets[0])
     ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
     return evenly([*({'terrain': ground, 'blend': height} for height in heights), {}])
+
+
+def crowded(preset: str) -> tuple[Any, ...]:
+    """Lessons on walls only and on all obstacles, closer together than in a mixed preset, and on that."""
+    mixed = terrain.load(preset)
+    near = {
+        name: CLOSER * value if 'Spacing' in name else value
+        for name, value in mixed.parameter_sets[0].items()
+    }
+    walls = {name: value for name, value in near.items() if not name.startswith(('Gap', 'Step'))}
+    grounds = ((mixed.type.replace('mixed', 'walls'), walls), (mixed.type, near))
+    return evenly(
+        [*({'terrain': {'Type': type_, 'Params': [values]}} for type_, values in grounds), {}]
+    )
 
 
 def evenly(lessons: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
@@ -269,6 +284,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
+    (
+        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
+        {'gamma': 0.98, 'lessons': crowded('slopes_mixed_humanoid')},
+    ),
     ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),

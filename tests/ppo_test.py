@@ -201,6 +201,28 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(trainer.environments.row.terrain, 'mixed_humanoid')
         self.assertEqual(first.row.terrain, 'mixed_humanoid')  # where it is evaluated
 
+    def test_lessons_with_obstacles_close_together(self):
+        lessons = ppo.crowded('slopes_mixed_humanoid')
+        settings = ppo.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        trainer = ppo.Trainer('PD_Biped2D_Slopes_Mixed_Terrain-v0', 0, settings, 1)
+        spacings, types = [], []
+        for samples in (0, 100, 200):
+            trainer.samples = samples
+            trainer.begin_lesson()
+            ground = trainer.environments.task.arena.terrain
+            types.append(ground.type)
+            values = ground.parameters()
+            spacings.append(
+                [
+                    values[f'{name}SpacingMax']
+                    for name in ('Wall', 'Gap')
+                    if f'{name}SpacingMax' in values
+                ]
+            )
+            self.assertEqual(values['WallHMax'], 0.4)
+        self.assertEqual(types, ['var2d_slopes_walls', *['var2d_slopes_mixed'] * 2])
+        np.testing.assert_allclose(np.concatenate(spacings), [8 / 3, 8 / 3, 8 / 3, 4, 4])
+
     def test_near_parts_of_maps(self):
         """Both maps of velocities are cut as that of heights."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
