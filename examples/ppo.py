@@ -255,6 +255,11 @@ LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 # Where they meet few obstacles, each of them another: more of them in every update, and looked at from
 # further ahead.
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
+# Who has so long to live treads on the spot in front of a wall, unless that ends the episode.
+CROWDED = {
+    'gamma': 0.98, 'lessons': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
+    'patience': 1.0,
+}  # fmt: skip
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
@@ -291,10 +296,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
-    (
-        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
-        {'gamma': 0.98, 'lessons': crowded('slopes_mixed_humanoid')},
-    ),
+    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
     ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
