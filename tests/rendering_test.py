@@ -30,10 +30,9 @@ def drawn_ground(environment):
     found = []
 
     def look(physics, scene):
-        ground = physics.model.name2id('terrain', 'body')
         for geom in scene.geoms[: scene.ngeom]:
             is_geom = geom.objtype == mujoco.mjtObj.mjOBJ_GEOM
-            if is_geom and physics.model.geom_bodyid[geom.objid] == ground and geom.pos[2] > -30:
+            if is_geom and physics.model.geom_bodyid[geom.objid] == 0 and geom.pos[2] > -30:
                 found.append((geom.pos[0], geom.size[0], geom.pos[2] + geom.size[2]))
 
     rendering.frame(environment, **SMALL)  # makes the context
