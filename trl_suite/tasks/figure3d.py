@@ -6,6 +6,7 @@ heading, y to the left and z up.
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -205,8 +206,9 @@ class SpatialFigure:
         self.arena.bind(world)
         self.kinematics = Kinematics(self.character, world, self._root.full_identifier, about)
         self.pose_qpos, self.pose_dof = self.kinematics.pose_qpos, self.kinematics.pose_dof
+        kinds = len(self.arena.touched)
         self._fall, self._contact = (
-            np.array([world.sensor_addresses(of_link) for of_link in names])
+            world.sensor_addresses([*itertools.chain(*names)]).reshape(len(names), kinds)
             for names in self._sensors.values()
         )
         model = world.models[0]
