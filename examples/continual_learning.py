@@ -13,6 +13,7 @@ import json
 import pathlib
 
 import ppo
+import ppo_settings
 import torch
 
 from trl_suite import sequences
@@ -63,7 +64,7 @@ def main(arguments=None):
     sequence = sequences.get(chosen.sequence)
     if chosen.threads:
         torch.set_num_threads(chosen.threads)
-    settings = ppo.settings_for(
+    settings = ppo_settings.settings_for(
         sequence.ids[0], start='', samples=chosen.budget * len(sequence), lessons=()
     )
     chosen.output.mkdir(parents=True, exist_ok=True)

@@ -8,29 +8,29 @@ had never stopped), `curve.json` (settings, learning curve), `policy.npz` (the p
 best in the evaluations of the curve, for `trl_suite.policies`), and at the end `last.npz`.
 
 PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
-Implementation Details of PPO). Needs `pip install 'trl_suite[train]'`.
+Implementation Details of PPO); the settings of each environment stand in `ppo_settings.py`. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import fnmatch
 import itertools
 import json
 import os
 import pathlib
 import time
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 import tqdm
+from ppo_settings import Settings, settings_for
 from torch import nn
 from torch.optim import swa_utils
 
-from trl_suite import characters, evaluation, policies, suite, terrain
+from trl_suite import characters, evaluation, policies, suite
 from trl_suite.catalogue import Row
 from trl_suite.tasks import rewards
 from trl_suite.terrain import surroundings
@@ -41,295 +41,7 @@ OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
 CLONING_RATE, CLONING_EPOCHS = 1e-3, 30
-CLOSER = 2 / 3  # times the spacing of obstacles
 START_COUNT = 2e4  # observations that the scales of a policy one begins with count as
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """What a run depends on besides environment and seed."""
-
-    samples: float = 1e6  # control steps in all, of all rows
-    num_envs: int = 64
-    horizon: int = 32  # control steps of each row between two updates
-    epochs: int = 5
-    minibatch: int = 512
-    learning_rate: float = 3e-4
-    last_learning_rate: float = 5e-5  # falls linearly
-    gamma: float = 0.95  # 0.67 s at 30 Hz
-    lambda_: float = 0.95
-    clip: float = 0.2
-    kl_per_action: float = 0.004  # an update stops at this mean divergence times the actions
-    hidden: tuple[int, ...] = (256, 256)
-    initial_std: float = 0.2  # of actions in [-1, 1]
-    bound_cost: float = 0.1  # times the squared excess of a mean action over 1
-    gradient_norm: float = 0.5
-    # What is evaluated and ships has the mean of the weights over about so many samples, the later
-    # ones counting more (Polyak averaging); 0: the weights of now.
-    averaged: float = 0.0
-    # In training an episode also ends when a reward term, as share of its maximum and smoothed over
-    # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
-    # local optimum. Evaluations are without it.
-    least_share: dict[str, float] = dataclasses.field(default_factory=dict)
-    patience: float = 0.3
-    # See left stance as right stance in a mirror; for walkers in three dimensions.
-    mirrored: bool = False
-    # What the network sees of a map of the terrain: how far ahead and to each side, m; None: all.
-    view: tuple[float, float] | None = None
-    # Lessons: from which share of the samples on, with which options of the task; and on which
-    # `terrain`, if another. Evaluations have those of the environment.
-    lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
-    # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
-    # weights, its scales and its noise. What it did not observe begins without influence. Or with
-    # one of `evaluation.BASELINES`, which is imitated for `cloned` control steps.
-    start: str = ''
-    cloned: float = 1e4
-    value_first: float = 2e4  # control steps in which such a run learns only the value
-    enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
-    evaluate_every: float = 1e5  # control steps
-    evaluation_episodes: int = 32
-
-
-def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
-    """Lessons of equal length on a terrain that comes ever closer to a preset, and at last on it.
-
-    Args:
-      preset: of the terrain.
-      low: what is different at height 0.
-      heights: from 0 to less than 1, the preset.
-    """
-    preset_ = terrain.load(preset)
-    full = dict(preset_.parameter_sets[0])
-    ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
-    return evenly([*({'terrain': ground, 'blend': height} for height in heights), {}])
-
-
-def crowded(preset: str) -> tuple[Any, ...]:
-    """Lessons on walls only and on all obstacles, closer together than in a mixed preset, and on that."""
-    mixed = terrain.load(preset)
-    near = {
-        name: CLOSER * value if 'Spacing' in name else value
-        for name, value in mixed.parameter_sets[0].items()
-    }
-    walls = {name: value for name, value in near.items() if not name.startswith(('Gap', 'Step'))}
-    grounds = ((mixed.type.replace('mixed', 'walls'), walls), (mixed.type, near))
-    return evenly(
-        [*({'terrain': {'Type': type_, 'Params': [values]}} for type_, values in grounds), {}]
-    )
-
-
-def evenly(lessons: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
-    """Lessons of equal length, one after the other."""
-    return tuple((i / len(lessons), options) for i, options in enumerate(lessons))
-
-
-# What differs from the defaults, by the pattern of an id; a later row wins.
-RUNS = {'least_share': {'com': 0.37}}  # about 1 m/s off the clip's speed
-RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
-# Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
-# them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated, and
-# a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
-# Then it does not, and who is pushed may leave the plan to keep standing; then it must come back, from
-# so far away that the reward has to reach there, and be accurate again. At last a foot that lands far
-# away ends the episode but for two seconds after a push or a sharp turn: without that it drifts off
-# the plan.
-WALKER = 31e6  # samples
-VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
-LESSONS = (
-    (0.0, {
-        'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
-        'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
-    }),
-    (0.9e6 / WALKER, {
-        'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
-        'plans': {**VARIED, 'sharp': 0.03},
-    }),
-    (2.1e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (6e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 5.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
-    }),
-    (9e6 / WALKER, {
-        'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
-        'plans': {**VARIED, 'sharp': 0.05},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (10e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
-        'plans': {**VARIED, 'sharp': 0.05},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (12e6 / WALKER, {
-        'footstep_scale': (1.5, 20.0), 'heading_scale': 5.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (15e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 3.0,
-        'plans': {**VARIED, 'sharp': 0.1},
-        'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    }),
-    (18e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (19.3e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
-        'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
-    }),
-    (21e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 3.0, 'miss': 0.5, 'grace': 2.5,
-        'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (23e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
-        'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
-    }),
-    (25e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.3, 'grace': 2.5,
-        'plans': {**VARIED, 'change': 0.2, 'sharp': 0.06},
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
-    }),
-    (27e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
-        'plans': {
-            **VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2, 'sharp': 0.06,
-        },
-        'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
-    }),
-)  # fmt: skip
-# Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
-RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
-RUN_LESSONS = (
-    (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'miss': 0.8}),
-    (0.25, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
-        'plans': {**RUN_PLANS, 'turn': 0.15},
-    }),
-    (0.5, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
-        'plans': {
-            **RUN_PLANS, 'length': (0.8, 1.3), 'turn': 0.25, 'from_root': 0.3,
-            'root_length': (0.8, 1.3), 'root_width': (0.08, 0.25), 'root_turn': 0.25,
-        },
-    }),
-)  # fmt: skip
-FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
-SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
-ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
-STEPS_ON = {  # on other grounds and plans
-    **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
-}  # fmt: skip
-# In the plane: the row's own plan, then all lengths, ever more accurately. The reward alone would have
-# it walk a quarter of a metre ahead of the plan, as the reference's longer steps do.
-PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
-PLANAR_LESSONS = (
-    (0.0, {'footstep_scale': 3.0, 'miss': 0.5}),
-    (0.2, {'footstep_scale': 5.0, 'miss': 0.3, 'plans': PLANAR_PLANS}),
-    (0.45, {'footstep_scale': 10.0, 'miss': 0.2, 'plans': PLANAR_PLANS}),
-)  # fmt: skip
-PLANAR_STEPS = {
-    'samples': 0.8e6, 'gamma': 0.97, 'lessons': PLANAR_LESSONS, 'start': 'PD_Biped2D_Flat-v0',
-}  # fmt: skip
-RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
-PLANS = {  # a step is a whole footstep: few of them
-    'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 1e-4,
-    'last_learning_rate': 3e-5, 'initial_std': 0.06,
-    'view': (6.0, 3.0), 'start': 'scripted', 'evaluate_every': 2e4, 'evaluation_episodes': 16,
-}  # fmt: skip
-CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
-    'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
-    'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
-}  # fmt: skip
-# Who walks over walls of 0.25 m falls at three of four that are up to 0.4 m high.
-LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
-# Where they meet few obstacles, each of them another: more of them in every update, and looked at from
-# further ahead.
-RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
-# Who has so long to live treads on the spot in front of a wall, unless that ends the episode.
-CROWDED = {
-    'gamma': 0.98, 'lessons': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
-    'patience': 1.0,
-}  # fmt: skip
-ENOUGH = {'enough': 0.95}
-WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
-ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
-OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
-    ('*', {'samples': 0.8e6}),
-    ('*_Biped2D_*Flat-v0', {'samples': 0.5e6}),
-    ('*_Run_*', {'samples': 1e6, **RUNS, **ENOUGH}),
-    ('*_Raptor2D_*', RUNS),
-    ('*_Dog2D_*', {'samples': 1.6e6, **RUNS}),
-    ('PD_Dog2D_LLC_*', {'samples': 1.2e6}),
-    ('PD_Dog2D_Flat-v0', {'samples': 0.8e6}),
-    ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
-    ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
-    *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
-    # From flat ground to all others.
-    ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0', **ENOUGH}),
-    *(
-        row
-        for name in ('Dog2D', 'Raptor2D')
-        for row in (
-            (
-                f'PD_{name}_*_Terrain-v0',
-                {'samples': 0.6e6, 'start': f'PD_{name}_Flat_Terrain-v0', **ENOUGH},
-            ),
-            (f'PD_{name}_Flat_Terrain-v0', {'samples': 0.2e6, 'start': f'PD_{name}_Flat-v0'}),
-        )
-    ),
-    ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
-    # From one kind of obstacle to a mix of them, and on to that on slopes.
-    *(
-        (f'PD_{name}_{to}_Terrain-v0', {'samples': n, 'start': f'PD_{name}_{start}_Terrain-v0'})
-        for name, n in (('Biped2D', 4e6), ('Dog2D', 2e6), ('Raptor2D', 2e6))
-        for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
-    ),
-    ('PD_*2D_*Mixed_Terrain-v0', RARE),
-    ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
-    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
-    ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
-    ('MTU_Raptor2D_*', {'samples': 1.2e6}),
-    ('Vel_Biped2D_*', {'samples': 1e6}),
-    # In three dimensions the planar noise fells the body before it has learnt anything.
-    ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
-    *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
-    ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'samples': 1.6e6, 'view': (2.5, 1.0)}),
-    ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
-    ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
-    ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
-    *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
-    # Its observation is mirrored.
-    ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
-    ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
-    ('PD_Biped3D_HLC_*', PLANS),
-    ('FSM_*', CYCLES),
-    ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
-)
-
-
-def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
-    """What rows say of an environment; a later row wins."""
-    values: dict[str, Any] = {}
-    for pattern, row in rows:
-        if fnmatch.fnmatchcase(id_, pattern):
-            values.update(row)
-    return values
-
-
-def settings_for(id_: str, **changes: Any) -> Settings:
-    """The settings of an environment."""
-    return Settings(**{**matching(id_, OVERRIDES), **changes})
 
 
 class Scales:

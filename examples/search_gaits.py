@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import ppo
+import ppo_settings
 import torch
 import tqdm
 
@@ -62,7 +63,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """The settings of an environment."""
-    return Settings(**{**ppo.matching(id_, OVERRIDES.items()), **changes})
+    return Settings(**{**ppo_settings.matching(id_, OVERRIDES.items()), **changes})
 
 
 class Search:

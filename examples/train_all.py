@@ -32,6 +32,7 @@ from types import ModuleType
 from typing import Any
 
 import ppo
+import ppo_settings
 import search_gaits
 import tqdm
 
@@ -79,7 +80,7 @@ def program(id_: str) -> ModuleType:
 
 def depth(id_: str) -> int:
     """How many environments a policy has learnt in before it comes to this one."""
-    start = ppo.settings_for(id_).start
+    start = ppo_settings.settings_for(id_).start
     return 1 + depth(start) if start in catalogue.BY_ID else 0
 
 
@@ -90,9 +91,7 @@ def entries(id_: str) -> list[dict[str, Any]]:
         return []
     runs = json.loads(path.read_text())['runs']
     default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
-    for (
-        run
-    ) in runs:  # settings that came later were at their defaults, those that went made no change
+    for run in runs:  # later settings were at their defaults, those that went made no change
         own = run['settings']
         run['settings'] = {name: own.get(name, value) for name, value in default.items()}
     return runs
@@ -167,7 +166,7 @@ def main() -> None:
     ):
         running: dict[concurrent.futures.Future, tuple[str, int]] = {}
         for job in todo:  # each waits only for what was submitted earlier
-            start = ppo.settings_for(job[0]).start
+            start = ppo_settings.settings_for(job[0]).start
             before = [future for future, (id_, _) in running.items() if id_ == start]
             running[pool.submit(work, *job, before)] = job
         for done in concurrent.futures.as_completed(running):

@@ -10,7 +10,7 @@ from trl_suite import catalogue, evaluation
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import compare_transfer
 import evaluate_plans
-import ppo
+import ppo_settings
 import train_all
 
 
@@ -29,14 +29,14 @@ class JobsTest(parameterized.TestCase):
     def test_what_a_run_begins_with_is_trained_before(self):
         seen = set()
         for id_, _ in train_all.jobs('*'):
-            start = ppo.settings_for(id_).start
+            start = ppo_settings.settings_for(id_).start
             if start and start not in evaluation.BASELINES:
                 self.assertIn(start, seen, id_)
             seen.add(id_)
 
     def test_starts_act_as_what_begins_with_them(self):
         for id_ in catalogue.BY_ID:
-            start = ppo.settings_for(id_).start
+            start = ppo_settings.settings_for(id_).start
             if start in catalogue.BY_ID:
                 own, other = catalogue.BY_ID[id_], catalogue.BY_ID[start]
                 self.assertEqual(

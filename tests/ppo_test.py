@@ -1,7 +1,6 @@
 """The trainer of examples/ppo.py: its parts, that it goes on where it was stopped, that it learns."""
 
 import dataclasses
-import importlib.util
 import pathlib
 import sys
 import tempfile
@@ -13,10 +12,9 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import catalogue, evaluation, policies
 
-_PATH = pathlib.Path(__file__).resolve().parents[1] / 'examples' / 'ppo.py'
-_SPEC = importlib.util.spec_from_file_location('ppo', _PATH)
-ppo = sys.modules['ppo'] = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(ppo)
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import ppo
+import ppo_settings
 
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 TINY = {
@@ -59,7 +57,7 @@ class PartsTest(parameterized.TestCase):
 
     def test_every_environment_has_settings(self):
         for id_ in catalogue.BY_ID:
-            settings = ppo.settings_for(id_)
+            settings = ppo_settings.settings_for(id_)
             cycles = catalogue.BY_ID[id_].rules == 'gait'  # a step is 10 to 20 times longer
             plans = catalogue.BY_ID[id_].rules in ('hike', 'soccer')
             least = 5e4 if cycles or plans else 2e5 if settings.start else 5e5
@@ -70,7 +68,10 @@ class PartsTest(parameterized.TestCase):
 
     def test_gaits_that_stand_still_are_ended_in_training_only(self):
         trainer = ppo.Trainer(
-            'PD_Raptor2D_LLC_Imitate_Flat-v0', 0, ppo.Settings(**TINY, least_share={'com': 0.37}), 1
+            'PD_Raptor2D_LLC_Imitate_Flat-v0',
+            0,
+            ppo_settings.Settings(**TINY, least_share={'com': 0.37}),
+            1,
         )
         terms = {'com': np.full(8, 0.2)}  # the weight: on the clip's speed
         terms['com'][3] = 0.0  # nowhere near it
@@ -87,7 +88,7 @@ class RunTest(parameterized.TestCase):
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def train(self, name, **changes):
-        settings = ppo.Settings(**{**TINY, **changes})
+        settings = ppo_settings.Settings(**{**TINY, **changes})
         return ppo.train(FLAT, 3, settings, self.folder / name, threads=1, progress=False)
 
     def test_a_stopped_run_goes_on_as_if_it_had_not_been(self):
@@ -117,7 +118,7 @@ class RunTest(parameterized.TestCase):
 
     def test_the_exported_policy_may_be_an_average(self):
         batch = TINY['num_envs'] * TINY['horizon']
-        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY, averaged=4 * batch), 1)
+        trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, averaged=4 * batch), 1)
         bias, expected = trainer.policy[-1].bias, None
         for value in (1.0, 3.0, -5.0):
             with torch.no_grad():
@@ -127,7 +128,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(trainer.exported().biases[-1], expected, rtol=1e-6)
 
     def test_the_exported_policy_is_the_network(self):
-        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY), 1)
+        trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY), 1)
         for _ in range(3):
             trainer.learn(trainer.collect())
         with torch.no_grad():
@@ -147,7 +148,7 @@ class RunTest(parameterized.TestCase):
     def test_a_run_may_begin_with_another_policy(self, id_):
         start = 'PD_Biped2D_Flat_Terrain-v0'
         other = policies.reference(start)
-        settings = ppo.Settings(**{**TINY, 'hidden': (256, 256)}, start=start)
+        settings = ppo_settings.Settings(**{**TINY, 'hidden': (256, 256)}, start=start)
         trainer = ppo.Trainer(id_, 0, settings, 1)
         flat = ppo.Trainer(start, 0, settings, 1)
         observation = trainer.observation.copy()
@@ -168,7 +169,7 @@ class RunTest(parameterized.TestCase):
 
     def test_a_run_may_begin_with_what_a_baseline_does(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
-        settings = ppo.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
+        settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
         trainer = ppo.Trainer(id_, 0, settings, 1)
         teacher = evaluation.BASELINES['scripted'](trainer.environments)
         seen, shown = trainer.observation.copy(), teacher(trainer.observation)
@@ -178,7 +179,7 @@ class RunTest(parameterized.TestCase):
         self.assertLess(np.abs(trainer.exported()(seen) - shown).mean(), before / 2)
 
     def test_a_run_ends_when_it_has_learnt_enough(self):
-        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY, enough=0.9), 1)
+        trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
         for fractions, expected in (
             ((), False), ((0.95,), False), ((0.95, 0.8), False), ((0.8, 0.95), False),
             ((0.8, 0.9, 0.91), True),
@@ -187,8 +188,10 @@ class RunTest(parameterized.TestCase):
             self.assertEqual(trainer.has_learnt(), expected)
 
     def test_lessons_on_ever_higher_walls(self):
-        lessons = ppo.rising('mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5))
-        settings = ppo.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        lessons = ppo_settings.rising(
+            'mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5)
+        )
+        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
         trainer = first = ppo.Trainer('PD_Biped2D_Mixed_Terrain-v0', 0, settings, 1)
         heights = []
         for samples in (0, 100, 200):
@@ -202,8 +205,8 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(first.row.terrain, 'mixed_humanoid')  # where it is evaluated
 
     def test_lessons_with_obstacles_close_together(self):
-        lessons = ppo.crowded('slopes_mixed_humanoid')
-        settings = ppo.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        lessons = ppo_settings.crowded('slopes_mixed_humanoid')
+        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
         trainer = ppo.Trainer('PD_Biped2D_Slopes_Mixed_Terrain-v0', 0, settings, 1)
         spacings, types = [], []
         for samples in (0, 100, 200):
@@ -236,14 +239,14 @@ class RunTest(parameterized.TestCase):
         self.assertIsNone(ppo.visible({'pose': slice(0, 6)}, (2.5, 1.0)))
 
     def test_a_policy_that_acts_otherwise_is_no_start(self):
-        settings = ppo.Settings(
+        settings = ppo_settings.Settings(
             **{**TINY, 'hidden': (256, 256)}, start='PD_Dog2D_LLC_Imitate_Flat-v0'
         )
         with self.assertRaisesRegex(ValueError, 'PD_Biped2D_Flat-v0 does not act as PD_Dog2D'):
             ppo.Trainer('PD_Biped2D_Flat-v0', 0, settings, 1)
 
     def test_an_update_ends_when_the_policy_has_moved_enough(self):
-        trainer = ppo.Trainer(FLAT, 0, ppo.Settings(**TINY, kl_per_action=-1.0), 1)
+        trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, kl_per_action=-1.0), 1)
         before = [p.detach().clone() for p in trainer.parameters]
         trainer.learn(trainer.collect())
         for a, b in zip(before, trainer.parameters, strict=True):
@@ -251,7 +254,7 @@ class RunTest(parameterized.TestCase):
 
     def test_a_cut_episode_is_worth_what_would_follow(self):
         """Where nothing but the step limit ends episodes, targets do not dip before it."""
-        settings = ppo.Settings(**{**TINY, 'horizon': 4})
+        settings = ppo_settings.Settings(**{**TINY, 'horizon': 4})
         trainer = ppo.Trainer(
             dataclasses.replace(catalogue.BY_ID[FLAT], step_limit=2), 0, settings, 1
         )
@@ -265,7 +268,7 @@ class RunTest(parameterized.TestCase):
 
     def test_it_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
-        settings = ppo.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
+        settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
         folder = self.folder / 'run'
         ppo.train(FLAT, 0, settings, folder, threads=1, progress=False)
         found = evaluation.evaluate(FLAT, policies.load(folder / 'last.npz'), 32, seed=1)

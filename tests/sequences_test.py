@@ -215,10 +215,10 @@ class ExampleTest(absltest.TestCase):
         pair = sequences.Sequence('pair', ('plaid/biped_flat', 'plaid/biped_gaps'))
         self.enterContext(mock.patch.dict(sequences.SEQUENCES, pair=pair))
         small = {'num_envs': 16, 'hidden': (32, 32), 'minibatch': 128}
-        settings = example.ppo.settings_for
+        settings = example.ppo_settings.settings_for
         self.enterContext(
             mock.patch.object(
-                example.ppo, 'settings_for', lambda id_, **k: settings(id_, **k, **small)
+                example.ppo_settings, 'settings_for', lambda id_, **k: settings(id_, **k, **small)
             )
         )
         # Quicker than episodes, and as telling: what the network has become.
