@@ -24,6 +24,7 @@ from trl_suite.tasks.plans import (
     options,
 )
 from trl_suite.tasks.reference3d import SpatialReference
+from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
 from trl_suite.world import World
@@ -417,7 +418,7 @@ class Footsteps(Tracking):
         plan[:, :12] = slots.reshape(n, 12)
         plan[:, 12] = self._off
 
-    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _extra_mirror(self, name: str) -> Reflection:
         if name == 'contact':
             return np.array([1, 0]), np.ones(2)
         index = np.arange(13)

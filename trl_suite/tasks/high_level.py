@@ -20,13 +20,13 @@ from trl_suite.characters import Character
 from trl_suite.controllers import llc
 from trl_suite.motion import Steps, quaternion
 from trl_suite.symmetry import Mirror
-from trl_suite.tasks import rewards
+from trl_suite.tasks import reflection3d, rewards
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
 from trl_suite.tasks.plans import span
 from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed, drawn_way
 from trl_suite.tasks.trace import Trace
-from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, POSE, SUBSTEPS
+from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
 from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
@@ -164,17 +164,16 @@ class HighLevel(Footsteps):
 
     def _plan_mirror(self) -> Mirror:
         """How observations and plans are reflected."""
-        parts = self._body_mirror()
+        parts = reflection3d.body(self.character)
         lines, _ = parts['terrain']
         ahead = np.ones(len(lines))
         parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
         for name, signs in self.GOAL_BLOCKS.items():
             parts[name] = np.arange(len(signs)), np.array(signs)
-        index = np.concatenate([part.start + parts[name][0] for name, part in self.blocks.items()])
-        sign = np.concatenate([parts[name][1] for name in self.blocks])
+        index, sign = reflection3d.joined(self.blocks, parts)
         links = list(self.character.row.links)
         feet = [links.index(name) for name in self.character.row.end_effectors]
-        right, left = self.blocks['pose'].start + 1 + len(POSE) * np.array(feet)
+        right, left = self.blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
         return Mirror(
             index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
         )

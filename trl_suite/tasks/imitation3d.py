@@ -16,6 +16,7 @@ from trl_suite.motion import Clip, quaternion
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.reference3d import SpatialReference
+from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import drawn_seed
 from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
 from trl_suite.terrain import Ground
@@ -161,7 +162,7 @@ class SpatialImitation(Tracking):
         way[:, 0, 1] = self._origin[:, 1] - found.root[:, 1]
         goal[...] = polar(way, found)
 
-    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _extra_mirror(self, name: str) -> Reflection:
         assert name == 'goal', name  # mirrored observations have no target
         return np.arange(2), np.array([-1.0, 1.0])
 

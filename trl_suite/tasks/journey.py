@@ -22,6 +22,7 @@ from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, Footsteps
 from trl_suite.tasks.high_level import GOAL_LASTS, flag
 from trl_suite.tasks.imitation3d import SpatialImitation
+from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import Marker, consecutive
 from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
@@ -281,7 +282,7 @@ class BallJourney(Journey):
         goal[...] = polar((self.goal - self.ball.place)[:, None, :2], found)
         self.ball.write(found, self._observation[:, self._full['ball']])
 
-    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _extra_mirror(self, name: str) -> Reflection:
         if name == 'ball':
             return np.arange(len(ball.MIRRORED)), np.array(ball.MIRRORED)
         return super()._extra_mirror(name)
@@ -335,7 +336,7 @@ class HiddenSteps(Footsteps):
     def _extra_blocks(self) -> dict[str, int]:
         return {**super()._extra_blocks(), 'goal': 2}
 
-    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _extra_mirror(self, name: str) -> Reflection:
         if name == 'goal':
             return np.arange(2), np.array([-1.0, 1.0])
         return super()._extra_mirror(name)

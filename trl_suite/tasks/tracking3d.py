@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from trl_suite import actuation, errors
-from trl_suite.actuation import ActionMap
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.motion import Clip, Steps
-from trl_suite.symmetry import Mirror, blocks, exchanged
-from trl_suite.tasks import rewards
+from trl_suite.symmetry import Mirror
+from trl_suite.tasks import reflection3d, rewards
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.reference3d import SpatialReference, mean_targets
 from trl_suite.tasks.task import (
@@ -26,7 +25,6 @@ from trl_suite.tasks.task import (
     start_phases,
 )
 from trl_suite.terrain import Ground
-from trl_suite.terrain.surroundings import SAMPLES
 from trl_suite.world import World
 
 CONTROL_TIMESTEP = 1 / 30  # s
@@ -36,9 +34,6 @@ PHASE_BINS = 4
 MIRRORED_BINS = 2  # of the phase of a single step
 CENTRES = ('clip', 'posture', 'original')  # of position control
 _DIGITS = 9  # of the clock, in cycles
-# Signs in a mirror, the x-z plane.
-_VECTOR, _QUATERNION, _SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
-POSE = (*_VECTOR, *_QUATERNION)  # of what the block of the pose has for each link
 
 
 class Tracking(Task):
@@ -153,8 +148,8 @@ class Tracking(Task):
         """
 
     @abc.abstractmethod
-    def _extra_mirror(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns index and sign by which a block of the subclass is reflected."""
+    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
+        """Returns how a block of the subclass is reflected."""
 
     def _canonical_extras(self, extras: dict[str, int]) -> dict[str, int]:
         """Returns blocks of the subclass, with their sizes, as mirrored observations have them."""
@@ -344,51 +339,16 @@ class Tracking(Task):
 
     # Left and right.
 
-    def _body_mirror(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """How the blocks of the body and of the map around it are reflected: index and sign."""
-        row = self.character.row
-        names = list(row.links)
-        pairs = [(names.index(a), names.index(b)) for a, b in row.mirror]
-        links = exchanged(len(names), pairs)
-        grid = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1]  # lines from the left
-        index, sign = blocks(links, POSE)
-        return {
-            'terrain': (grid.ravel(), np.ones(grid.size)),
-            'pose': (np.append(0, 1 + index), np.append(1.0, sign)),
-            'velocity': blocks(links, (*_VECTOR, *_SPIN)),
-        }
-
     def _mirror(self) -> Mirror:
         """How full observations and actions are reflected."""
-        parts = self._body_mirror()
-        bins = np.roll(np.arange(PHASE_BINS), PHASE_BINS // 2)
-        parts['phase'] = np.append(0, 1 + bins), np.ones(1 + PHASE_BINS)
-        for name in self._full:
-            if name not in parts:
-                parts[name] = self._extra_mirror(name)
-        index = np.concatenate([self._full[name].start + parts[name][0] for name in self._full])
-        sign = np.concatenate([parts[name][1] for name in self._full])
-        action_index, action_sign = self._action_mirror(self.action_map)
-        return Mirror(index, sign, action_index, action_sign, self._full['phase'].start)
-
-    def _action_mirror(self, action_map: ActionMap) -> tuple[np.ndarray, np.ndarray]:
-        row = self.character.row
-        joints = list(row.joints)
-        starts: list[int] = []
-        signs: list[float] = []
-        original = isinstance(action_map, actuation.AngleAxisMap)
-        ball = (1.0, -1.0, -1.0, 1.0) if original else _SPIN  # angle; forward, up, right
-        for spherical in self.character.spherical.tolist():
-            starts.append(len(signs))
-            signs += ball if spherical else (1.0,)
-        index = np.arange(len(signs))
-        for a, b in row.mirror:
-            i, j = (starts[joints.index(name)] for name in (a, b))
-            width = len(ball) if self.character.spherical[joints.index(a)] else 1
-            index[i : i + width], index[j : j + width] = (
-                np.arange(j, j + width), np.arange(i, i + width),
-            )  # fmt: skip
-        return index, np.array(signs)
+        parts = reflection3d.body(self.character)
+        parts['phase'] = reflection3d.phase(PHASE_BINS)
+        parts |= {name: self._extra_mirror(name) for name in self._full if name not in parts}
+        return Mirror(
+            *reflection3d.joined(self._full, parts),
+            *reflection3d.actions(self.character, self.action_map),
+            self._full['phase'].start,
+        )
 
     def _canonical_columns(self) -> np.ndarray:
         """Which columns of a full observation in right stance a mirrored one has."""
