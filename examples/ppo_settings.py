@@ -234,6 +234,11 @@ CROWDED = {
 }  # fmt: skip
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
+# What planning footsteps does without: the walk is there, where to go with it is learnt.
+JOURNEYS = {
+    'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
+    'start': 'PD_Biped3D_Imitate-v0',
+}  # fmt: skip
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
@@ -284,6 +289,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # Its observation is mirrored.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
+    ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
