@@ -545,19 +545,33 @@ def train(
     return trainer.curve
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def command_line(
+    description: str, sample: str
+) -> tuple[str, int, dict[str, Any], pathlib.Path, int]:
+    """What a program that trains is asked for.
+
+    Args:
+      description: of the program.
+      sample: what its samples are.
+
+    Returns:
+      Id, seed, settings that are not the default, folder and threads.
+    """
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--threads', type=int, default=0, help='0: all cores')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument('--samples', type=float, help='control steps, instead of the default')
-    arguments = parser.parse_args()
-    id_ = suite.find(arguments.id).id
-    changes = {} if arguments.samples is None else {'samples': arguments.samples}
-    folder = arguments.output / id_ / f'seed_{arguments.seed}'
-    curve = train(id_, arguments.seed, settings_for(id_, **changes), folder, arguments.threads)
-    for point in curve:
+    parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
+    chosen = parser.parse_args()
+    id_ = suite.find(chosen.id).id
+    changes = {} if chosen.samples is None else {'samples': chosen.samples}
+    return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
+
+
+def main() -> None:
+    id_, seed, changes, folder, threads = command_line(__doc__.splitlines()[0], 'control steps')
+    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(f'{point["samples"]:9} {point["fraction"]:.3f} of the maximum, {point["full"]:.0%}')
     print(folder / 'policy.npz')
 

@@ -16,7 +16,6 @@ of the curve), `last.npz`, and `decisions.npz`, from which the same command goes
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import pathlib
@@ -30,7 +29,7 @@ import ppo_settings
 import torch
 import tqdm
 
-from trl_suite import characters, evaluation, files, policies, suite
+from trl_suite import characters, evaluation, files, policies
 from trl_suite.tasks import gait
 from trl_suite.vector import VectorEnvironment
 
@@ -286,18 +285,8 @@ def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarr
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--threads', type=int, default=0, help='0: all cores')
-    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument('--samples', type=float, help='decisions, instead of the default')
-    arguments = parser.parse_args()
-    id_ = suite.find(arguments.id).id
-    changes = {} if arguments.samples is None else {'samples': arguments.samples}
-    folder = arguments.output / id_ / f'seed_{arguments.seed}'
-    curve = train(id_, arguments.seed, settings_for(id_, **changes), folder, arguments.threads)
-    for point in curve:
+    id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'decisions')
+    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(
             f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["full"]:.0%} complete'
         )

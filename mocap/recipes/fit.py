@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import figure
 import numpy as np
@@ -221,8 +221,20 @@ def residuals(guess: run.Run, physics: float) -> np.ndarray:
     return np.concatenate([np.ravel(part) for part in out])
 
 
-def fit(start: run.Run, bounds: Mapping[str, tuple[float, float]], evaluations: int = 25):
-    """Returns the run of the same pace with fitted figures, and the final cost."""
+def fit(
+    start: run.Run,
+    bounds: Mapping[str, tuple[float, float]],
+    residuals: Callable[[run.Run, float], np.ndarray],
+    evaluations: int = 25,
+) -> tuple[run.Run, float]:
+    """Returns the run of the same pace with fitted figures, and the final cost.
+
+    Args:
+      start: where the search begins.
+      bounds: of those figures that are fitted.
+      residuals: of a run, with a weight of its inverse dynamics; see `residuals`.
+      evaluations: the most, of each of two stages.
+    """
     names = [name for name in bounds if name in start.shape]
     low, high = np.array([bounds[name] for name in names]).T
 
@@ -248,7 +260,8 @@ def find(name: str) -> tuple[run.Run, float]:
     found = dataclasses.replace(found, shape={**found.shape, **QUICKER[name]})
     bounds = BOUNDS | NARROWER[found.character]
     for speed, period in PACES[name]:
-        found, cost = fit(dataclasses.replace(found, speed=speed, period=period), bounds)
+        pace = dataclasses.replace(found, speed=speed, period=period)
+        found, cost = fit(pace, bounds, residuals)
     return found, cost
 
 

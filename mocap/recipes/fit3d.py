@@ -17,7 +17,6 @@ import fit
 import numpy as np
 import run
 import run3d
-from scipy import optimize
 
 # A first run to start from, with the foot slow to leave and meet the ground (rise 3).
 START = run.Run(
@@ -186,31 +185,9 @@ def residuals(guess: run.Run, physics: float) -> np.ndarray:
     return np.concatenate([np.ravel(part) for part in out])
 
 
-def find(name: str, evaluations: int = 25) -> tuple[run.Run, float]:
-    """Returns the run of a clip from its start, and its final cost."""
-    start = STARTS[name]
-    names = [key for key in BOUNDS[name] if key in start.shape]
-    low, high = np.array([BOUNDS[name][key] for key in names]).T
-
-    def guess(x):
-        return dataclasses.replace(start, shape={**start.shape, **dict(zip(names, x, strict=True))})
-
-    x = np.array([start.shape[key] for key in names])
-    for physics in (0.3, 1.0):
-        result = optimize.least_squares(
-            lambda x, physics=physics: residuals(guess(x), physics),
-            np.clip(x, low + 1e-6, high - 1e-6),
-            bounds=(low, high),
-            x_scale=high - low,
-            max_nfev=evaluations,
-        )
-        x = result.x
-    return guess(x.tolist()), float(result.cost)
-
-
 def main(names: list[str]) -> None:
     for name in names or STARTS:
-        found, cost = find(name)
+        found, cost = fit.fit(STARTS[name], BOUNDS[name], residuals)
         print(f'{name}: {found.character}, {found.speed} m/s, {found.period} s, cost {cost:.3f}')
         for group, keys in {**run.SHAPE, 'space': run3d.SPACE}.items():
             if keys[0] in found.shape:
