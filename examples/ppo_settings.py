@@ -105,7 +105,7 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # so far away that the reward has to reach there, and be accurate again. At last a foot that lands far
 # away ends the episode but for two seconds after a push or a sharp turn: without that it drifts off
 # the plan.
-WALKER = 31e6  # samples
+WALKER = 33e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 LESSONS = (
     (0.0, {
