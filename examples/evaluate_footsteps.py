@@ -51,6 +51,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     'general': {'plans': {}},
     'varied lengths and widths': {'plans': VARIED},
     'made from the root': {'plans': {'from_root': 1.0}},
+    'made from the root, on the spot': {'plans': {'from_root': 1.0, 'root_length': (0.0, 0.0)}},
     'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
     'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
     'ramp down 8 %': {'plans': STEADY, 'terrain': ramp(-0.08)},
@@ -128,7 +129,7 @@ def main() -> None:
             row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
         )
         print(
-            f'{name:28} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
+            f'{name:32} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
             f'heading {result["heading"]:.3f} rad',
             flush=True,
