@@ -52,6 +52,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     'varied lengths and widths': {'plans': VARIED},
     'made from the root': {'plans': {'from_root': 1.0}},
     'made from the root, on the spot': {'plans': {'from_root': 1.0, 'root_length': (0.0, 0.0)}},
+    'made from the root, turning about': {'plans': {'from_root': 1.0, 'root_turn': 0.6}},
     'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
     'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
     'ramp down 8 %': {'plans': STEADY, 'terrain': ramp(-0.08)},
@@ -129,7 +130,7 @@ def main() -> None:
             row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
         )
         print(
-            f'{name:32} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
+            f'{name:34} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
             f'heading {result["heading"]:.3f} rad',
             flush=True,

@@ -233,7 +233,7 @@ class PlanTest(parameterized.TestCase):
         self.assertGreater(np.ptp(lengths[0]), 0.3)  # drawn anew at every start
 
     def test_plans_made_from_the_root(self):
-        rows, found = walked(60, 16, plans={'from_root': 1.0})
+        rows, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
         task = rows._task
         measured = task.figure.measure()
         lengths, widths, turns = [], [], []
@@ -248,10 +248,10 @@ class PlanTest(parameterized.TestCase):
         assert_uniform(lengths, 0.2 - 1e-9, 0.7 + 1e-9)
         assert_uniform(widths, 0.08 - 1e-9, 0.28 + 1e-9)
         turns = np.ravel(turns)
-        self.assertLessEqual(np.abs(turns).max(), 0.8 + 1e-9)
-        # N(0, 0.3) cut at 0.8, which is 2.67 deviations.
-        self.assertAlmostEqual(turns.std(), 0.299, delta=0.03)
-        self.assertBetween(np.mean(np.abs(turns) > 0.8 - 1e-6), 0.0, 0.025)
+        self.assertLessEqual(np.abs(turns).max(), 1.2 + 1e-9)
+        # N(0, 0.45) cut at 1.2, which is 2.67 deviations.
+        self.assertAlmostEqual(turns.std(), 0.448, delta=0.045)
+        self.assertBetween(np.mean(np.abs(turns) > 1.2 - 1e-6), 0.0, 0.025)
 
     def test_some_plans_from_the_root(self):
         _, found = walked(80, 12, plans={'from_root': 0.3})

@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import errors
 
-ROOT_TURN_LIMIT = 0.8  # rad; the most that a plan made from the root turns
+ROOT_TURN_LIMIT = 1.2  # rad; the most that a plan made from the root turns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Plans:
       from_root: probability that a plan is made anew from where the body is and heads, as a
         high-level controller makes plans.
       root_length, root_width: of the steps of such a plan, m: least and most.
-      root_turn: spread of its turn off the present heading, rad; cut at 0.8.
+      root_turn: spread of its turn off the present heading, rad; cut at 1.2.
     """
 
     length: tuple[float, float] = (0.5, 0.5)
