@@ -16,7 +16,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 import trl_suite
-from trl_suite import catalogue, policies, resources, suite
+from trl_suite import catalogue, motion, policies, resources, suite
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -443,6 +443,28 @@ class ShippedTest(parameterized.TestCase):
     @unittest.skip('until all are trained')
     def test_every_row_has_one(self):
         self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
+
+    def test_every_planar_row_that_tracks_a_clip_has_one(self):
+        rows = [row for row in catalogue.ROWS if row.rules == 'imitation' and 'planar' in row.tags]
+        self.assertLen(rows, 42)
+        self.assertContainsSubset([row.id for row in rows], policies.available())
+
+    @parameterized.parameters(
+        *(
+            row.id
+            for row in catalogue.ROWS
+            if row.domain == 'plaid' and row.id in policies.available()
+        )
+    )
+    def test_who_does_not_fall_gets_on(self, id_):
+        """Standing in front of a wall until time is up is no way of crossing terrain."""
+        entry = json.loads((resources.directory('trained') / f'{id_}.json').read_text())
+        found = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
+        full = np.equal(found['lengths'], found['step_limit'])
+        distances = np.array(found['distances'])[full]
+        clip = motion.load(catalogue.BY_ID[id_].clip)
+        whole = clip.speed * found['step_limit'] / 30  # m; as the clip goes
+        self.assertGreater(np.median(distances), 0.7 * whole)
 
 
 class ImportTest(absltest.TestCase):
