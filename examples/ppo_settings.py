@@ -284,6 +284,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
     ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
+    ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
     # In three dimensions the planar noise fells the body before it has learnt anything.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
