@@ -119,8 +119,10 @@ def advantages(
     return result
 
 
-def visible(blocks: dict[str, slice], view: tuple[float, float] | None) -> np.ndarray | None:
-    """Which columns of an observation are no part of a map of the ground, or near enough."""
+def visible(
+    blocks: dict[str, slice], inputs: int, view: tuple[float, float] | None
+) -> np.ndarray | None:
+    """Which of so many columns of an observation are no part of a map of the ground, or near enough."""
     maps = [name for name in MAPS if name in blocks]
     if view is None or not maps:
         return None
@@ -128,7 +130,7 @@ def visible(blocks: dict[str, slice], view: tuple[float, float] | None) -> np.nd
     forward = np.linspace(*surroundings.AHEAD, surroundings.SAMPLES)[along]
     aside = np.linspace(-surroundings.ASIDE, surroundings.ASIDE, surroundings.SAMPLES)[lines]
     near = (forward <= view[0]) & (np.abs(aside) <= view[1])
-    seen = np.ones(max(block.stop for block in blocks.values()), bool)
+    seen = np.ones(inputs, bool)
     for name in maps:
         part = blocks[name]
         seen[part] = np.tile(near, (part.stop - part.start) // len(near))
@@ -152,9 +154,12 @@ class Trainer:
         terms = getattr(self.environments.task, 'TERMS', rewards.IMITATION_TERMS)
         self.largest = {name: weight for name, (weight, _) in terms.items()}
         self.random = np.random.default_rng(seed)
-        inputs, outputs = self.observation.shape[1], len(self.environments.action_map)
-        columns = visible(self.environments.blocks, s.view)
-        self.scales = Scales(self.environments.blocks, inputs, columns)
+        outputs, blocks = len(self.environments.action_map), self.environments.blocks
+        starts = [blocks[name].start for name in s.places]
+        self.places = np.add.outer(starts, (0, 1)) if starts else None
+        inputs = self.observation.shape[1] + 2 * len(starts)
+        columns = visible(blocks, inputs, s.view)
+        self.scales = Scales(blocks, inputs, columns)
         inputs = inputs if columns is None else len(columns)
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
@@ -216,6 +221,14 @@ class Trainer:
             if part.stop - (part.start or 0) == size:
                 column[part] = offset + np.arange(size)
             offset += size
+        own, others = self.places, other.places
+        if own is not None and others is not None:
+            same_place = (column[own][:, None] == others).all(-1)  # (own, others)
+            for i, j in np.argwhere(same_place):
+                column[len(column) - own.size + 2 * i + np.arange(2)] = (
+                    offset + 2 * j + np.arange(2)
+                )
+        offset += 0 if others is None else others.size
         seen = np.arange(offset) if other.columns is None else other.columns
         entry = np.full(offset + 1, -1)  # of the other's network; the last one is for -1
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
@@ -272,7 +285,7 @@ class Trainer:
         """Steps all rows `horizon` times; returns the samples, flattened."""
         s, environments = self.settings, self.environments
         shape = (s.horizon, s.num_envs)
-        observations = np.empty((s.horizon + 1, *self.observation.shape))
+        observations = np.empty((s.horizon + 1, s.num_envs, len(self.scales.mean)))
         noise = self.random.standard_normal((*shape, len(self.log_std)), np.float32)
         means, actions = np.empty_like(noise), np.empty_like(noise)
         reward, ended, failed = np.empty(shape), np.empty(shape, bool), np.empty(shape, bool)
@@ -322,9 +335,12 @@ class Trainer:
 
     def seen(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Observations as the policy sees them, and which of them are reflected."""
-        if self.mirror is None:
-            return observation, np.zeros(len(observation), bool)
-        return self.mirror.canonical(observation)
+        left = np.zeros(len(observation), bool)
+        if self.mirror is not None:
+            observation, left = self.mirror.canonical(observation)
+        if self.places is not None:
+            observation = policies.placed(observation, self.places)
+        return observation, left
 
     def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
         """Rows whose reward terms have been too low for too long."""
@@ -398,6 +414,7 @@ class Trainer:
             quantity=self.environments.action_map.quantity,
             mean=self.scales.mean if columns is None else self.scales.mean[columns],
             std=self.scales.std if columns is None else self.scales.std[columns],
+            places=self.places,
             columns=columns,
             clip=OBSERVATION_CLIP,
             weights=tuple(weights),

@@ -48,6 +48,9 @@ class Settings:
     mirrored: bool = False
     # What the network sees of a map of the terrain: how far ahead and to each side, m; None: all.
     view: tuple[float, float] | None = None
+    # Blocks of the observation that begin with bearing and distance of a place, which the network
+    # then sees in a straight line, too (see `trl_suite.policies.placed`).
+    places: tuple[str, ...] = ()
     # Lessons: from which share of the samples on, with which options of the task; and on which
     # `terrain`, if another. Evaluations have those of the environment.
     lessons: tuple[tuple[float, dict[str, Any]], ...] = ()

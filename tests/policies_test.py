@@ -151,6 +151,17 @@ class ActTest(parameterized.TestCase):
         )  # fmt: skip
         np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
 
+    def test_it_may_see_places_in_a_straight_line(self):
+        """Near ones where they are, far ones as a direction; columns count with them."""
+        policy = make(
+            hidden=(), places=np.array([[1, 2], [4, 3]]), columns=np.array([7, 8, 9, 10]),
+            mean=np.zeros(4), std=np.ones(4), clip=9, log_std=np.zeros(4), actions=tuple('abcd'),
+            weights=[np.eye(4) / 2], biases=[np.zeros(4)],
+        )  # fmt: skip
+        observation = np.array([9, np.pi / 6, 0.5, 20, -np.pi / 2, 9, 9])
+        expected = [0.5 * 3**0.5 / 2, 0.5 / 2, 0, -1]
+        np.testing.assert_allclose(policy(observation), np.array(expected) / 2, atol=1e-6)
+
     def test_samples(self):
         # Not clipped before the noise: a mean far outside stays outside.
         policy = make(
@@ -187,6 +198,10 @@ class ActTest(parameterized.TestCase):
         ({'info': [1]}, 'info: expected a dict'),
         ({'columns': np.array([0.5])}, 'columns: expected integers, at least one'),
         ({'columns': np.array([7])}, 'columns: expected numbers of 0 to 6'),
+        ({'places': np.array([0, 1])}, 'places: expected integers, at least one'),
+        ({'places': np.array([[0, 7]])}, 'places: expected numbers of 0 to 6'),
+        ({'places': np.array([[0, 1, 2]])}, r'places: has shape \(1, 3\); expected \(p, 2\)'),
+        ({'places': np.array([[0, 1]])}, r'mean: has shape \(7,\); expected \(9,\)'),
         ({'columns': np.array([0, 6])}, r'mean: has shape \(7,\); expected \(2,\)'),
         ({'choices': np.zeros((3, 2))}, r'weight_2: has shape \(5, 2\); expected \(5, 3\)'),
         ({'choices': np.zeros((2, 3))}, r'choices: has shape \(2, 3\); expected \(2, 2\)'),
@@ -261,15 +276,14 @@ class FileTest(FolderTest):
 
     def test_what_not_every_policy_has_comes_back(self):
         policy = make(
-            columns=np.array([0, 2, 5]), mean=np.zeros(3), std=np.ones(3),
+            places=np.array([[3, 1]]), columns=np.array([0, 2, 8]), mean=np.zeros(3), std=np.ones(3),
             weights=[np.ones((3, 4))], biases=[np.arange(4)],
             choices=np.random.default_rng(0).uniform(-1, 1, (4, 2)),
         )  # fmt: skip
         policies.save(policy, self.folder / 'p.npz')
         again = policies.load(self.folder / 'p.npz')
-        for name in ('columns', 'choices'):
-            np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
         for name in policies._OPTIONAL:
+            np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
             self.assertRegex(policies.__doc__, rf'\n    {name}\b')
 
     def test_the_format_is_the_documented_one(self):

@@ -167,6 +167,30 @@ class RunTest(parameterized.TestCase):
         trainer.learn(trainer.collect())
         self.assertTrue((trainer.exported().weights[0] != before[0]).any())
 
+    def test_places_are_seen_in_a_straight_line(self):
+        """By the network in training as by what it exports; and a start that saw them fits."""
+        id_, places = 'PD_Biped3D_HLC_Soccer-v0', ('target', 'ball')
+        settings = ppo_settings.Settings(**TINY, places=places, mirrored=True)
+        trainer = ppo.Trainer(id_, 0, settings, 1)
+        trainer.learn(trainer.collect())
+        policy = trainer.exported()
+        blocks = trainer.environments.blocks
+        expected = [[blocks[name].start, blocks[name].start + 1] for name in places]
+        np.testing.assert_array_equal(policy.places, expected)
+        self.assertLen(policy.mean, policy.observation_size + 4)
+        observation, left = trainer.seen(trainer.observation)
+        with torch.no_grad():
+            inside = trainer.policy(trainer.scales(observation)).numpy()
+        inside = trainer.mirror.answered(inside, left)
+        np.testing.assert_allclose(policy(trainer.observation), np.clip(inside, -1, 1), atol=1e-5)
+        # What has not varied would not be taken over.
+        policy = dataclasses.replace(policy, std=np.ones_like(policy.std))
+        for names, same in ((places, True), (places[::-1], True), (places[1:], False)):
+            other = ppo.Trainer(id_, 1, dataclasses.replace(settings, places=names), 1)
+            other.begin_with(policy)
+            found = other.exported()(trainer.observation)
+            self.assertEqual(np.allclose(found, policy(trainer.observation), atol=1e-4), same)
+
     def test_a_run_may_begin_with_what_a_baseline_does(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
@@ -230,13 +254,15 @@ class RunTest(parameterized.TestCase):
         """Both maps of velocities are cut as that of heights."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
         two = {'surface': slice(0, 2048), 'pose': slice(2048, 2054)}
-        near, both = (ppo.visible(blocks, (2.5, 1.0)) for blocks in (one, two))
+        near, both = (
+            ppo.visible(blocks, size, (2.5, 1.0)) for blocks, size in ((one, 1030), (two, 2054))
+        )
         count = len(near) - 6
         # 11 m by 11 m at 32 by 32 points: 3.5 m along, 2 m across.
         self.assertEqual(count, 10 * 6)
         np.testing.assert_array_equal(both[count : 2 * count], near[:count] + 1024)
         np.testing.assert_array_equal(both[-6:], np.arange(2048, 2054))
-        self.assertIsNone(ppo.visible({'pose': slice(0, 6)}, (2.5, 1.0)))
+        self.assertIsNone(ppo.visible({'pose': slice(0, 6)}, 6, (2.5, 1.0)))
 
     def test_a_policy_that_acts_otherwise_is_no_start(self):
         settings = ppo_settings.Settings(

@@ -10,8 +10,8 @@
         time_step = environment.step(policy(time_step.observation))
 
 A file holds these arrays and no pickled objects (U is text, a the number of actions, k the number
-of observations, L the number of layers, c the number of observations that the network sees: k, unless
-there are `columns`):
+of observations, L the number of layers, c the number of inputs of the network: k, unless there are
+`places` or `columns`):
 
     format       U ()        'trl_suite policy'
     version      int ()      1
@@ -38,9 +38,14 @@ and, if the policy sees left stance as right stance in a mirror (see `trl_suite.
     mirror_action_index       int (a,)
     mirror_action_sign        float (a,)
 
+and, if the network sees p places that are observed as bearing and distance in a straight line, too:
+
+    places       int (p, 2)  columns of the bearing, rad, and of the distance, m, after any mirror;
+                             `placed` has what it sees of them, after all else
+
 and, if the network sees only a part of it, say of a map of the terrain what is near:
 
-    columns      int (c,)    of the observation, after any mirror
+    columns      int (c,)    of the observation, after any mirror and with the 2p numbers of places
 
 and, if it chooses among b actions instead of composing one, as mixtures of experts do:
 
@@ -86,7 +91,8 @@ _MIRROR = {
     'action_index': ('iu', 1), 'action_sign': ('f', 1),
 }  # fmt: skip
 _SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
-_OPTIONAL = {'columns': ('iu', 1), 'choices': ('f', 2)}
+_OPTIONAL = {'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2)}
+REACH = 1.0  # m; within which a network sees where a place is, and farther away its direction
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +115,10 @@ class Policy:
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was made; what JSON can hold.
       mirror: how it sees left stance as right stance; None if it sees all as it is.
-      columns: of the observation, after any mirror, that the network sees, (c,); None: all.
+      places: columns of bearing and distance of what the network sees in a straight line, too, as
+        `placed` adds it, (p, 2); None: nothing.
+      columns: of the observation, after any mirror and with such places, that the network sees, (c,);
+        None: all.
       choices: actions of which the one with the largest output is taken, (b, a); None: the outputs
         are the action.
 
@@ -130,6 +139,7 @@ class Policy:
     log_std: np.ndarray = dataclasses.field(repr=False)
     info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
     mirror: Mirror | None = dataclasses.field(default=None, repr=False)
+    places: np.ndarray | None = dataclasses.field(default=None, repr=False)
     columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
     choices: np.ndarray | None = dataclasses.field(default=None, repr=False)
 
@@ -150,15 +160,14 @@ class Policy:
             raise ValueError(errors.unknown('activation', self.activation, ACTIVATIONS))
         k, a = self.observation_size, len(self.actions)
         seen = k
+        if self.places is not None:
+            put('places', _columns('places', self.places, 2, k))
+            if self.places.shape[1] != 2:
+                raise ValueError(f'places: has shape {self.places.shape}; expected (p, 2)')
+            seen += self.places.size
         if self.columns is not None:
-            columns = np.array(self.columns)
-            if columns.ndim != 1 or columns.dtype.kind not in 'iu' or not len(columns):
-                raise ValueError('columns: expected integers, at least one')
-            if columns.min() < 0 or columns.max() >= k:
-                raise ValueError(f'columns: expected numbers of 0 to {k - 1}')
-            columns.setflags(write=False)
-            put('columns', columns)
-            seen = len(columns)
+            put('columns', _columns('columns', self.columns, 1, seen))
+            seen = len(self.columns)
         put('mean', _array('mean', self.mean, (seen,)))
         put('std', _array('std', self.std, (seen,)))
         if not (self.std > 0).all():
@@ -277,6 +286,8 @@ class Policy:
         seen, left = np.atleast_2d(flat), None
         if self.mirror is not None:
             seen, left = self.mirror.canonical(seen)
+        if self.places is not None:
+            seen = placed(seen, self.places)
         if self.columns is not None:
             seen = seen.take(self.columns, 1)
         x = np.clip((seen - self.mean) / self.std, -self.clip, self.clip)
@@ -292,6 +303,22 @@ class Policy:
         if self.mirror is not None and left is not None:
             x = self.mirror.answered(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+
+def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Adds to observations (n, k) how far ahead and to the left places are, (n, k + 2p).
+
+    A bearing jumps behind the back, and what is near is seen too coarsely beside what is far. So a
+    place within `REACH` is seen where it is, in units of it, and one farther away as a direction.
+
+    Args:
+      observation: (n, k).
+      places: columns of bearing and distance, (p, 2).
+    """
+    bearing, distance = observation[:, places[:, 0]], observation[:, places[:, 1]]
+    near = np.minimum(distance / REACH, 1)
+    straight = np.stack([near * np.cos(bearing), near * np.sin(bearing)], axis=-1)
+    return np.concatenate([observation, straight.reshape(len(observation), -1)], axis=1)
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
@@ -433,6 +460,17 @@ def _read(archive: Any, field: str, kind: str, axes: int) -> np.ndarray:
     array = archive[field]
     if array.dtype.kind not in kind or array.ndim != axes:
         raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
+    return array
+
+
+def _columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
+    """Returns a read-only copy of numbers of columns."""
+    array = np.array(value)
+    if array.ndim != axes or array.dtype.kind not in 'iu' or not array.size:
+        raise ValueError(f'{name}: expected integers, at least one')
+    if array.min() < 0 or array.max() >= inputs:
+        raise ValueError(f'{name}: expected numbers of 0 to {inputs - 1}')
+    array.setflags(write=False)
     return array
 
 
