@@ -5,7 +5,8 @@
 
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it
 had never stopped), `curve.json` (settings, learning curve), `policy.npz` (the policy that scored
-best in the evaluations of the curve, for `trl_suite.policies`), and at the end `last.npz`.
+best in the evaluations of the curve, for `trl_suite.policies`), `lesson_N.npz` at the end of every
+lesson but the last, and at the end `last.npz`.
 
 PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
 Implementation Details of PPO); the settings of each environment stand in `ppo_settings.py`. Needs
@@ -21,6 +22,7 @@ import json
 import os
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -135,6 +137,18 @@ def visible(
         part = blocks[name]
         seen[part] = np.tile(near, (part.stop - part.start) // len(near))
     return np.flatnonzero(seen)
+
+
+def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
+    """The policy whose weights and scales are the means of others', as the last one is otherwise."""
+    means: dict[str, Any] = {
+        name: np.mean([getattr(part, name) for part in parts], axis=0)
+        for name in ('mean', 'std', 'log_std')
+    }
+    for name in ('weights', 'biases'):
+        layers = zip(*(getattr(part, name) for part in parts), strict=True)
+        means[name] = tuple(np.mean(layer, axis=0) for layer in layers)
+    return dataclasses.replace(parts[-1], **means)
 
 
 class Trainer:
@@ -542,6 +556,8 @@ def train(
             divergence = trainer.learn(batch)
             if trainer.average:
                 trainer.average.update_parameters(trainer.policy)
+            if trainer.lesson != trainer.current:
+                policies.save(trainer.exported(), folder / f'lesson_{trainer.current}.npz')
             end = time.perf_counter()
             trainer.seconds['simulation'] += middle - begin
             trainer.seconds['learning'] += end - middle
@@ -558,7 +574,9 @@ def train(
                 trainer.evaluate(folder, divergence)
                 trainer.seconds['evaluation'] += time.perf_counter() - end
                 trainer.save(folder)
-    policies.save(trainer.exported(), folder / 'last.npz')
+    earlier = range(trainer.current - settings.lessons_averaged + 1, trainer.current)
+    parts = [policies.load(folder / f'lesson_{i}.npz') for i in earlier]
+    policies.save(mean_of([*parts, trainer.exported()]), folder / 'last.npz')
     return trainer.curve
 
 

@@ -39,6 +39,9 @@ class Settings:
     # What is evaluated and ships has the mean of the weights over about so many samples, the later
     # ones counting more (Polyak averaging); 0: the weights of now.
     averaged: float = 0.0
+    # And what ships at last is the mean over so many ends of lessons, the last ones (stochastic weight
+    # averaging, Izmailov et al. 2018, arXiv:1803.05407): one policy that can what each has stressed.
+    lessons_averaged: int = 1
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
     # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
     # local optimum. Evaluations are without it.
@@ -225,9 +228,14 @@ PLANAR_STEPS = {
 }  # fmt: skip
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
-    'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 1e-4,
-    'last_learning_rate': 3e-5, 'initial_std': 0.06,
-    'view': (6.0, 3.0), 'start': 'scripted', 'evaluate_every': 2e4, 'evaluation_episodes': 16,
+    'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 2e-4, 'kl_per_action': 0.006,
+    'initial_std': 0.1, 'view': (6.0, 3.0), 'places': ('target',), 'start': 'scripted',
+    'evaluate_every': 2e4, 'evaluation_episodes': 16,
+}  # fmt: skip
+# A goal so large that a kicked ball comes to rest in it, and then ever smaller.
+DRIBBLING = {
+    'samples': 6e5, 'gamma': 0.97, 'initial_std': 0.12, 'places': ('target', 'ball'),
+    'evaluate_every': 4e4, 'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
@@ -296,6 +304,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
+    ('PD_Biped3D_LLC_General_Step-v0', {'lessons_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # Its observation is mirrored.
@@ -303,6 +312,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
+    ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
 )

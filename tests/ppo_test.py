@@ -292,6 +292,27 @@ class RunTest(parameterized.TestCase):
         # Episodes last two steps: no target lacks the 7 that follow, discounted.
         self.assertGreater(float(batch['target'].min()), 7 * settings.gamma**2)
 
+    def test_what_ships_may_be_the_mean_over_ends_of_lessons(self):
+        samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a lesson
+        settings = ppo_settings.Settings(
+            **{**TINY, 'samples': 3 * samples},
+            lessons=ppo_settings.evenly([{}] * 3), lessons_averaged=2,
+        )  # fmt: skip
+        ppo.train(FLAT, 0, settings, self.folder, threads=1, progress=False)
+        first, second, best, last = (
+            policies.load(self.folder / f'{name}.npz')
+            for name in ('lesson_1', 'lesson_2', 'policy', 'last')
+        )
+        self.assertEqual([p.info['samples'] for p in (first, second)], [samples, 2 * samples])
+        self.assertFalse((self.folder / 'lesson_3.npz').exists())
+        self.assertEqual(best.info, last.info)  # the only one after all lessons
+        for part in ('mean', 'std', 'log_std'):
+            expected = (getattr(second, part) + getattr(best, part)) / 2
+            np.testing.assert_allclose(getattr(last, part), expected, rtol=1e-6, atol=1e-7)
+        for part in ('weights', 'biases'):
+            for a, b, found in zip(*(getattr(p, part) for p in (second, best, last)), strict=True):
+                np.testing.assert_allclose(found, (a + b) / 2, rtol=1e-6, atol=1e-7)
+
     def test_it_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
         settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
