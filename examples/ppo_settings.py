@@ -230,12 +230,12 @@ RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
     'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 2e-4, 'kl_per_action': 0.006,
     'initial_std': 0.1, 'view': (6.0, 3.0), 'places': ('target',), 'start': 'scripted',
-    'evaluate_every': 2e4, 'evaluation_episodes': 16,
+    'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
     'samples': 6e5, 'gamma': 0.97, 'initial_std': 0.12, 'places': ('target', 'ball'),
-    'evaluate_every': 4e4, 'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
+    'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
