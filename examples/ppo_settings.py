@@ -212,8 +212,9 @@ RUN_LESSONS = (
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
-STEPS_ON = {  # on other grounds and plans
+STEPS_ON = {  # on other grounds and plans; by small steps, or what the walker can is lost
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'learning_rate': 5e-5, 'last_learning_rate': 2e-5, 'kl_per_action': 0.002, 'value_first': 1.5e5,
 }  # fmt: skip
 # In the plane: the row's own plan, then all lengths, ever more accurately. The reward alone would have
 # it walk a quarter of a metre ahead of the plan, as the reference's longer steps do.
