@@ -43,7 +43,7 @@ OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
 CLONING_RATE, CLONING_EPOCHS = 1e-3, 30
-START_COUNT = 2e4  # observations that the scales of a policy one begins with count as
+NEW_COUNT = 2e4  # observations that the scale of what a first policy did not see counts as
 
 
 class Scales:
@@ -56,7 +56,7 @@ class Scales:
     def __init__(
         self, blocks: dict[str, slice], size: int, columns: np.ndarray | None = None
     ) -> None:
-        self.blocks, self.count, self.columns = blocks, 0, columns
+        self.blocks, self.count, self.columns = blocks, np.zeros(size), columns
         self.mean, self.square = np.zeros(size), np.ones(size)
 
     def update(self, batch: np.ndarray) -> None:
@@ -248,7 +248,7 @@ class Trainer:
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
         entry = entry[column]
         known = entry >= 0
-        scales.count = START_COUNT
+        scales.count = np.where(known, self.settings.start_count, NEW_COUNT)
         scales.mean[known] = other.mean[entry[known]]
         scales.square[:] = LEAST_STD**2
         scales.square[known] = other.std[entry[known]] ** 2 + scales.mean[known] ** 2

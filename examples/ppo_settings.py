@@ -61,6 +61,9 @@ class Settings:
     # weights, its scales and its noise. What it did not observe begins without influence. Or with
     # one of `evaluation.BASELINES`, which is imitated for `cloned` control steps.
     start: str = ''
+    # As how many observations its scales count: few, and they soon fit the new environment, where its
+    # weights may no longer fit them.
+    start_count: float = 2e4
     cloned: float = 1e4
     value_first: float = 2e4  # control steps in which such a run learns only the value
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
@@ -212,9 +215,9 @@ RUN_LESSONS = (
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
-STEPS_ON = {  # on other grounds and plans; by small steps, or what the walker can is lost
+STEPS_ON = {  # on other grounds and plans; gently, or what the walker can is lost
     **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
-    'learning_rate': 5e-5, 'last_learning_rate': 2e-5, 'kl_per_action': 0.002, 'value_first': 1.5e5,
+    'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
 # In the plane: the row's own plan, then all lengths, ever more accurately. The reward alone would have
 # it walk a quarter of a metre ahead of the plan, as the reference's longer steps do.
@@ -229,13 +232,14 @@ PLANAR_STEPS = {
 }  # fmt: skip
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
-    'samples': 2e5, 'horizon': 16, 'minibatch': 256, 'learning_rate': 2e-4, 'kl_per_action': 0.006,
-    'initial_std': 0.1, 'view': (6.0, 3.0), 'places': ('target',), 'start': 'scripted',
-    'evaluate_every': 4e4, 'evaluation_episodes': 16,
+    'samples': 8e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
+    'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('target',),
+    'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
-    'samples': 6e5, 'gamma': 0.97, 'initial_std': 0.12, 'places': ('target', 'ball'),
+    'samples': 6e5, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
+    'places': ('target', 'ball'),
     'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
@@ -257,7 +261,7 @@ WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 # What planning footsteps does without: the walk is there, where to go with it is learnt.
 JOURNEYS = {
     'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
-    'start': 'PD_Biped3D_Imitate-v0',
+    'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6,
 }  # fmt: skip
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (

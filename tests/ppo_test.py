@@ -167,6 +167,23 @@ class RunTest(parameterized.TestCase):
         trainer.learn(trainer.collect())
         self.assertTrue((trainer.exported().weights[0] != before[0]).any())
 
+    @parameterized.parameters((2e4, 100.0), (1e9, 1e6))
+    def test_scales_of_a_start_stay_as_long_as_asked(self, count, least):
+        """After a hundredth as many observations, means have moved by less than the step."""
+        start = 'PD_Biped2D_Flat_Terrain-v0'
+        settings = ppo_settings.Settings(
+            **{**TINY, 'hidden': (256, 256)}, start=start, start_count=count
+        )
+        trainer = ppo.Trainer('PD_Biped2D_Gaps_Terrain-v0', 0, settings, 1)
+        pose = trainer.environments.blocks['pose']
+        before = trainer.scales.mean[pose].copy()
+        trainer.scales.update(
+            np.broadcast_to(trainer.scales.mean + 1.0, (200, len(trainer.scales.mean)))
+        )
+        moved = np.abs(trainer.scales.mean[pose] - before)
+        np.testing.assert_allclose(moved, 200 / (count + 200), rtol=1e-3)
+        self.assertLess(moved.max(), 1 / least)
+
     def test_places_are_seen_in_a_straight_line(self):
         """By the network in training as by what it exports; and a start that saw them fits."""
         id_, places = 'PD_Biped3D_HLC_Soccer-v0', ('target', 'ball')
