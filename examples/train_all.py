@@ -31,6 +31,7 @@ from collections.abc import Collection
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import ppo
 import ppo_settings
 import search_gaits
@@ -113,12 +114,22 @@ def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
     return folder
 
 
+def trimmed(policy: policies.Policy) -> policies.Policy:
+    """The same policy without inputs that were always 0, as the place where the standing foot lands."""
+    kept = (policy.mean != 0) | (policy.std > ppo.LEAST_STD)
+    columns = np.arange(len(kept)) if policy.columns is None else policy.columns
+    return dataclasses.replace(
+        policy, columns=columns[kept], mean=policy.mean[kept], std=policy.std[kept],
+        weights=(policy.weights[0][kept], *policy.weights[1:]),
+    )  # fmt: skip
+
+
 def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
     """Evaluates a finished run and writes it beside the others of its environment."""
     curve = json.loads((folder / 'curve.json').read_text())
     # After lessons the last policy is the one that has learnt what the environment does not ask for.
     name = 'last' if curve['settings'].get('lessons') else 'policy'
-    policy = policies.load(folder / f'{name}.npz')
+    policy = trimmed(policies.load(folder / f'{name}.npz'))
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]

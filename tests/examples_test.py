@@ -3,9 +3,10 @@
 import pathlib
 import sys
 
+import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, characters, evaluation
+from trl_suite import catalogue, characters, evaluation, policies
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import compare_transfer
@@ -44,6 +45,22 @@ class JobsTest(parameterized.TestCase):
                     for row in (catalogue.BY_ID[id_], catalogue.BY_ID[start])
                 )
                 self.assertEqual(own, other, id_)
+
+
+class TrimTest(absltest.TestCase):
+    def test_only_what_was_always_0_is_left_out(self):
+        rng = np.random.default_rng(0)
+        policy = policies.Policy(
+            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
+            mean=[0, 0.5, 0, 0], std=[1, 0.01, 0.01, 2], clip=10, activation='tanh',
+            columns=[4, 3, 1, 0], weights=[rng.normal(size=(4, 2))], biases=[[0, 0]],
+            log_std=[0, 0],
+        )  # fmt: skip
+        trimmed = train_all.trimmed(policy)
+        self.assertEqual(trimmed.columns.tolist(), [4, 3, 0])  # a constant counts
+        observation = rng.normal(size=(9, 5)) / 10
+        observation[:, 1] = 0.0
+        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=1e-6)
 
 
 class TransferTest(parameterized.TestCase):
