@@ -160,6 +160,11 @@ class Trainer:
         self.seed = seed
         self.settings, self.threads = settings, threads
         s = settings
+        if not 1 <= s.lessons_averaged <= max(1, len(s.lessons)):
+            raise ValueError(
+                f'lessons_averaged: {s.lessons_averaged}; expected 1 to {max(1, len(s.lessons))}, the '
+                'number of lessons'
+            )
         self.samples = 0
         self.begin_lesson()
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None

@@ -39,8 +39,9 @@ class Settings:
     # What is evaluated and ships has the mean of the weights over about so many samples, the later
     # ones counting more (Polyak averaging); 0: the weights of now.
     averaged: float = 0.0
-    # And what ships at last is the mean over so many ends of lessons, the last ones (stochastic weight
-    # averaging, Izmailov et al. 2018, arXiv:1803.05407): one policy that can what each has stressed.
+    # And what ships at last is the mean over so many ends of lessons, the last ones (stochastic
+    # weight averaging, Izmailov et al. 2018, arXiv:1803.05407): one policy that can do what each of
+    # them has stressed.
     lessons_averaged: int = 1
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
     # `patience` seconds, falls below its value here: for gaits so fast that standing still is a

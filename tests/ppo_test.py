@@ -330,6 +330,14 @@ class RunTest(parameterized.TestCase):
             for a, b, found in zip(*(getattr(p, part) for p in (second, best, last)), strict=True):
                 np.testing.assert_allclose(found, (a + b) / 2, rtol=1e-6, atol=1e-7)
 
+    @parameterized.parameters(0, 3)
+    def test_no_more_ends_of_lessons_than_there_are(self, number):
+        settings = ppo_settings.Settings(
+            **TINY, lessons=ppo_settings.evenly([{}] * 2), lessons_averaged=number
+        )
+        with self.assertRaisesRegex(ValueError, f'lessons_averaged: {number}; expected 1 to 2'):
+            ppo.Trainer(FLAT, 0, settings, 1)
+
     def test_it_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
         settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
