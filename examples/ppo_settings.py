@@ -233,9 +233,14 @@ PLANAR_STEPS = {
 }  # fmt: skip
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
-    'samples': 8e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
+    'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
     'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('target',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
+}  # fmt: skip
+# A trail so wide that who strays is still on it, and then ever narrower.
+NARROWING = {
+    'num_envs': 64, 'minibatch': 256, 'cloned': 2e4,
+    'lessons': rising('trail3d1', {'PathWidth0': 4.0, 'PathWidth1': 5.0}, (0, 0.4, 0.7)),
 }  # fmt: skip
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
@@ -318,6 +323,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
+    ('PD_Biped3D_HLC_PathFollowing-v0', NARROWING),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot

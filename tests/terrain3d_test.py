@@ -238,7 +238,7 @@ class ObstaclesTest(parameterized.TestCase):
         for a, b in ((0, 0), (7, 11), (20, 3), (13, 13)):
             point = np.array([i[a], i[b]]) * 0.2
             over = np.flatnonzero(((begin <= point) & (end >= point)).all(1))
-            self.assertEqual(heights[a, b], tops[over[-1]] if len(over) else 0)
+            self.assertEqual(heights[a, b], np.float32(tops[over[-1]]) if len(over) else 0)
 
 
 class TrailTest(parameterized.TestCase):

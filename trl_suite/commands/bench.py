@@ -27,6 +27,7 @@ CONTROL_TIMESTEP = 1 / 30  # s; longer steps have controllers inside
 SECONDS = 2.0  # per measurement
 WARM = 4 / 3  # s of simulated time; most rows have fallen once by then
 RESET = 30  # calls between two resets of what is stepped raw, a second of simulated time
+ROUNDS = 8  # in which environment and raw batch take turns: machines are now faster, now slower
 DRAWN = 100  # random actions, which are repeated
 
 
@@ -95,7 +96,7 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
       id: of the environment.
       rows: number of simulations.
       threads: that step them; 0 takes all cores.
-      seconds: per measurement.
+      seconds: for the environment, and as many for the raw batch.
 
     Returns:
       'control' and 'physics': steps per second of all rows; 'batch': physics steps per second of the
@@ -103,30 +104,32 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
       `Batch.step`; 'resets': share of resets; 'reset': ms per row.
     """
     environments, drawn = warmed(id, rows, threads)
-    world: Any = environments._world
+    others, _ = warmed(id, rows, threads)
+    world: Any = others._world
     physics, begin = counted(environments), Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
-    control = Stopwatch(environments.step, lambda action: rows)
-    start = time.perf_counter()
-    rate(lambda: control(next(drawn)), seconds)
-    total = time.perf_counter() - start
-    found = {
-        'control': control.items / total,
-        'physics': physics.items / total,
-        'share': physics.seconds / total,
-        'reset': 1e3 * begin.seconds / max(1, begin.items),
-        'resets': begin.seconds / total,
-    }
-    substeps, controls = control_substeps(environments), world.batch.bind('ctrl')
-    directly = acts_directly(environments, world.models[0])  # else raw bodies are limp
+    substeps, controls = control_substeps(others), world.batch.bind('ctrl')
+    directly = acts_directly(others, world.models[0])  # else raw bodies are limp
 
     def step() -> None:
-        controls[:] = environments.action_map.control(next(drawn)) if directly else 0.0
+        controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
         world.batch.step(nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
-    found['batch'] = rate(step, seconds, rows * substeps)
+    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: rows)
+    batch = Stopwatch(step, lambda: rows * substeps)
+    for _ in range(ROUNDS):
+        for turn in (control, batch):
+            rate(turn, seconds / ROUNDS)
     environments.close()
-    return found
+    others.close()
+    return {
+        'control': control.items / control.seconds,
+        'physics': physics.items / control.seconds,
+        'batch': batch.items / batch.seconds,
+        'share': physics.seconds / control.seconds,
+        'reset': 1e3 * begin.seconds / max(1, begin.items),
+        'resets': begin.seconds / control.seconds,
+    }
 
 
 def control_substeps(environment: Any) -> int:

@@ -202,15 +202,21 @@ class Clip:
           rotations as angular velocity in rad/s in the rotating body's own axes, which is
           MuJoCo's convention for the velocities of free and ball joints.
         """
+        return self.state(t)[1]
+
+    def state(self, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what `pose` and `velocity` do, in one go."""
         t = np.asarray(t, dtype=float)
         start, end = t - VELOCITY_STEP / 2, t + VELOCITY_STEP / 2
         if not self.loop:
             start, end = np.clip([start, end], 0, self.duration)
-        velocity = self.layout.change(*self.pose(np.stack([start, end])))
+        poses, before, after = self.pose(np.stack([t, start, end]))
+        velocity = self.layout.change(before, after)
         if self.loop:
-            return velocity / VELOCITY_STEP
+            return poses, velocity / VELOCITY_STEP
         inside = (t >= 0) & (t <= self.duration)
-        return velocity * np.where(inside, 1 / np.where(inside, end - start, 1), 0)[..., None]
+        share = np.where(inside, 1 / np.where(inside, end - start, 1), 0)
+        return poses, velocity * share[..., None]
 
     def phase(self, t: ArrayLike) -> np.ndarray:
         """Returns the phase at times `t`, same shape: [0, 1) looping, else clamped to [0, 1]."""

@@ -133,9 +133,9 @@ class SpatialImitation(Tracking):
             ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
             self.arena.begin_episode(row, ground)
         times = self._start_cycles[rows] * self.period
-        poses = self.clip.pose(times)
+        poses, rates = self.clip.state(times)
         poses[:, :2] = 0.0
-        return poses, self.clip.velocity(times), np.zeros((len(rows), 3))
+        return poses, rates, np.zeros((len(rows), 3))
 
     def _compare(self, found: SimpleNamespace) -> None:
         self._reference_now = self.reference.features(self.phase)

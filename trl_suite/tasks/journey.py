@@ -110,9 +110,9 @@ class Journey(SpatialImitation):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         spawns = self._begin_grounds(rows, random_states)
         times = self._start_cycles[rows] * self.period
-        poses = self.clip.pose(times)
+        poses, rates = self.clip.state(times)
         poses[:, :2] = 0.0
-        return poses, self.clip.velocity(times), spawns
+        return poses, rates, spawns
 
     def _begun_on_ground(self, rows: np.ndarray) -> None:
         self.goals_reached[rows] = 0

@@ -57,7 +57,7 @@ class Reference:
         self.clip = clip
         self.period = clip.duration
         times = np.arange(SAMPLES + 1) / SAMPLES * self.period
-        poses, rates = clip.pose(times), clip.velocity(times)
+        poses, rates = clip.state(times)
         parts = {
             'xipos': links, 'cvel': links, 'subtree_com': links[:1], 'xpos': effectors,
             'geom_xpos': geoms, 'geom_xmat': geoms,

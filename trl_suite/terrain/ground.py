@@ -63,21 +63,15 @@ class Ground:
                 f'terrain {terrain.name!r} ({terrain.type}) is planar, a Strip; a Ground is '
                 'three-dimensional'
             )
-        sequence = seed_sequence(seed)
-        self._draw({
-            'type': terrain.type,
-            'parameters': terrain.parameters(blend),
-            'entropy': sequence.entropy,
-            'spawn_key': sequence.spawn_key,
-        })  # fmt: skip
+        self._draw(terrain.type, terrain.parameters(blend), seed_sequence(seed))
 
-    def _draw(self, state: Mapping[str, Any]) -> None:
-        sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
-        layout = draw3d(state['type'], state['parameters'], np.random.default_rng(sequence))
-        self.type: str = state['type']
-        self.parameters: dict[str, float] = dict(state['parameters'])
-        self.layout: Layout = layout
-        self._seed = state['entropy'], tuple(state['spawn_key'])
+    def _draw(
+        self, type_: str, parameters: Mapping[str, float], sequence: np.random.SeedSequence
+    ) -> None:
+        self.layout: Layout = draw3d(type_, parameters, np.random.default_rng(sequence))
+        self.type: str = type_
+        self.parameters: dict[str, float] = dict(parameters)
+        self._seed = sequence.entropy, tuple(sequence.spawn_key)
 
     def state(self) -> dict[str, Any]:
         """Returns everything `from_state` needs: what was drawn from what."""
@@ -93,7 +87,8 @@ class Ground:
     def from_state(cls, state: Mapping[str, Any]) -> Ground:
         """Returns the same ground again."""
         ground = cls.__new__(cls)
-        ground._draw(state)
+        sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
+        ground._draw(state['type'], state['parameters'], sequence)
         return ground
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -68,12 +68,9 @@ def boxes(
       slope: rise of the upper face per m along the box's x axis.
     """
     position = np.asarray(position, float).reshape(-1, 2)
-    count = len(position)
-    return Boxes(
-        position,
-        np.broadcast_to(np.asarray(half_size, float), (count, 2)),
-        *(np.broadcast_to(np.asarray(part, float), (count,)) for part in (yaw, top, slope)),
-    )
+    half_sizes, (yaws, tops, slopes) = np.empty_like(position), np.empty((3, len(position)))
+    half_sizes[...], yaws[:], tops[:], slopes[:] = half_size, yaw, top, slope
+    return Boxes(position, half_sizes, yaws, tops, slopes)
 
 
 NO_BOXES = boxes(np.zeros((0, 2)), (0, 0), 0)

@@ -76,6 +76,7 @@ MOVERS = {'NumObstacles': 10, 'ObstacleHeight0': 1, 'ObstacleHeight1': 5, **MOVI
 CONVEYORS = {'ConveyorStripLength': 10, 'ConveyorNumStrips': 4, 'ConveyorSpacing': 3, **MOVING,
              'ConveyorNumSlices': 10}  # fmt: skip
 
+Corner = np.ndarray | tuple[float, float]
 Function3D = Callable[[Parameters, np.random.Generator], Layout]
 
 
@@ -297,7 +298,7 @@ class _Obstacles:
         columns, rows = (range(a, b + 1) for a, b in zip(first, last, strict=True))
         found = [self._tile((i, j)) for i in columns for j in rows]
         begin, end, height = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        near = np.flatnonzero(((begin <= high) & (end >= low)).all(1))
+        near = np.flatnonzero(_meeting(begin, end, low, high))
         return begin[near], end[near], height[near]
 
     def _tile(self, tile: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -308,13 +309,14 @@ class _Obstacles:
             rng = np.random.default_rng(np.random.SeedSequence([*self._key, *naturals]))
             count = int(parameters['ObstacleDensity'] * TILE**2 + 1e-6)
             height = _between(parameters, 'ObstacleHeight', rng.random(count))
-            begin, end = np.zeros((2, count, 2))
-            missing = np.arange(count)
+            begin, end = np.empty((2, count, 2))
+            missing: slice | np.ndarray = slice(None)
             for _ in range(100):  # what does not fit then must stand over the start
-                shares = rng.random((2, len(missing), 2))
-                begin[missing] = TILE * (np.array(tile) - 0.5 + shares[0])
-                end[missing] = begin[missing] + _between(parameters, 'ObstacleWidth', shares[1])
-                missing = np.flatnonzero(((begin <= CLEAR) & (end >= -CLEAR)).all(1))
+                shares = rng.random((2, *begin[missing].shape))
+                corner = TILE * (np.array(tile) - 0.5 + shares[0])
+                begin[missing] = corner
+                end[missing] = corner + _between(parameters, 'ObstacleWidth', shares[1])
+                missing = np.flatnonzero(_meeting(begin, end, (-CLEAR, -CLEAR), (CLEAR, CLEAR)))
                 if not len(missing):
                     break
             height[missing] = 0.0
@@ -336,17 +338,27 @@ def obstacles(parameters: Parameters, rng: np.random.Generator) -> Layout:
     return Layout(boxes=blocks, place='clear', span=PLACE_SPAN['obstacles3d'])
 
 
+def _meeting(begin: np.ndarray, end: np.ndarray, low: Corner, high: Corner) -> np.ndarray:
+    """Which upright rectangles, from corners `begin` to `end` (k, 2), meet another one, (k,) bool."""
+    found = begin[:, 0] <= high[0]
+    found &= begin[:, 1] <= high[1]
+    found &= end[:, 0] >= low[0]
+    found &= end[:, 1] >= low[1]
+    return found
+
+
 def _rubble(drawn: _Obstacles) -> GridFunction:
     def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:
         corner = np.array([i[0], j[0]])
         low, high = GRID * corner, GRID * np.array([i[-1], j[-1]])
         begin, end, height = drawn.touching(low, high)
-        heights = np.zeros((len(i), len(j)))
+        heights = np.zeros((len(i), len(j)), np.float32)
         # Vertices in the closed rectangles; at least one line of them along each axis.
         first = np.ceil(begin / GRID).astype(int)
         last = np.maximum(np.floor(end / GRID).astype(int), first)
         first, last = np.maximum(first - corner, 0), np.maximum(last - corner + 1, 0)
-        for (a, c), (b, d), top in zip(first.tolist(), last.tolist(), height.tolist(), strict=True):
+        tops = height[:, None].astype(np.float32)  # numbers would be made arrays one by one
+        for a, c, b, d, top in zip(*first.T.tolist(), *last.T.tolist(), tops, strict=True):
             heights[a:b, c:d] = top
         return heights
 

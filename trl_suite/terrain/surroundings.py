@@ -26,6 +26,7 @@ _RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)[:, None]
 _CHUNK = 16  # rows whose maps are made at once: they fit into the processor's cache
 _CELLS_PER_METRE = 1 / GRID
 _LAST = VERTICES - 1.0 - 1e-6
+_CORNERS = (0, VERTICES, 1, VERTICES + 1)  # of a cell: near, along x, along y, far
 
 Rows = slice | np.ndarray
 ALL = slice(None)
@@ -39,18 +40,22 @@ class Capacity(NamedTuple):
     boxes: int
     belts: int
     movers: int
+    strips: bool  # whether all boxes reach from the right rim to the left one
 
 
 def capacity(terrain: Terrain) -> Capacity:
     """Foresees what windows of a terrain hold, from a few fixed draws."""
-    found, counts, finite = [], [], True
+    found, counts, finite, strips = [], [], True, True
     for blend in range(max(1, len(terrain.parameter_sets))):
         for seed in range(PROBES):
             layout = Ground(terrain, seed, blend=blend).layout
             finite &= isinstance(layout.boxes, Boxes)
             for centre in ((0.0, 0.0), (SHIFT * seed, -SHIFT * seed)):
                 low, high = np.array(centre) - HALF, np.array(centre) + HALF
-                counts.append(len(layout.boxes_in(low, high).top))
+                boxes = layout.boxes_in(low, high)
+                counts.append(len(boxes.top))
+                beside = np.abs(boxes.position[:, 1] - centre[1]) + HALF - boxes.extent()[:, 1]
+                strips &= layout.belts is None and bool((beside <= 0).all())
             if isinstance(layout.boxes, Boxes):
                 counts.append(len(layout.boxes.top))
             found.append(
@@ -60,12 +65,14 @@ def capacity(terrain: Terrain) -> Capacity:
                     0,
                     0 if layout.belts is None else len(layout.belts.velocity),
                     0 if layout.movers is None else len(layout.movers.speed),
+                    False,
                 )
             )
     most, least = max(counts), min(counts)
     if not finite and most:
         most = min(round(SPARE * most) + PROBES, most + 3 * (most - least) + 3)
-    return Capacity(*(max(part) for part in zip(*found, strict=True)))._replace(boxes=most)
+    largest = Capacity(*(max(part) for part in zip(*found, strict=True)))
+    return largest._replace(boxes=most, strips=strips)
 
 
 class Surroundings:
@@ -94,7 +101,7 @@ class Surroundings:
         self._low = np.zeros((n, 2))  # corner of the window, m
         if capacity.grid:
             self._grid = np.zeros((n, VERTICES * VERTICES), np.float32)  # along x, then y
-        self._index = BoxIndex(n, capacity.boxes, capacity.belts)
+        self._index = BoxIndex(n, capacity.boxes, capacity.belts, capacity.strips)
         movers = (n, capacity.movers)
         self.start, self.axis, self.half_size = np.zeros((3, *movers, 2))
         self.length, self.speed, self.way, self._mover_top = np.zeros((4, *movers))
@@ -377,20 +384,25 @@ class Surroundings:
         i += j
         if self.n > 1:
             i += (self._row[rows] * VERTICES**2).astype(np.int32)
-        over = u + v > 1
-        # From the far corner of a cell its far triangle looks like the near one.
-        np.subtract(1, u, out=u, where=over)
-        np.subtract(1, v, out=v, where=over)
-        step = np.where(over, np.int32(1), np.int32(VERTICES))
+        # A plane through three vertices and, beyond the diagonal, what the fourth is off it.
         grid = self._grid.reshape(-1)
-        near = i + over * np.int32(VERTICES + 1)
-        base = grid.take(near, mode='clip')
-        step += i
-        u *= grid.take(step, mode='clip') - base
-        np.subtract(2 * i + (VERTICES + 1), step, out=step)
-        v *= grid.take(step, mode='clip') - base
+        base, along, aside, far = (
+            grid[offset:].take(i, mode='clip').astype(float) for offset in _CORNERS
+        )
+        far += base
+        far -= along
+        far -= aside
+        along -= base
+        aside -= base
+        beyond = u + v
+        beyond -= 1
+        np.maximum(beyond, 0, out=beyond)
+        u *= along
+        v *= aside
+        beyond *= far
         np.add(base, u, out=heights)
         heights += v
+        heights += beyond
 
     # State.
 
