@@ -25,7 +25,10 @@ import resource
 from trl_suite.commands import bench
 from trl_suite.commands.bench import actions, rate, raw, warmed
 
-IDS = ('PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0')
+IDS = (
+    'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
+    'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0',
+)  # fmt: skip
 ROWS = (1, 16, 64, 256, 1024)
 THREADS = (1, 2)
 SUBSTEPS = 10

@@ -4,8 +4,8 @@
     python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
 
 Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
-`evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the share that does not
-fall, speed towards the goal, goals per minute, distance along a trail, the share of time with the
+`evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares that do not
+fall, at all and in the first minute, speed towards the goal, goals per minute, distance along a trail, the share of time with the
 ball at its goal, and falls per kilometre. Writes into trained/plans.json what it has measured.
 """
 
@@ -26,6 +26,7 @@ from trl_suite.vector import VectorEnvironment
 EPISODES = 32
 POLICIES = ('scripted', 'reference')
 SEGMENT = 2.0  # m; of a trail
+MINUTE = 60.0  # s
 
 
 def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarray:
@@ -78,7 +79,8 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
     environments.close()
     return {
         'episodes': episodes, 'seed': seed, 'reward': float(reward.mean() / limit),
-        'survived': float(1 - fell.mean()), 'seconds': float(seconds.mean()),
+        'survived': float(1 - fell.mean()),
+        'survived_minute': float(1 - (fell & (seconds < MINUTE)).mean()), 'seconds': float(seconds.mean()),
         'speed': float(towards.sum() / seconds.sum()),
         'goals_per_minute': float(60 * goals.sum() / seconds.sum()),
         'trail': float(np.median(trail)), 'at_goal': float(arrived.sum() / seconds.sum()),

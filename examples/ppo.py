@@ -272,29 +272,40 @@ class Trainer:
     def imitate(self, baseline: str) -> None:
         """Has the policy do what a baseline does, as far as it sees why (behavioural cloning).
 
-        The baseline is disturbed as the policy will be, so that it shows how to come back.
+        Who walks is disturbed as the policy will be, so that the baseline shows how to come back.
         """
         s, environments = self.settings, self.environments
         teacher = evaluation.BASELINES[baseline](environments)
-        seen, shown = [], []
+        seen: list[np.ndarray] = []
+        shown: list[np.ndarray] = []
         std = self.log_std.exp().detach().numpy()
-        while len(seen) * s.num_envs < s.cloned:
-            action = teacher(self.observation)
-            observation, left = self.seen(self.observation)
-            seen.append(observation.copy())
-            shown.append(self.mirror.answered(action, left) if self.mirror else action)
-            noise = self.random.standard_normal(action.shape)
-            step = environments.step(np.clip(action + std * noise, -1, 1))
-            ended = step.terminated | step.truncated
-            self.observation = environments.reset(ended) if ended.any() else step.observation
+        for number in range(s.clonings):
+            first = len(seen)
+            while len(seen) * s.num_envs < s.cloned * (number + 1) / s.clonings:
+                observation, left = self.seen(self.observation)
+                action = teacher(self.observation)
+                seen.append(observation.copy())
+                shown.append(self.mirror.answered(action, left) if self.mirror else action)
+                if number > 0:
+                    with torch.no_grad():
+                        action = self.policy(self.scales(observation)).numpy()
+                    action = self.mirror.answered(action, left) if self.mirror else action
+                noise = self.random.standard_normal(action.shape)
+                step = environments.step(np.clip(action + std * noise, -1, 1))
+                ended = step.terminated | step.truncated
+                self.observation = environments.reset(ended) if ended.any() else step.observation
+            self.scales.update(np.concatenate(seen[first:]))
+            self.fit(np.concatenate(seen), np.concatenate(shown))
         self.samples += len(seen) * s.num_envs
-        self.scales.update(np.concatenate(seen))
-        inputs = self.scales(np.concatenate(seen))
-        targets = torch.from_numpy(np.concatenate(shown).astype(np.float32))
+
+    def fit(self, seen: np.ndarray, shown: np.ndarray) -> None:
+        """Has the policy answer observations (n, k) by actions (n, a)."""
+        inputs = self.scales(seen)
+        targets = torch.from_numpy(shown.astype(np.float32))
         optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
         for _ in range(CLONING_EPOCHS):
             order = torch.from_numpy(self.random.permutation(len(inputs)))
-            for part in order.split(s.minibatch):
+            for part in order.split(self.settings.minibatch):
                 loss = (self.policy(inputs[part]) - targets[part]).square().mean()
                 optimizer.zero_grad()
                 loss.backward()

@@ -66,6 +66,9 @@ class Settings:
     # weights may no longer fit them.
     start_count: float = 2e4
     cloned: float = 1e4
+    # In how many rounds: after the first one the policy walks, and the baseline only says what it
+    # would do there (DAgger, Ross et al. 2011, arXiv:1011.0686).
+    clonings: int = 1
     value_first: float = 2e4  # control steps in which such a run learns only the value
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
@@ -237,11 +240,10 @@ PLANS = {  # a step is a whole footstep: few of them
     'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('target',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
-# A trail so wide that who strays is still on it, and then ever narrower.
-NARROWING = {
-    'num_envs': 64, 'minibatch': 256, 'cloned': 2e4,
-    'lessons': rising('trail3d1', {'PathWidth0': 4.0, 'PathWidth1': 5.0}, (0, 0.4, 0.7)),
-}  # fmt: skip
+# Who finds a way between blocks begins well among other things that stand or move.
+AMONG = {'samples': 2e5, 'start': 'PD_Biped3D_HLC_LargeBlocks-v0', 'start_count': 1e6}
+# On a trail the clone must find its way before it can learn anything by walking.
+SHOWN = {'cloned': 8e4, 'clonings': 5, 'value_first': 1e5}
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
     'samples': 6e5, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
@@ -323,7 +325,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
-    ('PD_Biped3D_HLC_PathFollowing-v0', NARROWING),
+    ('PD_Biped3D_HLC_Forest-v0', AMONG),
+    ('PD_Biped3D_HLC_DynamicsObstacles-v0', AMONG),
+    ('PD_Biped3D_HLC_Conveyors*', AMONG),
+    ('PD_Biped3D_HLC_PathFollowing-v0', SHOWN),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot

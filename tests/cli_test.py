@@ -258,7 +258,7 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 116 numbers', out)
         self.assertRegex(out, r'\n  ball +107 +116 +9 ')
         self.assertRegex(out, r'as seen from the ball')
-        self.assertRegex(out, r'a ball of 0\.2 m and 0\.1 kg lies 0\.7 to 10 m')
+        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg lies 0\.7 to 10 m')
         for name, weight in (
             ('approach', '0.1667'), ('near', '0.1667'), ('dribble', '0.3333'), ('goal', '0.3333'),
         ):  # fmt: skip
@@ -472,7 +472,7 @@ class RolloutTest(CommandTest):
 
     def test_no_ghost_above_a_controller(self):
         self.assert_refused(
-            'a HighLevel task has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
+            'the task HighLevel has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
             '--video', 'a.mp4', *SIZE,
         )  # fmt: skip
         self.assert_only()
@@ -506,10 +506,10 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('an? Imitation task has no scripted policy; high-level tasks with', GAPS, '--policy',
+        ('the task Imitation has no scripted policy; high-level tasks with', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
-        ('No such file', GAPS, '--policy', 'none.npz'),
+        ('no such file', GAPS, '--policy', 'none.npz'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
         ('required: ID', '--seed', '1'),
         ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
@@ -645,7 +645,7 @@ class EvaluateTest(CommandTest):
     @parameterized.parameters(
         ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),
         ("unknown policy 'walk'; known:", GAPS, '--policy', 'walk'),
-        ('No such file', GAPS, '--policy', 'none.npz'),
+        ('no such file', GAPS, '--policy', 'none.npz'),
         ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
         ("'0' is not a positive integer", GAPS, '--episodes', '0'),
         ('seed is -1; expected 0 or', GAPS, '--policy', 'zero', '--seed', '-1'),
@@ -686,11 +686,12 @@ class TerrainTest(CommandTest):
         for message, *arguments in (
             ("unknown terrain 'gasp'; did you mean 'gaps'", 'gasp'),
             ("unknown terrain type 'var2d_gap'", 'bad.json'),
-            ('No such file', 'none.json'),
+            ('no such file', 'none.json'),
             ("'0' is not a positive integer", 'gaps', '--draws', '0'),
             ('length is 0.0', 'gaps', '--length', '0'),
             ('seed is -2', 'gaps', '--seed', '-2'),
-            ("unknown suffix '.pdf'", 'gaps', '--output', 'a.pdf'),
+            ("unknown suffix '.pdf'; expected .*png or .obj", 'gaps', '--output', 'a.pdf'),
+            ('length is 4000', 'hills3d', '--length', '4000', '--output', 'a.obj'),
         ):
             with self.subTest(message):
                 self.assert_refused(message, 'terrain', *arguments)

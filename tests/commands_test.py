@@ -242,8 +242,21 @@ class ClipTest(CommandTest):
         self.assert_refused('frame 0 has 26 numbers, the layout of 6 joints needs 14', *run_json)
         motion.load('raptor_run_050').save('run.npz')
         out = self.output('clip', 'run.npz', *run_json[2:], '--frames')
+        self.assertIn('right_knee from right_ankle', out)
+        self.assertIn('joints that nothing moves: right_hip', out)
         self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
         self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
+
+    def test_bad_maps(self):
+        for text, message in (
+            ('[1, 2]', 'map.json: expected an object of names'),
+            ('[1, 2', 'map.json: not JSON'),
+            ('{"left_knee": 3}', 'map.json: expected an object'),
+        ):
+            pathlib.Path('map.json').write_text(text)
+            self.assert_refused(
+                message, 'clip', 'run.json', '--character', 'raptor', '--map', 'map.json'
+            )
 
     def test_refusals_leave_nothing_behind(self):
         here = [path.name for path in self.folder.iterdir()]

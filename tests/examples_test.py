@@ -60,7 +60,8 @@ class TrimTest(absltest.TestCase):
         self.assertEqual(trimmed.columns.tolist(), [4, 3, 0])  # a constant counts
         observation = rng.normal(size=(9, 5)) / 10
         observation[:, 1] = 0.0
-        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=1e-6)
+        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=2e-3)  # halves
+        self.assertFalse((trimmed.weights[0].view(np.int32) & 0x1FFF).any())  # 11 bits, kept by zip
 
 
 class TransferTest(parameterized.TestCase):
@@ -83,7 +84,7 @@ class PlansTest(absltest.TestCase):
             return lambda observation: 0.0 * observation[:, :5] + 1.0  # too far for anybody
 
         found = evaluate_plans.run(id_, make, episodes=2, seed=0)
-        self.assertEqual(found['survived'], 0)
+        self.assertEqual((found['survived'], found['survived_minute']), (0, 0))
         self.assertEqual(found['goals_per_minute'], 0)
         self.assertBetween(found['seconds'], 0.5, 20)
         self.assertLess(found['reward'], 0.05)

@@ -1,6 +1,7 @@
 """Tests of what users make: characters from files, terrain from data, tasks from parts."""
 
 import contextlib
+import math
 import pathlib
 import pickle
 import re
@@ -109,9 +110,35 @@ class CharacterTest(Folder):
         # The weight at the end of the leg, 0.84 m below the hip.
         self.assertAlmostEqual(limits['left_hip'], model.body_mass.sum() * 9.8 * 0.84, delta=1e-6)
         self.assertAlmostEqual(other.kd, other.kp / 10)
+        self.assertFalse([note for note in row.notes if 'without damping' in note])
         self.assertEqual(model.nu + model.nkey + model.nsensor, 0)
         np.testing.assert_allclose(model.jnt_range[1], [-2 * np.pi / 3, 0])
         self.assertEqual(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, 'floor'), -1)
+
+    def test_damping_of_the_file_is_added(self):
+        text = MJCF.replace('name="left_hip"', 'name="left_hip" damping="5"').replace('kv="3"', '')
+        row = self.planar(text)
+        hip, servo = row.joints['left_hip'], row.joints['right_hip']
+        self.assertAlmostEqual(hip.kd, hip.kp / 10 + 5)
+        self.assertEqual((servo.kp, servo.kd), (90, 9))
+        self.assertIn(
+            'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', row.notes
+        )
+
+    def test_what_has_no_name_in_the_file(self):
+        things = '<site pos="0 0 .4"/><camera pos="0 -2 0"/><light pos="0 0 3"/>'
+        rules = (
+            '<contact><exclude body1="trunk" body2="left_shin"/></contact>'
+            '<equality><joint joint1="left_hip" joint2="right_hip" active="false"/></equality>'
+            '<tendon><fixed><joint joint="left_knee" coef="1"/></fixed></tendon></mujoco>'
+        )
+        text = MJCF.replace('<geom size=".15', f'{things}<geom size=".15')
+        row = self.planar(text.replace('</mujoco>', rules))
+        environment = suite.build(row, terrain='slopes', task='walk', task_kwargs={'random': 0})
+        environment.reset()
+        self.assertTrue(np.isfinite(environment.step(np.zeros(4)).reward))
+        model = environment.physics.model
+        self.assertEqual((model.neq, model.ntendon, model.nexclude), (1, 1, 1))
 
     def test_own_figures_replace_those_found(self):
         mine = characters.Joint(kp=10, kd=1, weight=0.5)
@@ -215,12 +242,28 @@ class CharacterTest(Folder):
         ('turned', 'name="trunk" pos="0 0 1"', 'name="trunk" euler="0 0 90"', "root 'trunk' is turned"),
         ('two_roots', '</worldbody>', '<body name="ball"><freejoint/><geom size="1"/></body></worldbody>', 'several bodies may be the root'),
         ('broken', '</mujoco>', '', 'not a model'),
+        ('nan', 'name="left_knee" axis', 'name="left_knee" armature="nan" axis', 'armature="nan" of .left_knee. .<joint>.; expected finite'),
+        ('infinity', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="0 0 inf"', 'line 1: pos="0 0 inf" of .trunk.'),
+        ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
         ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
     )  # fmt: skip
     def test_bad_files(self, before, after, message):
         self.assertIn(before, MJCF)
         with self.assertRaisesRegex(ValueError, f'figure.xml: .*{message}'):
             self.planar(MJCF.replace(before, after))
+
+    def test_a_body_may_be_named_nan(self):
+        self.assertIn(
+            'nan', self.planar(MJCF.replace('right_shin', 'nan'), end_effectors=('nan',)).links
+        )
+
+    @parameterized.parameters(
+        ({'kp': -80}, 'kp of a joint is -80'), ({'kd': math.nan}, 'kd of a joint is nan'),
+        ({'armature': math.inf}, 'armature'), ({'target': (0, math.nan, 0)}, 'target .* finite numbers'),
+    )  # fmt: skip
+    def test_bad_figures(self, values, message):
+        with self.assertRaisesRegex(ValueError, message):
+            characters.Joint(**{'kp': 10, 'kd': 1, 'weight': 1, **values})
 
     def test_missing_file_and_what_a_urdf_does_not_tell(self):
         path = self.write(URDF, 'two.urdf')
@@ -383,6 +426,24 @@ class TerrainTest(Folder):
         self.write('nothing', 'broken.png')
         with self.assertRaisesRegex(ValueError, message):
             make(self.folder)
+
+    def test_a_cell_that_is_run_again(self):
+        def heights(factor):
+            def wavelets(x):
+                return factor * np.sin(x)
+
+            return terrain.from_function(wavelets)
+
+        heights(1.0)
+        again = terrain.Strip(heights(0.5), 0)
+        self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
+
+    def test_heights_that_are_not_finite(self):
+        hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
+        with self.assertRaisesRegex(
+            ValueError, "terrain 'hole' returned nan at x = 3.* m; expected"
+        ):
+            terrain.Strip(hole, 0).height(5.0)
 
     def test_missing_files(self):
         for make in (terrain.from_mesh, lambda path: terrain.from_image(path, 1)):

@@ -706,8 +706,11 @@ class RegisterTest(parameterized.TestCase):
             make({'Type': 'mine3d'})
 
     @parameterized.parameters(
-        ({'grid': lambda i, j: np.zeros(3)}, r'finite heights of shape .* \(3,\)'),
-        ({'grid': lambda i, j: np.full((len(i), len(j)), np.nan)}, 'finite heights'),
+        ({'grid': lambda i, j: np.zeros(3)}, r'heights of shape .* \(3,\)'),
+        (
+            {'grid': lambda i, j: np.full((len(i), len(j)), np.nan)},
+            'returned nan at x = .* m, y = ',
+        ),
         ({'boxes': lambda low, high: None}, 'finite Boxes'),
         ({'boxes': lambda low, high: terrain.boxes([(0, 0)], 1, math.nan)}, 'finite Boxes'),
     )

@@ -51,11 +51,14 @@ class Environment(composer.Environment):
 
         Raises:
           ValueError: a limit that is not positive, a bad seed, or substep hooks.
+          TypeError: a seed that is no integer.
         """
         if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
             raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
         if not time_limit > 0:
             raise ValueError(f'time_limit is {time_limit}; expected a positive number of seconds')
+        if isinstance(random, (float, str, bytes)):
+            raise TypeError(f'random is {random!r}; expected a seed, an integer in [0, 2**32)')
         if isinstance(random, int) and not 0 <= random < 2**32:
             raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
         self._flat_observation = flat_observation

@@ -3,6 +3,8 @@
 import difflib
 from collections.abc import Iterable
 
+MANY = 40  # names; of more only some are listed
+
 
 def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
     """Returns a message for an unknown name, with its closest matches among `choices`."""
@@ -14,5 +16,11 @@ def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
             lowered[match]
             for match in difflib.get_close_matches(str(name).lower(), lowered, n=3, cutoff=0.4)
         ]
-    hint = f'did you mean {" or ".join(map(repr, near))}?' if near else f'known: {", ".join(known)}'
+    hint = f'did you mean {" or ".join(map(repr, near))}?' if near else f'known: {_listed(known)}'
     return f'unknown {kind} {name!r}; {hint}'
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) <= MANY:
+        return ', '.join(names)
+    return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'

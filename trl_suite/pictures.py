@@ -292,7 +292,7 @@ def height_map(
     part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
     if part.stop - part.start != SAMPLES**2:
         raise ValueError(
-            f'a {type(task).__name__} task that observes no map of {SAMPLES} x {SAMPLES} heights has '
+            f'the task {type(task).__name__}, which observes no map of {SAMPLES} x {SAMPLES} heights, has '
             'none to draw; 3D imitation and footsteps observe one with the option terrain_map=True'
         )
     if not 0 < reach < np.inf:

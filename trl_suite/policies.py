@@ -61,14 +61,13 @@ import difflib
 import io
 import json
 import os
-import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite import catalogue, errors, resources
-from trl_suite.files import check_path, replacing
+from trl_suite.files import check_path, existing, replacing
 from trl_suite.symmetry import Mirror
 
 FORMAT = 'trl_suite policy'
@@ -364,7 +363,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
       ValueError: a broken or malformed file; the message names file and field.
       FileNotFoundError: there is no such file.
     """
-    path = pathlib.Path(path)
+    path = existing(path, ('.npz',))
     content = io.BytesIO(path.read_bytes())
     fields: dict[str, Any] = {}
     field = ''

@@ -91,7 +91,7 @@ def frame(
             raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
     if ghost and getattr(environment.task, 'reference_pose', None) is None:
         raise ValueError(
-            f'a {type(environment.task).__name__} task has no reference clip to draw as a ghost'
+            f'the task {type(environment.task).__name__} has no reference clip to draw as a ghost'
         )
     camera_id = _camera(physics, camera)
     _check_gl(physics)

@@ -74,8 +74,12 @@ def read(
       ImportError: for .bvh, if the extra 'clips' is not installed.
     """
     path = existing(path, SUFFIXES)
-    if (path.suffix.lower() == '.amc') is (skeleton is None):
-        raise ValueError(f'{path}: a skeleton (.asf) belongs to an .amc file, and to no other')
+    if path.suffix.lower() == '.amc' and skeleton is None:
+        raise ValueError(f'{path}: an .amc file needs its skeleton, an .asf file')
+    if path.suffix.lower() != '.amc' and skeleton is not None:
+        raise ValueError(
+            f'{path}: a skeleton ({skeleton}) belongs to an .amc file, and to no other'
+        )
     if path.suffix.lower() == '.bvh':
         return read_bvh(path, **options)
     if path.suffix.lower() == '.amc':
@@ -116,6 +120,38 @@ def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
     return found
 
 
+def counterparts(
+    motion: Clip | Capture, joints: Sequence[str], joint_map: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Returns which joint of a motion the root and each joint of a character follow.
+
+    Args:
+      motion: the motion.
+      joints: of the character.
+      joint_map: from the character's joints, and 'root', to the motion's; by default `guess_map`.
+
+    Raises:
+      ValueError: unknown joints, or no root in the map.
+    """
+    ours, theirs = ('root', *joints), _joints(motion)
+    chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)
+    for our, their in chosen.items():
+        if our not in ours:
+            raise ValueError(errors.unknown('joint of the character', our, ours))
+        if their not in theirs:
+            raise ValueError(errors.unknown('joint of the motion', their, theirs))
+    if 'root' not in chosen or len(chosen) < 2:
+        raise ValueError(
+            f'motion {motion.name!r}: no root, or nothing else, has a counterpart; give a map from '
+            f'{", ".join(ours)} to {", ".join(theirs)}'
+        )
+    return chosen
+
+
+def _joints(motion: Clip | Capture) -> tuple[str, ...]:
+    return tuple(motion.joints) if isinstance(motion, Capture) else ('root', *motion.joints)
+
+
 def retarget(
     motion: Clip | Capture,
     character: CharacterLike,
@@ -149,19 +185,7 @@ def retarget(
         own = motion.layout
         if (own.root, own.joints, own.sizes) == (layout.root, layout.joints, layout.sizes):
             return motion
-    ours = ('root', *layout.joints)
-    theirs = motion.joints if isinstance(motion, Capture) else ('root', *motion.joints)
-    chosen = guess_map(theirs, ours) if joint_map is None else dict(joint_map)
-    for our, their in chosen.items():
-        if our not in ours:
-            raise ValueError(errors.unknown('joint of the character', our, ours))
-        if their not in theirs:
-            raise ValueError(errors.unknown('joint of the motion', their, theirs))
-    if 'root' not in chosen or len(chosen) < 2:
-        raise ValueError(
-            f'motion {motion.name!r}: no root, or nothing else, has a counterpart; give a map from '
-            f'{", ".join(ours)} to {", ".join(theirs)}'
-        )
+    theirs, chosen = _joints(motion), counterparts(motion, layout.joints, joint_map)
     if scale is not None and not 0 < scale < np.inf:
         raise ValueError(f'scale is {scale}; expected a positive number')
     if isinstance(motion, Capture):

@@ -48,7 +48,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     task = environments.task
     if not isinstance(task, HighLevel) or task.interface != 'plan':
         raise ValueError(
-            f'a {type(task).__name__} task has no scripted policy; high-level tasks with the '
+            f'the task {type(task).__name__} has no scripted policy; high-level tasks with the '
             "interface 'plan' have"
         )
     blocks = environments.blocks

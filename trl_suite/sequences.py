@@ -231,7 +231,7 @@ class Resumable(Protocol):
 
 
 def scores(
-    sequence: Sequence,
+    sequence: Sequence | str,
     learner: Learner,
     episodes: int = EPISODES,
     seed: int = 0,
@@ -240,7 +240,7 @@ def scores(
     """Tests the present policy of a learner on all tasks.
 
     Args:
-      sequence: the tasks.
+      sequence: the tasks, or the name of a sequence.
       learner: whose policy is tested.
       episodes: of every task, the same ones whenever it is called with this seed.
       seed: of the test seeds.
@@ -249,6 +249,7 @@ def scores(
     Returns:
       Mean returns over the step limit, (T,).
     """
+    sequence = get(sequence) if isinstance(sequence, str) else sequence
     seeds = test_seeds(episodes, seed)
     return [
         evaluation.evaluate(id, learner.policy(id), episodes, seeds, num_threads)[SCORE]

@@ -34,6 +34,9 @@ class Joint:
       original_range: limits in rad by which the original scales position actions, where they are
         not the limits that act; of a spherical joint the extremes over its three axes.
       armature: inertia in kg m^2 that is added to keep stiff servos of light links steady.
+
+    Raises:
+      ValueError: a gain, a weight or an armature that is negative, or what is not finite.
     """
 
     kp: float
@@ -42,6 +45,14 @@ class Joint:
     target: float | tuple[float, float, float] = 0.0
     original_range: tuple[float, float] | None = None
     armature: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ('kp', 'kd', 'weight', 'armature', 'target', 'original_range'):
+            value = getattr(self, name)
+            least = -np.inf if name in ('target', 'original_range') else 0.0
+            if value is not None and not (np.isfinite(value).all() and np.min(value) >= least):
+                expected = 'finite numbers' if least else 'a finite number, 0 or more'
+                raise ValueError(f'{name} of a joint is {value!r}; expected {expected}')
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,11 +9,12 @@ says about masses, limits, damping of joints, servos and torques is kept; where 
 
 * the torque limit of a joint holds the weight of the whole character at the far end of what hangs
   on the joint; the force limit of a slide is twice that weight;
-* kp asks for all of that torque at an error of 1 rad (of a slide, at a tenth of its range), and kd
-  is a tenth of kp, as in the suite's own characters; so is the armature, 0.01 kg m^2 per 300 N m/rad;
+* kp asks for all of that torque at an error of 1 rad (of a slide, at a tenth of its range), and a
+  servo damps by a tenth of kp, as in the suite's own characters; so is the armature, 0.01 kg m^2 per
+  300 N m/rad;
 * a joint works about its first key frame, or else its zero, if that is within its limits.
 
-`row.notes` tells what of it was assumed. The passive damping of joints becomes part of kd (see
+`row.notes` tells what of it was assumed. The passive damping of joints is added to kd (see
 `trl_suite.actuation`); friction, springs, equalities and tendons stay; actuators, sensors and what
 is not part of the character go.
 """
@@ -29,6 +30,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from dm_control import mjcf
+from lxml import etree
 
 from trl_suite import errors
 from trl_suite.characters.character import CharacterRow, Joint
@@ -52,6 +54,8 @@ _FREE, _BALL, _SLIDE, _HINGE = (
     )
 )  # fmt: skip
 _KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
+# Of a file, besides bodies: what must have a name to be found again.
+_NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 _CAMERAS = {  # place in reaches, and the axes of the picture
     'side': ((0.15, -1, 0.09), (1, 0, 0, 0, 0.09, 1)),
     'front': ((0.85, -0.53, 0.2), (0.53, 0.85, 0, -0.17, 0.11, 1)),
@@ -94,6 +98,7 @@ def from_file(
         was expected, and the closest matches of an unknown name.
     """
     file = existing(path, SUFFIXES)
+    _check_numbers(file)
     name = file.stem if name is None else name
     if name in CHARACTERS or '/' in name:
         raise ValueError(f'a character may not be named {name!r}, as one of the suite; give name=')
@@ -151,10 +156,44 @@ def _named(file: pathlib.Path) -> mujoco.MjSpec:
             for i, item in enumerate(items):
                 if not item.name:
                     item.name = f'{body.name}{kind}{i if kind or len(items) > 1 else ""}'
-        for item in (body, *body.joints, *body.geoms):
-            if '/' in item.name:
-                raise _error(file, f'the name {item.name!r} has a slash; expected none in names')
+    for kind in _NAMED:
+        for i, item in enumerate(getattr(spec, kind)):
+            item.name = item.name or f'unnamed_{kind}_{i}'
+    for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
+        if '/' in item.name:
+            raise _error(file, f'the name {item.name!r} has a slash; expected none in names')
     return spec
+
+
+def _check_numbers(file: pathlib.Path) -> None:
+    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity."""
+    try:
+        elements = [*etree.parse(file).getroot().iter(etree.Element)]
+    except etree.XMLSyntaxError as error:
+        raise _error(file, f'not a model: {error}') from None
+    names = {element.get(key) for element in elements for key in ('name', 'class')}
+    for element in elements:
+        for key, text in element.items():
+            if text not in names and key not in ('name', 'class') and not _finite(text):
+                of = f' of {element.get("name")!r}' if element.get('name') else ''
+                raise _error(
+                    file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
+                    'finite numbers',
+                )  # fmt: skip
+    for element in elements:
+        if (
+            element.tag == 'include'
+            and (included := file.parent / element.get('file', '')).is_file()
+        ):
+            _check_numbers(included)
+
+
+def _finite(text: str) -> bool:
+    """Whether a text is no list of numbers, or one of finite ones."""
+    try:
+        return bool(np.isfinite([float(number) for number in text.split()]).all())
+    except ValueError:
+        return True
 
 
 def _in_package(file: pathlib.Path, name: str) -> str:
@@ -215,6 +254,8 @@ class _Found:
                     'ahead and z up: turn what it holds instead',
                 )  # fmt: skip
             return number
+        if not top:
+            raise _error(self.file, 'there is no body; expected one that carries all others')
         if root is None:
             raise _error(self.file, f'several bodies may be the root; give root=, one of {[*top]}')
         names = [model.body(i).name for i in range(1, model.nbody)]
@@ -277,7 +318,9 @@ class _Found:
         """The figures of all joints; sets `limits`, their largest torques or forces."""
         model, figures = self.model, {}
         self.limits: dict[str, float] = {}
-        assumed: dict[str, list[str]] = {'limit': [], 'gains': [], 'posture': [], 'free': []}
+        assumed: dict[str, list[str]] = {
+            'limit': [], 'gains': [], 'damping': [], 'posture': [], 'free': [],
+        }  # fmt: skip
         for i in self.joints.tolist():
             name, kind = model.joint(i).name, int(model.jnt_type[i])
             kp, kv, limit = self._actuators(i)
@@ -289,8 +332,11 @@ class _Found:
             if kp is None:
                 span = 0.1 * np.ptp(model.jnt_range[i]) if kind == _SLIDE else 1.0
                 kp = limit / span
-                kd = KD_SHARE * kp
+                kd += KD_SHARE * kp
                 assumed['gains'].append(f'{name} {kp:.3g}')
+            elif not kd:
+                kd = KD_SHARE * kp
+                assumed['damping'].append(f'{name} {kd:.3g}')
             target = self._posture(i, assumed['posture'])
             if kind == _HINGE and not model.jnt_limited[i]:
                 assumed['free'].append(name)
@@ -304,6 +350,7 @@ class _Found:
             for key, text in (
                 ('limit', 'no torque limits in the file; N m (slides: N)'),
                 ('gains', 'no servos in the file; kp, N m/rad (slides: N/m)'),
+                ('damping', 'servos without damping; kd, N m s/rad (slides: N s/m)'),
                 ('posture', 'zero is beyond the limits; working about'),
                 ('free', 'no limits of the angle'),
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import pathlib
 
 from trl_suite import files, rendering
 from trl_suite.commands import engine
@@ -25,10 +26,17 @@ def run(arguments: argparse.Namespace) -> None:
 
     chosen = None
     if arguments.map is not None:
-        chosen = json.loads(files.existing(arguments.map, ('.json',)).read_text(encoding='utf-8'))
+        chosen = _joint_map(arguments.map)
     name = arguments.character
     motion = retargeting.read(arguments.file, name, arguments.skeleton)
     clip = retargeting.retarget(motion, name, chosen, arguments.scale)
+    if clip is not motion:
+        joints = Mannequin(name).layout.joints
+        followed = retargeting.counterparts(motion, joints, chosen)
+        still = [joint for joint in joints if joint not in followed]
+        print('joints:', ', '.join(f'{own} from {other}' for own, other in followed.items()))
+        if still:
+            print('joints that nothing moves:', ', '.join(still))
     if arguments.cycle is not None:
         clip = retargeting.cycle(clip, *arguments.cycle)
     report = clip_check.check(clip, name)
@@ -45,3 +53,16 @@ def run(arguments: argparse.Namespace) -> None:
         image = Mannequin(name).film_strip(clip, height=240, width=320)
         rendering.film_strip([image], arguments.strip)
         print(arguments.strip)
+
+
+def _joint_map(path: pathlib.Path) -> dict[str, str]:
+    """Reads which joint of the motion each joint of the character follows."""
+    try:
+        content = json.loads(files.existing(path, ('.json',)).read_text(encoding='utf-8'))
+    except ValueError as error:
+        raise ValueError(f'{path}: not JSON: {error}') from None
+    if not isinstance(content, dict) or not all(isinstance(v, str) for v in content.values()):
+        raise ValueError(
+            f'{path}: expected an object of names, {{"joint of the character": "joint of the motion"}}'
+        )
+    return content

@@ -227,7 +227,7 @@ def goal_and_ball() -> Section:
     low, high = ball.BALL_AWAY
     return section(
         'Goal and ball',
-        f'a ball of {ball.RADIUS:g} m and {ball.MASS:g} kg lies {low:g} to {high:g} m from the walker, the '
+        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg lies {low:g} to {high:g} m from the walker, the '
         f'goal up to {ball.GOAL_AWAY[1]:g} m from the ball; both are drawn anew, the ball after '
         f'{_seconds(ball.BALL_LASTS)}, the goal after {_seconds(high_level.GOAL_LASTS)}',
     )

@@ -190,10 +190,16 @@ class Layout:
         """
         assert self.grid is not None
         heights = np.asarray(self.grid(i, j))
-        if heights.shape != (len(i), len(j)) or not np.isfinite(heights).all():
+        if heights.shape != (len(i), len(j)):
             raise ValueError(
-                f'the function for a grid of a Layout must return finite heights of shape '
+                f'the function for a grid of a Layout must return heights of shape '
                 f'{(len(i), len(j))}; it returned an array of shape {heights.shape}'
+            )
+        if not np.isfinite(heights).all():
+            a, b = np.argwhere(~np.isfinite(heights))[0]
+            raise ValueError(
+                f'the function for a grid of a Layout returned {heights[a, b]} at x = {GRID * i[a]:g} m, '
+                f'y = {GRID * j[b]:g} m; expected finite heights'
             )
         return heights
 

@@ -47,6 +47,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from trl_suite.errors import unknown
+from trl_suite.files import existing
 from trl_suite.terrain.generators import GENERATORS, check
 from trl_suite.terrain.layout import GRID
 from trl_suite.terrain.spatial import GENERATORS3D
@@ -190,7 +191,7 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
             raise ValueError(unknown('terrain', name, (*PRESETS, *PRESETS3D)))
         return PRESETS[name] if name in PRESETS else PRESETS3D[name]
     try:
-        text = pathlib.Path(name).read_text(encoding='utf-8-sig')
+        text = existing(name, (pathlib.Path(name).suffix.lower(),)).read_text(encoding='utf-8-sig')
         content = json.loads(text, object_pairs_hook=_without_repetition)
     except (ValueError, RecursionError) as error:
         raise ValueError(f'{name}: not a terrain file in JSON: {error}') from error

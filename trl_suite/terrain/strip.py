@@ -200,10 +200,16 @@ class Strip:
         assert self._line is not None
         x = (first + np.arange(count)) * SPACING + self._offset
         heights = np.asarray(self._line(x), dtype=float)
-        if heights.shape != x.shape or not np.isfinite(heights).all():
+        if heights.shape != x.shape:
             raise ValueError(
-                f'the function of terrain {self.type!r} must return finite heights of shape '
-                f'{x.shape}, as its argument has; it returned an array of shape {heights.shape}'
+                f'the function of terrain {self.type!r} must return heights of shape {x.shape}, as its '
+                f'argument has; it returned an array of shape {heights.shape}'
+            )
+        if not np.isfinite(heights).all():
+            wrong = np.flatnonzero(~np.isfinite(heights))[0]
+            raise ValueError(
+                f'the function of terrain {self.type!r} returned {heights[wrong]} at x = '
+                f'{x[wrong]:g} m; expected finite heights'
             )
         return heights
 
