@@ -396,7 +396,7 @@ class Trainer:
             group['lr'] = rate
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        divergence = 0.0
+        divergence, stopped = 0.0, False
         waits = bool(s.start) and self.samples <= s.value_first
         for _ in range(s.epochs):
             order = torch.from_numpy(self.random.permutation(len(advantage)))
@@ -409,9 +409,11 @@ class Trainer:
                 )
                 log_ratio = log_probability - b['log_probability']
                 ratio = log_ratio.exp()
-                with torch.no_grad():
-                    divergence = float((ratio - 1 - log_ratio).mean())
-                if divergence > s.kl_per_action * mean.shape[1]:
+                if not stopped:
+                    with torch.no_grad():
+                        divergence = float((ratio - 1 - log_ratio).mean())
+                    stopped = divergence > s.kl_per_action * mean.shape[1]
+                if stopped and not s.value_goes_on:
                     return divergence
                 gain = torch.min(
                     ratio * b['advantage'],
@@ -420,7 +422,7 @@ class Trainer:
                 value_error = (self.value(b['observation'])[:, 0] - b['target']).square().mean()
                 excess = (mean.abs() - 1).clamp(min=0).square().sum(-1).mean()
                 loss = 0.5 * value_error
-                if not waits:
+                if not (waits or stopped):
                     loss = -gain + loss + s.bound_cost * excess
                 self.optimizer.zero_grad()
                 loss.backward()

@@ -152,7 +152,7 @@ def plan_rows() -> list[list[str]]:
     return [
         [
             f'`{id_}`', name, str(found['episodes']), f'{found["reward"]:.2f}',
-            f'{found["survived"]:.0%}', f'{found["speed"]:.2f}', f'{found["goals_per_minute"]:.1f}',
+            f'{found["survived_minute"]:.0%}', f'{found["survived"]:.0%}', f'{found["speed"]:.2f}', f'{found["goals_per_minute"]:.1f}',
             f'{found["trail"]:.0f}' if found['trail'] else '–',
             f'{found["at_goal"]:.0%}' if 'Soccer' in id_ else '–', f'{found["falls_per_km"]:.1f}',
         ]
@@ -246,6 +246,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'policy',
                     'episodes',
                     'reward',
+                    'no fall in 60 s',
                     'no fall',
                     'speed',
                     'goals a minute',

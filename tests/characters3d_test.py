@@ -570,7 +570,7 @@ class CollisionTest(parameterized.TestCase):
     def test_cameras(self, name):
         model, _ = alone(name)
         cameras = {model.camera(i).name for i in range(model.ncam)}
-        self.assertEqual(cameras, {'side', 'front', 'back'})
+        self.assertEqual(cameras, {'side', 'front', 'back', 'above'})
 
     @parameterized.parameters(*NAMES)
     def test_left_and_right_have_their_own_colours(self, name):

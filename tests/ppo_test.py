@@ -219,6 +219,24 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(trainer.samples, 160)
         self.assertLess(np.abs(trainer.exported()(seen) - shown).mean(), before / 2)
 
+    def test_after_the_first_round_the_policy_walks(self):
+        id_ = 'PD_Biped3D_HLC_Soccer-v0'
+        seen = []
+        for clonings in (1, 2):
+            settings = ppo_settings.Settings(
+                **TINY, start='scripted', cloned=160, clonings=clonings, initial_std=1e-9
+            )
+            trainer = ppo.Trainer(id_, 0, settings, 1)
+            with mock.patch.object(
+                trainer.environments, 'step', wraps=trainer.environments.step
+            ) as step:
+                trainer.imitate('scripted')
+            self.assertEqual(trainer.samples, 160)
+            seen.append([call.args[0] for call in step.call_args_list])
+        half = len(seen[0]) // 2
+        np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
+        self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
+
     def test_a_run_ends_when_it_has_learnt_enough(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
         for fractions, expected in (
@@ -294,6 +312,18 @@ class RunTest(parameterized.TestCase):
         trainer.learn(trainer.collect())
         for a, b in zip(before, trainer.parameters, strict=True):
             self.assertTrue(torch.equal(a, b))
+
+    def test_the_value_may_be_learnt_on(self):
+        trainer = ppo.Trainer(
+            FLAT, 0, ppo_settings.Settings(**TINY, kl_per_action=-1.0, value_goes_on=True), 1
+        )
+        policy, value = (part.state_dict() for part in (trainer.policy, trainer.value))
+        policy, value = ({k: v.clone() for k, v in part.items()} for part in (policy, value))
+        trainer.learn(trainer.collect())
+        for name, weight in trainer.policy.state_dict().items():
+            self.assertTrue(torch.equal(weight, policy[name]), name)
+        for name, weight in trainer.value.state_dict().items():
+            self.assertFalse(torch.equal(weight, value[name]), name)
 
     def test_a_cut_episode_is_worth_what_would_follow(self):
         """Where nothing but the step limit ends episodes, targets do not dip before it."""

@@ -85,7 +85,7 @@ class FrameTest(parameterized.TestCase):
     def test_no_ghost_without_a_clip(self):
         environment = composer.Environment(composer.NullTask(composer.Arena()))
         self.assertEqual(rendering.frame(environment, 48, 64, camera=-1).shape, (48, 64, 3))
-        with self.assertRaisesRegex(ValueError, 'a NullTask task has no reference clip'):
+        with self.assertRaisesRegex(ValueError, 'the task NullTask has no reference clip'):
             rendering.frame(environment, 48, 64, camera=-1, ghost=True)
 
 
@@ -350,7 +350,7 @@ class SpatialTest(FolderTest):
 
     def test_height_map_refusals(self):
         for make, options, message in (
-            (lambda: suite.make(GAPS), {}, 'Imitation task.*no map'),
+            (lambda: suite.make(GAPS), {}, 'the task Imitation.*no map'),
             (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, 'terrain_map=True'),
             (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
             (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
