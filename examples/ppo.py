@@ -50,14 +50,27 @@ class Scales:
     """Running mean and standard deviation of observations.
 
     The phase stays as it is, and all numbers of a map of the ground share one scale: their shape is
-    what counts, and where the ground is flat nothing is blown up.
+    what counts, and where the ground is flat nothing is blown up. With a bound they are clipped there
+    and become shares of it, by `gain`, which an exported policy has in its weights.
     """
 
     def __init__(
-        self, blocks: dict[str, slice], size: int, columns: np.ndarray | None = None
+        self,
+        blocks: dict[str, slice],
+        size: int,
+        columns: np.ndarray | None = None,
+        map_bound: float = 0.0,
     ) -> None:
         self.blocks, self.count, self.columns = blocks, np.zeros(size), columns
-        self.mean, self.square = np.zeros(size), np.ones(size)
+        self.mean, self.square, self.gain = np.zeros(size), np.ones(size), np.ones(size)
+        self.map_std = map_bound / OBSERVATION_CLIP
+        if map_bound:
+            for part in self.maps:
+                self.square[part], self.gain[part] = self.map_std**2, 1 / OBSERVATION_CLIP
+
+    @property
+    def maps(self) -> list[slice]:
+        return [self.blocks[name] for name in MAPS if name in self.blocks]
 
     def update(self, batch: np.ndarray) -> None:
         """Takes in observations (n, size)."""
@@ -67,8 +80,8 @@ class Scales:
         if 'phase' in self.blocks:
             part = self.blocks['phase']
             mean[part], square[part] = 0.0, 1.0
-        for part in (self.blocks[name] for name in MAPS if name in self.blocks):
-            mean[part], square[part] = 0.0, square[part].mean()
+        for part in self.maps:
+            mean[part], square[part] = 0.0, self.map_std**2 or square[part].mean()
         self.mean += weight * (mean - self.mean)
         self.square += weight * (square - self.square)
 
@@ -78,6 +91,7 @@ class Scales:
 
     def __call__(self, observation: np.ndarray) -> torch.Tensor:
         scaled = np.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        scaled *= self.gain
         if self.columns is not None:
             scaled = scaled[..., self.columns]
         return torch.from_numpy(scaled.astype(np.float32))
@@ -178,7 +192,7 @@ class Trainer:
         self.places = np.add.outer(starts, (0, 1)) if starts else None
         inputs = self.observation.shape[1] + 2 * len(starts)
         columns = visible(blocks, inputs, s.view)
-        self.scales = Scales(blocks, inputs, columns)
+        self.scales = Scales(blocks, inputs, columns, s.map_bound)
         inputs = inputs if columns is None else len(columns)
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
@@ -252,14 +266,22 @@ class Trainer:
         entry = np.full(offset + 1, -1)  # of the other's network; the last one is for -1
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
         entry = entry[column]
+        for part in (
+            scales.maps if scales.map_std else ()
+        ):  # clipped elsewhere, they mean other things
+            entry[part] = np.where(
+                np.isclose(other.std[entry[part]], scales.map_std), entry[part], -1
+            )
         known = entry >= 0
         scales.count = np.where(known, self.settings.start_count, NEW_COUNT)
         scales.mean[known] = other.mean[entry[known]]
         scales.square[:] = LEAST_STD**2
+        for part in scales.maps if scales.map_std else ():
+            scales.square[part] = scales.map_std**2
         scales.square[known] = other.std[entry[known]] ** 2 + scales.mean[known] ** 2
-        if scales.columns is not None:
-            entry = entry[scales.columns]
-        first = np.where((entry >= 0)[:, None], other.weights[0][entry], 0.0)
+        kept = slice(None) if scales.columns is None else scales.columns
+        entry, gain = entry[kept], scales.gain[kept, None]
+        first = np.where((entry >= 0)[:, None], other.weights[0][entry] / gain, 0.0)
         layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
         with torch.no_grad():
             for layer, weight, bias in zip(
@@ -436,6 +458,9 @@ class Trainer:
         layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
+        weights[0] *= (
+            self.scales.gain[:, None] if columns is None else self.scales.gain[columns, None]
+        )
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
         return policies.Policy(
             id=self.row.id,

@@ -1036,7 +1036,7 @@ class PictureTest(parameterized.TestCase):
 
     def test_no_ghost(self):
         environment, _ = started(FOREST)
-        with self.assertRaisesRegex(ValueError, 'HighLevel task has no reference clip'):
+        with self.assertRaisesRegex(ValueError, 'the task HighLevel has no reference clip'):
             rendering.frame(environment, 60, 80, ghost=True)
 
 

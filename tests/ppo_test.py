@@ -208,6 +208,31 @@ class RunTest(parameterized.TestCase):
             found = other.exported()(trainer.observation)
             self.assertEqual(np.allclose(found, policy(trainer.observation), atol=1e-4), same)
 
+    def test_maps_may_be_clipped(self):
+        id_ = 'PD_Biped3D_HLC_LargeBlocks-v0'
+        settings = ppo_settings.Settings(**TINY, map_bound=0.3, view=(6.0, 3.0))
+        trainer = ppo.Trainer(id_, 0, settings, 1)
+        trainer.collect()
+        policy, observation = trainer.exported(), trainer.observation.copy()
+        inputs = trainer.scales(observation)
+        walls = inputs.abs().max(1).values > 0.99
+        self.assertTrue(walls.any())
+        with torch.no_grad():
+            inside = trainer.policy(inputs).numpy()
+        np.testing.assert_allclose(policy(observation), np.clip(inside, -1, 1), atol=1e-5)
+        # What is higher than the bound makes no difference.
+        part = trainer.environments.blocks['terrain']
+        cut = observation.copy()
+        cut[:, part] = np.clip(cut[:, part], -0.3, 0.3)
+        np.testing.assert_allclose(policy(cut), policy(observation), atol=1e-6)
+        # What has not varied would not be taken over.
+        policy = dataclasses.replace(policy, std=np.maximum(policy.std, 0.02))
+        for bound, same in ((0.3, True), (0.5, False)):
+            other = ppo.Trainer(id_, 1, dataclasses.replace(settings, map_bound=bound), 1)
+            other.begin_with(policy)
+            found = other.exported()(observation)
+            self.assertEqual(np.allclose(found, policy(observation), atol=1e-4), same)
+
     def test_a_run_may_begin_with_what_a_baseline_does(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
