@@ -266,17 +266,15 @@ class Trainer:
         entry = np.full(offset + 1, -1)  # of the other's network; the last one is for -1
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
         entry = entry[column]
-        for part in (
-            scales.maps if scales.map_std else ()
-        ):  # clipped elsewhere, they mean other things
-            entry[part] = np.where(
-                np.isclose(other.std[entry[part]], scales.map_std), entry[part], -1
-            )
+        bounded = scales.maps if scales.map_std else []
+        for part in bounded:  # what was clipped elsewhere means other things
+            same_std = np.isclose(other.std[entry[part]], scales.map_std)
+            entry[part] = np.where(same_std, entry[part], -1)
         known = entry >= 0
         scales.count = np.where(known, self.settings.start_count, NEW_COUNT)
         scales.mean[known] = other.mean[entry[known]]
         scales.square[:] = LEAST_STD**2
-        for part in scales.maps if scales.map_std else ():
+        for part in bounded:
             scales.square[part] = scales.map_std**2
         scales.square[known] = other.std[entry[known]] ** 2 + scales.mean[known] ** 2
         kept = slice(None) if scales.columns is None else scales.columns

@@ -252,6 +252,18 @@ class CharacterTest(Folder):
         with self.assertRaisesRegex(ValueError, f'figure.xml: .*{message}'):
             self.planar(MJCF.replace(before, after))
 
+    def test_numbers_of_included_files(self):
+        part = '<mujocoinclude><body name="ball"><geom size="{}"/></body></mujocoinclude>'
+        text = MJCF.replace('</worldbody>', '<include file="part.xml"/></worldbody>')
+        self.write(part.format('1'), 'part.xml')
+        self.assertNotIn('ball', self.planar(text, root='trunk').links)
+        self.write(part.format('nan'), 'part.xml')
+        with self.assertRaisesRegex(ValueError, 'part.xml: line 1: size="nan"'):
+            self.planar(text, root='trunk')
+        self.write('<mujocoinclude><include file="part.xml"/></mujocoinclude>', 'part.xml')
+        with self.assertRaisesRegex(ValueError, 'figure.xml: not a model'):
+            self.planar(text, root='trunk')
+
     def test_a_body_may_be_named_nan(self):
         self.assertIn(
             'nan', self.planar(MJCF.replace('right_shin', 'nan'), end_effectors=('nan',)).links

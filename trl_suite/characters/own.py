@@ -166,7 +166,7 @@ def _named(file: pathlib.Path) -> mujoco.MjSpec:
     return spec
 
 
-def _check_numbers(file: pathlib.Path) -> None:
+def _check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset()) -> None:
     """Refuses NaN, which MuJoCo takes for something that is not said, and infinity."""
     try:
         elements = [*etree.parse(file).getroot().iter(etree.Element)]
@@ -181,12 +181,12 @@ def _check_numbers(file: pathlib.Path) -> None:
                     file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
                     'finite numbers',
                 )  # fmt: skip
+    seen |= {file.resolve()}
     for element in elements:
-        if (
-            element.tag == 'include'
-            and (included := file.parent / element.get('file', '')).is_file()
-        ):
-            _check_numbers(included)
+        if element.tag == 'include':
+            included = file.parent / element.get('file', '')
+            if included.is_file() and included.resolve() not in seen:  # else MuJoCo complains
+                _check_numbers(included, seen)
 
 
 def _finite(text: str) -> bool:
