@@ -5,8 +5,9 @@
 
 Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
 `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares that do not
-fall, at all and in the first minute, speed towards the goal, goals per minute, distance along a trail, the share of time with the
-ball at its goal, and falls per kilometre. Writes into trained/plans.json what it has measured.
+fall, at all and in the first minute, speed towards the goal, goals per minute, distance along a
+trail, the share of time with the ball at its goal, and falls per kilometre. Writes into
+trained/plans.json what it has measured.
 """
 
 from __future__ import annotations

@@ -450,6 +450,15 @@ class TerrainTest(Folder):
         again = terrain.Strip(heights(0.5), 0)
         self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
 
+    def test_another_lambda_of_the_same_name(self):
+        for factor in (1.0, 2.0):
+            with (
+                self.assertRaisesRegex(ValueError, 'exists; pass')
+                if factor > 1
+                else contextlib.nullcontext()
+            ):
+                terrain.from_function(lambda x, factor=factor: factor * x, 'wedge')
+
     def test_heights_that_are_not_finite(self):
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
         with self.assertRaisesRegex(
