@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 import tqdm
+from guide import guide
 from ppo_settings import Settings, settings_for
 from torch import nn
 from torch.optim import swa_utils
@@ -38,6 +39,7 @@ from trl_suite.tasks import rewards
 from trl_suite.terrain import surroundings
 from trl_suite.vector import VectorEnvironment
 
+TEACHERS = {**evaluation.BASELINES, 'guide': guide}
 EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
 OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
@@ -198,7 +200,7 @@ class Trainer:
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
         self.begun = not s.start
-        if s.start and s.start not in evaluation.BASELINES:
+        if s.start and s.start not in TEACHERS:
             self.begin_with(policies.reference(s.start))
             self.begun = True
         self.networks = [self.policy, self.value]
@@ -295,7 +297,7 @@ class Trainer:
         Who walks is disturbed as the policy will be, so that the baseline shows how to come back.
         """
         s, environments = self.settings, self.environments
-        teacher = evaluation.BASELINES[baseline](environments)
+        teacher = TEACHERS[baseline](environments)
         seen: list[np.ndarray] = []
         shown: list[np.ndarray] = []
         std = self.log_std.exp().detach().numpy()

@@ -64,7 +64,7 @@ class Settings:
     lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
     # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
     # weights, its scales and its noise. What it did not observe begins without influence. Or with
-    # one of `evaluation.BASELINES`, which is imitated for `cloned` control steps.
+    # one of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
     start: str = ''
     # As how many observations its scales count: few, and they soon fit the new environment, where its
     # weights may no longer fit them.
@@ -246,15 +246,17 @@ PLANS = {  # a step is a whole footstep: few of them
 }  # fmt: skip
 # Updates stop after a few steps, too few to learn a value by.
 BETTER_VALUED = {'value_goes_on': True, 'learning_rate': 1e-4}
-# Who finds a way between blocks begins well among other things that stand or move.
-AMONG = {'samples': 2e5, 'start': 'PD_Biped3D_HLC_LargeBlocks-v0', 'start_count': 1e6}
-# On a trail the clone must find its way before it can learn anything by walking.
-SHOWN = {'cloned': 8e4, 'clonings': 5, 'value_first': 1e5}
-AVOIDING = {**BETTER_VALUED, 'samples': 2e5, 'cloned': 4e4, 'clonings': 4, 'value_first': 6e4}
+# Shown the way by somebody who has a map, again and again from where it goes astray; then by itself.
+GUIDED = {
+    **BETTER_VALUED, 'samples': 2e5, 'start': 'guide', 'cloned': 1.2e5, 'clonings': 6,
+    'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
+    'evaluation_episodes': 32,
+}  # fmt: skip
+MOVING = {**GUIDED, 'map_bound': 1.0}  # m/s
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
-    'samples': 6e5, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
-    'places': ('target', 'ball'),
+    'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
+    'value_goes_on': True, 'averaged': 2e4, 'places': ('target', 'ball'),
     'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
@@ -332,10 +334,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
-    ('PD_Biped3D_HLC_Forest-v0', AMONG),
-    ('PD_Biped3D_HLC_DynamicsObstacles-v0', AVOIDING),
-    ('PD_Biped3D_HLC_Conveyors*', AMONG),
-    ('PD_Biped3D_HLC_PathFollowing-v0', SHOWN),
+    ('PD_Biped3D_HLC_Forest-v0', GUIDED),
+    ('PD_Biped3D_HLC_DynamicsObstacles-v0', MOVING),
+    ('PD_Biped3D_HLC_Conveyors*', MOVING),
+    ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot

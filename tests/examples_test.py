@@ -2,15 +2,19 @@
 
 import pathlib
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, characters, evaluation, policies
+from trl_suite import catalogue, characters, policies
+from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import compare_transfer
 import evaluate_plans
+import guide
+import ppo
 import ppo_settings
 import train_all
 
@@ -31,7 +35,7 @@ class JobsTest(parameterized.TestCase):
         seen = set()
         for id_, _ in train_all.jobs('*'):
             start = ppo_settings.settings_for(id_).start
-            if start and start not in evaluation.BASELINES:
+            if start and start not in ppo.TEACHERS:
                 self.assertIn(start, seen, id_)
             seen.add(id_)
 
@@ -90,6 +94,54 @@ class PlansTest(absltest.TestCase):
         self.assertLess(found['reward'], 0.05)
         self.assertGreater(found['falls_per_km'], 50)
         self.assertEqual(found['at_goal'], 0)
+
+
+class GuideTest(parameterized.TestCase):
+    """Who shows policies how to plan footsteps."""
+
+    def test_a_trail(self):
+        trail = SimpleNamespace(
+            start=np.array([[0.0, 0.0], [2.0, 0.0]]), end=np.array([[2.0, 0.0], [2.0, 2.0]])
+        )
+        for place, goal, ahead, expected in (
+            ((0.5, 0.1), (1.9, 0.0), 1.0, (1.5, 0.0)),
+            ((1.5, 0.1), (2.0, 1.9), 1.0, (2.0, 0.5)),  # around the corner
+            ((2.1, 0.5), (1.0, 0.0), 1.0, (1.5, 0.0)),  # back
+            ((1.5, 0.0), (1.7, 0.0), 1.0, (1.7, 0.0)),  # no farther than the goal
+        ):
+            aim = guide.on_trail(trail, np.array(place), np.array(goal), ahead)
+            np.testing.assert_allclose(aim + place, expected, atol=1e-9)
+
+    def test_a_way_on_a_map(self):
+        map_ = guide.Map()
+        x, y = map_.places.T
+        np.testing.assert_allclose(map_.places[map_.middle], 0)
+        self.assertEqual(np.abs(map_.places[map_.rim]).max(1).min(), guide.REACH)
+        even = np.ones(len(x))
+        for goal in ((3.0, 0.0), (0.0, -4.0), (-20.0, 0.0), (9.0, 9.0)):
+            aim = map_.aim(even, np.array(goal))
+            np.testing.assert_allclose(aim, np.array(goal) / np.linalg.norm(goal), atol=0.13)
+        # A wall ahead that reaches farther to the right than to the left.
+        wall = (np.abs(x - 1) < 0.2) & (y < 1) & (y > -4)
+        aim = map_.aim(even + guide.WALL * wall, np.array([3.0, 0.0]))
+        self.assertGreater(aim[1], 0.6)
+
+    @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
+    def test_it_arrives_where_it_is_dangerous(self, name):
+        """20 s of 8 episodes, towards goals at the least speed that is asked of who has learnt it."""
+        rows = VectorEnvironment(f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled')
+        policy, observation = guide.guide(rows), rows.reset()
+        fell, speed = 0, np.zeros(8)
+        for _ in range(40):
+            action = policy(observation)
+            self.assertEqual(action.shape, (8, 5))
+            step = rows.step(action)
+            ended = step.terminated | step.truncated
+            fell += ended.sum()
+            speed += step.info['speed'] / 40
+            observation = rows.reset(ended) if ended.any() else step.observation
+        self.assertLessEqual(fell, 1)
+        self.assertGreater(speed.mean(), 0.6)
 
 
 if __name__ == '__main__':

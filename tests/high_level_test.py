@@ -874,7 +874,8 @@ class ScriptedTest(parameterized.TestCase):
     def test_plans(self, stance):
         ways = np.array([0.0, 0.3, -0.3, 2.0])
         room = np.array([np.inf, 1.0, np.inf, np.inf])
-        plans = scripted.steps(ways, np.full(4, 5.0), room, np.full(4, stance), 0.5)
+        lengths = 0.5 * scripted.lengths(ways, np.full(4, 5.0), room)
+        plans = scripted.steps(ways, lengths, np.full(4, stance), 0.5)
         side = -1 if stance == LEFT else 1  # of the foot that swings
         first, second = plans[:, :2], plans[:, 2:4]
         self.assertAlmostEqual(first[0, 1], side * 0.075)

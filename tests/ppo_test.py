@@ -63,7 +63,7 @@ class PartsTest(parameterized.TestCase):
             least = 5e4 if cycles or plans else 2e5 if settings.start else 5e5
             self.assertGreaterEqual(settings.samples, least, id_)
             if settings.start:
-                self.assertIn(settings.start, {**catalogue.BY_ID, **evaluation.BASELINES})
+                self.assertIn(settings.start, {**catalogue.BY_ID, **ppo.TEACHERS})
             self.assertEqual(settings.num_envs * settings.horizon % settings.minibatch, 0)
 
     def test_gaits_that_stand_still_are_ended_in_training_only(self):

@@ -57,7 +57,8 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
         parts = {name: observation[:, part] for name, part in blocks.items()}
         bearing, distance = towards_ball(parts) if isinstance(task, Soccer) else parts['target'].T
         way, room = free_way(parts, bearing, distance)
-        plan = steps(way, distance, room, task.stance, task.step_length)
+        length = task.step_length * lengths(way, distance, room)
+        plan = steps(way, length, task.stance, task.step_length)
         return np.clip(task.action_map.action(plan), -1, 1)
 
     return policy
@@ -114,13 +115,17 @@ def free_way(
     return ways[best], room[best]
 
 
-def steps(
-    way: np.ndarray, distance: np.ndarray, room: np.ndarray, stance: np.ndarray, step_length: float
-) -> np.ndarray:
-    """Plans (n, 5) in physical units that walk along a bearing (n,), so far and with so much room."""
-    turn = np.clip(way, -TURN / step_length, TURN / step_length)
+def lengths(way: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of steps along a bearing (n,), so far and with so much room; in step lengths."""
     short = (distance < NEAR) | (np.abs(way) > SHARP)
-    length = np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH)) * step_length
+    return np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH))
+
+
+def steps(
+    way: np.ndarray, length: np.ndarray, stance: np.ndarray, step_length: float
+) -> np.ndarray:
+    """Plans (n, 5) in physical units: steps along bearings (n,) rad, so long (n,) m."""
+    turn = np.clip(way, -TURN / step_length, TURN / step_length)
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)
     ankle = ANKLE / step_length
