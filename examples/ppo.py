@@ -291,10 +291,14 @@ class Trainer:
                 layer.bias.copy_(torch.from_numpy(bias.copy()))
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
 
-    def imitate(self, baseline: str) -> None:
+    def imitate(self, baseline: str, folder: pathlib.Path | None = None) -> None:
         """Has the policy do what a baseline does, as far as it sees why (behavioural cloning).
 
         Who walks is disturbed as the policy will be, so that the baseline shows how to come back.
+
+        Args:
+          baseline: one of `TEACHERS`.
+          folder: where it is evaluated between two rounds; None: it is not.
         """
         s, environments = self.settings, self.environments
         teacher = TEACHERS[baseline](environments)
@@ -318,7 +322,9 @@ class Trainer:
                 self.observation = environments.reset(ended) if ended.any() else step.observation
             self.scales.update(np.concatenate(seen[first:]))
             self.fit(np.concatenate(seen), np.concatenate(shown))
-        self.samples += len(seen) * s.num_envs
+            self.samples += (len(seen) - first) * s.num_envs
+            if folder is not None and number < s.clonings - 1:
+                self.evaluate(folder, 0.0)
 
     def fit(self, seen: np.ndarray, shown: np.ndarray) -> None:
         """Has the policy answer observations (n, k) by actions (n, a)."""
@@ -454,7 +460,8 @@ class Trainer:
 
     def exported(self) -> policies.Policy:
         """The policy of now, without PyTorch."""
-        network_ = self.average.module if self.average else self.policy
+        averaged = self.average is not None and self.average.n_averaged > 0
+        network_ = self.average.module if averaged else self.policy
         layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
@@ -592,7 +599,7 @@ def train(
                 trainer.begin_lesson()
             begin, before = time.perf_counter(), trainer.samples
             if not trainer.begun:
-                trainer.imitate(settings.start)
+                trainer.imitate(settings.start, folder)
                 trainer.begun = True
             batch = trainer.collect()
             middle = time.perf_counter()

@@ -262,6 +262,18 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
         self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
 
+    def test_it_is_evaluated_between_rounds(self):
+        settings = ppo_settings.Settings(
+            **TINY, start='scripted', cloned=160, clonings=2, averaged=100.0
+        )
+        trainer = ppo.Trainer('PD_Biped3D_HLC_Soccer-v0', 0, settings, 1)
+        before = trainer.exported()(trainer.observation)
+        with tempfile.TemporaryDirectory() as name:
+            trainer.imitate('scripted', pathlib.Path(name))
+            self.assertEqual([point['samples'] for point in trainer.curve], [80])
+            shown = policies.load(pathlib.Path(name) / 'policy.npz')(trainer.observation)
+        self.assertGreater(np.abs(shown - before).mean(), 0.1)  # not the average, not yet begun
+
     def test_a_run_ends_when_it_has_learnt_enough(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
         for fractions, expected in (
