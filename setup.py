@@ -48,7 +48,7 @@ setup(
         'rllib': ['gymnasium>=1.1', 'ray[rllib]>=2.54.1,<2.61', TORCH],
         'shimmy': ['shimmy>=2.0,<3'],
         'clips': [BVH],
-        'train': [TORCH],
+        'train': [TORCH, 'scipy'],
         'tune': ['cma'],
         'test': [
             'absl-py',

@@ -15,7 +15,7 @@ import pathlib
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from trl_suite import acting, catalogue, characters, describe, files, policies, suite, terrain
@@ -177,6 +177,17 @@ def strip(row: catalogue.Row, environment: Any) -> str:
     )
 
 
+def begun(settings: Mapping[str, Any]) -> str:
+    """What a run began with."""
+    start = settings['start']
+    if start in catalogue.BY_ID:
+        return f'[{start}]({start}.md)'
+    shown = f'shown for {settings["cloned"] / 1e6:.2g} million plans'
+    if start == 'guide':
+        return f'what [a guide with a map](../../examples/guide.py) would do, {shown}'
+    return f'what `--policy {start}` does, {shown}'
+
+
 def learnt(row: catalogue.Row) -> str:
     found = gallery.record(row.id)
     if found is None:
@@ -192,6 +203,7 @@ def learnt(row: catalogue.Row) -> str:
         ('episodes that were not cut short', f'{result["full"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{samples / 1e6:.2g} million {unit}, seed {run["seed"]}'),
+        *([('began with', begun(run['settings']))] if run['settings'].get('start') else []),
         ('on', run['machine']),
     )  # fmt: skip
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''

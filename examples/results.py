@@ -176,7 +176,10 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
         'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
         'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
-        f'the run began with; its samples are not counted again. Machine: {machines}; one thread per '
+        'the run began with, whose samples are not counted again; or what it was shown at first: '
+        '`scripted`, the rules written by hand, or `guide`, the plans of [one who has a map]'
+        '(../examples/guide.py), whose samples are counted. '
+        f'Machine: {machines}; one thread per '
         'run, with up to five others and other work beside it, so that minutes say little.',
         '## Every environment',
         table(
