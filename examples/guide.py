@@ -24,11 +24,8 @@ from trl_suite.vector import VectorEnvironment
 
 REACH, FINE, COARSE = 5.0, 0.125, 2  # m to each side; m between heights; heights between two places
 LEVEL = 0.12  # m; what differs less from the ground at the goal is level
-DISTANCE, PRICE = (
-    0.7,
-    8.0,
-)  # m; nearer to anything a way counts as up to so many times its length more
-WALL = 60.0  # the same through something
+DISTANCE = 0.7  # m; a way that is nearer to something counts as longer than it is,
+PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through something by so many
 NEXT, LAST = 0.6, 1.4  # m along the way: the stretch whose middle is stepped towards
 AHEAD = 4.0  # step lengths; the same on a trail
 PACE = 1.0  # m/s; how fast the guide comes along where boxes move
