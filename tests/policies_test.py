@@ -301,7 +301,23 @@ class FileTest(FolderTest):
         for name, array in arrays.items():
             self.assertIn(array.dtype.kind, 'Uif', name)
             if array.dtype.kind == 'f':
+                self.assertIn(array.dtype, (np.float32, np.float16))
+
+    def test_what_half_precision_holds_is_written_in_it(self):
+        exact = [weight.astype(np.float16) for weight in make().weights]
+        finer = np.full_like(make().biases[0], 1 + 2**-12)
+        policy = make(weights=exact, biases=[finer, *make().biases[1:]])
+        path = self.folder / 'p.npz'
+        policies.save(policy, path)
+        with np.load(path, allow_pickle=False) as data:
+            self.assertEqual(data['weight_0'].dtype, np.float16)
+            self.assertEqual(data['bias_0'].dtype, np.float32)
+        for name in ('weights', 'biases'):
+            for array, expected in zip(
+                getattr(policies.load(path), name), getattr(policy, name), strict=True
+            ):
                 self.assertEqual(array.dtype, np.float32)
+                np.testing.assert_array_equal(array, expected)
 
     def test_an_old_file_stays_until_the_new_one_is_whole(self):
         path = self.folder / 'p.npz'

@@ -51,7 +51,7 @@ and, if it chooses among b actions instead of composing one, as mixtures of expe
 
     choices      float (b, a)  the action is the row whose output is the largest
 
-Floats are written as float32.
+Floats are written as float32, or as float16 where nothing is lost by it.
 """
 
 from __future__ import annotations
@@ -121,7 +121,9 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
     fields |= {name: value for name, value in optional.items() if value is not None}
     with replacing(check_path(path, ('.npz',))) as part:
-        np.savez_compressed(part, allow_pickle=False, **fields)
+        np.savez_compressed(
+            part, allow_pickle=False, **{name: _small(value) for name, value in fields.items()}
+        )
 
 
 def load(path: str | os.PathLike[str]) -> Policy:
@@ -219,6 +221,15 @@ def available() -> tuple[str, ...]:
     """Returns the ids of the environments that have a shipped policy, as the catalogue has them."""
     files = {path.stem for path in resources.directory('trained').glob('*.npz')}
     return tuple(id for id in catalogue.BY_ID if id in files)
+
+
+def _small(value: Any) -> Any:
+    """Returns an array in half precision, if nothing is lost by it."""
+    if not isinstance(value, np.ndarray) or value.dtype != np.float32:
+        return value
+    with np.errstate(over='ignore'):
+        half = value.astype(np.float16)
+    return half if np.array_equal(half, value) else value
 
 
 def _read(archive: Any, field: str, kind: str, axes: int) -> np.ndarray:
