@@ -243,7 +243,7 @@ def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
     row = suite.find(id)
     planned = 'hierarchical' in row.tags
     hidden = 'obstacles' in terrains.load(row.terrain).type
-    camera = 'back' if planned and not hidden else 'side'
+    camera = ('above' if hidden else 'back') if planned else 'side'
     images: list[np.ndarray] = []
     number = itertools.count()
 
