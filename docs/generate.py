@@ -184,7 +184,7 @@ def begun(settings: Mapping[str, Any]) -> str:
         return f'[{start}]({start}.md)'
     shown = f'shown for {settings["cloned"] / 1e6:.2g} million plans'
     if start == 'guide':
-        return f'what [a guide with a map](../../examples/guide.py) would do, {shown}'
+        return f'what a guide with a map would do (`examples/guide.py`), {shown}'
     return f'what `--policy {start}` does, {shown}'
 
 
