@@ -19,6 +19,7 @@ from trl_suite import scripted
 from trl_suite.scripted import CAUTIOUS
 from trl_suite.tasks import rewards
 from trl_suite.tasks.high_level import HighLevel
+from trl_suite.tasks.soccer import Soccer
 from trl_suite.terrain.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
@@ -99,9 +100,17 @@ def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) ->
 
 
 def guide(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
-    """Makes a guide: like the values of `evaluation.BASELINES`."""
+    """Makes a guide: like the values of `evaluation.BASELINES`.
+
+    Raises:
+      ValueError: a task whose steps are no plans, or whose way is that of a ball.
+    """
     task = environments.task
-    assert isinstance(task, HighLevel)
+    if not isinstance(task, HighLevel) or isinstance(task, Soccer) or task.interface != 'plan':
+        raise ValueError(
+            f'the guide knows no way for the task {type(task).__name__}; it does for high-level '
+            "tasks with the interface 'plan' and without a ball"
+        )
     map_, arena = Map(), task.arena
     moves = arena.surroundings.capacity.movers > 0
 

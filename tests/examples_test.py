@@ -126,6 +126,16 @@ class GuideTest(parameterized.TestCase):
         aim = map_.aim(even + guide.WALL * wall, np.array([3.0, 0.0]))
         self.assertGreater(aim[1], 0.6)
 
+    @parameterized.parameters(
+        ('PD_Biped3D_HLC_Soccer-v0', {}),
+        ('PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}),
+        ('PD_Biped2D_Flat-v0', {}),
+    )
+    def test_ways_that_it_does_not_know(self, id_, options):
+        rows = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
+        with self.assertRaisesRegex(ValueError, 'the guide knows no way for the task'):
+            guide.guide(rows)
+
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
     def test_it_arrives_where_it_is_dangerous(self, name):
         """20 s of 8 episodes, towards goals at the least speed that is asked of who has learnt it."""
