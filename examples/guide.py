@@ -27,10 +27,12 @@ REACH, FINE, COARSE = 5.0, 0.125, 2  # m to each side; m between heights; height
 LEVEL = 0.12  # m; what differs less from the ground at the goal is level
 DISTANCE = 0.7  # m; a way that is nearer to something counts as longer than it is,
 PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through something by so many
-NEXT, LAST = 0.6, 1.4  # m along the way: the stretch whose middle is stepped towards
+DETOUR = 1.02  # a place is gone straight to if that costs no more times what the way there does
 AHEAD = 4.0  # step lengths; the same on a trail
 PACE = 1.0  # m/s; how fast the guide comes along where boxes move
+
 BEND, CLOSE = 0.35, 0.3  # rad, m; a sharper bend and what is closer are taken with small steps
+LOOKS = 33  # places on a straight line
 BEYOND = 1.5  # times the distance: what lies outside of the map is guessed to take
 
 
@@ -54,7 +56,9 @@ class Map:
         self.rim = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
 
     def aim(self, cost: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The middle of the stretch from `NEXT` to `LAST` on the cheapest way to a goal, (2,) m.
+        """The farthest place on the cheapest way to a goal that may be gone straight to, (2,) m.
+
+        From place to place the way turns by 45 degrees, which nobody should follow step by step.
 
         Args:
           cost: of the places, per m.
@@ -69,17 +73,23 @@ class Map:
         price = 0.5 * (cost[self.a] + cost[self.b]) * self.length
         ends = np.append(self.a, into), np.append(self.b, np.full(len(into), n))
         graph = sparse.coo_array((np.append(price, last), ends), shape=(n + 1, n + 1))
-        _, before = csgraph.dijkstra(
+        left, before = csgraph.dijkstra(
             graph.tocsr(), directed=False, indices=n, return_predecessors=True
         )
-        places, at = [], self.middle
+        at, way = self.middle, []
         while at != n:
-            places.append(self.places[at])
             at = before[at]
-        way = np.array([*places, goal])
-        done = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-        ahead = np.linspace(NEXT, LAST, 5)
-        return np.array([np.interp(ahead, done, part).mean() for part in way.T])
+            way.append(at)
+        there = np.concatenate([self.places, [goal]])[way]
+        share = np.linspace(0, 1, LOOKS)
+        side = round(n**0.5)
+        seen = (there[:, None] * share[:, None] + REACH) / (COARSE * FINE)
+        met = ndimage.map_coordinates(
+            cost.reshape(side, side), np.moveaxis(seen, -1, 0), order=1, cval=BEYOND
+        )
+        straight = met.mean(1) * np.linalg.norm(there, axis=1)
+        best = straight <= DETOUR * (left[self.middle] - left[way])
+        return there[np.flatnonzero(best)[-1] if best.any() else 0]
 
 
 def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) -> np.ndarray:

@@ -44,7 +44,7 @@ EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use
 OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
 LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
-CLONING_RATE, CLONING_EPOCHS = 1e-3, 30
+CLONING_RATE = 1e-3
 NEW_COUNT = 2e4  # observations that the scale of what a first policy did not see counts as
 
 
@@ -331,7 +331,7 @@ class Trainer:
         inputs = self.scales(seen)
         targets = torch.from_numpy(shown.astype(np.float32))
         optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
-        for _ in range(CLONING_EPOCHS):
+        for _ in range(self.settings.cloning_epochs):
             order = torch.from_numpy(self.random.permutation(len(inputs)))
             for part in order.split(self.settings.minibatch):
                 loss = (self.policy(inputs[part]) - targets[part]).square().mean()

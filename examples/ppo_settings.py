@@ -73,6 +73,7 @@ class Settings:
     # In how many rounds: after the first one the policy walks, and the baseline only says what it
     # would do there (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
+    cloning_epochs: int = 30  # of each round, over all that was shown so far
     value_first: float = 2e4  # control steps in which such a run learns only the value
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
@@ -252,7 +253,8 @@ GUIDED = {
     'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
     'evaluation_episodes': 32,
 }  # fmt: skip
-MOVING = {**GUIDED, 'map_bound': 1.0}  # m/s
+MOVING = {**GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8}  # m/s
+BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
@@ -278,7 +280,8 @@ WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 # What planning footsteps does without: the walk is there, where to go with it is learnt.
 JOURNEYS = {
     'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
-    'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6,
+    'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6, 'value_goes_on': True, 'map_bound': 0.3,
+    'learning_rate': 2e-4,
 }  # fmt: skip
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -335,8 +338,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_Forest-v0', GUIDED),
-    ('PD_Biped3D_HLC_DynamicsObstacles-v0', MOVING),
-    ('PD_Biped3D_HLC_Conveyors*', MOVING),
+    ('PD_Biped3D_HLC_DynamicsObstacles-v0', {**MOVING, 'samples': 4e5, 'evaluate_every': 4e4}),
+    ('PD_Biped3D_HLC_Conveyors*', BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
