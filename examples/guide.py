@@ -30,7 +30,6 @@ PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through someth
 DETOUR = 1.02  # a place is gone straight to if that costs no more times what the way there does
 AHEAD = 4.0  # step lengths; the same on a trail
 PACE = 1.0  # m/s; how fast the guide comes along where boxes move
-
 BEND, CLOSE = 0.35, 0.3  # rad, m; a sharper bend and what is closer are taken with small steps
 LOOKS = 33  # places on a straight line
 BEYOND = 1.5  # times the distance: what lies outside of the map is guessed to take
@@ -44,6 +43,7 @@ class Map:
         self.fine = np.stack(np.meshgrid(axis, axis, indexing='ij'), -1)  # (k, k, 2) m
         self.places = self.fine[::COARSE, ::COARSE].reshape(-1, 2)
         side = len(axis[::COARSE])
+        self.shape = side, side
         number = np.arange(side * side).reshape(side, side)
         pairs = []
         for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
@@ -82,10 +82,9 @@ class Map:
             way.append(at)
         there = np.concatenate([self.places, [goal]])[way]
         share = np.linspace(0, 1, LOOKS)
-        side = round(n**0.5)
         seen = (there[:, None] * share[:, None] + REACH) / (COARSE * FINE)
         met = ndimage.map_coordinates(
-            cost.reshape(side, side), np.moveaxis(seen, -1, 0), order=1, cval=BEYOND
+            cost.reshape(self.shape), np.moveaxis(seen, -1, 0), order=1, cval=BEYOND
         )
         straight = met.mean(1) * np.linalg.norm(there, axis=1)
         best = straight <= DETOUR * (left[self.middle] - left[way])
