@@ -8,6 +8,7 @@ Needs `pip install 'trl_suite[video]'` for the picture.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import pathlib
 import sys
@@ -287,7 +288,8 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
     for id_ in entries:
         row = catalogue.BY_ID[id_]
         if row.rules != 'gait':  # whose return says little
-            panels.setdefault((row.domain, row.character), []).append(id_)
+            planned = 'hierarchical' in row.tags  # few and long steps
+            panels.setdefault((row.domain, 'plans' if planned else row.character), []).append(id_)
     columns = 3
     count = -(-len(panels) // columns)
     figure, axes = pyplot.subplots(
@@ -295,22 +297,24 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
     )
     for axis, ((domain, name), ids) in zip(axes.flat, panels.items(), strict=False):
         axis.set_title(f'{domain}: {name}')
-        for i, id_ in enumerate(ids):
-            row, colour = catalogue.BY_ID[id_], f'C{i}' if i < 10 else 'black'
+        colours = pyplot.get_cmap('tab10' if len(ids) <= 10 else 'tab20').colors
+        for colour, id_ in zip(itertools.cycle(colours), ids, strict=False):
+            row = catalogue.BY_ID[id_]
             for run in entries[id_]['runs']:
                 ship = run['seed'] == entries[id_]['shipped']
                 axis.plot(
-                    [0, *[p['samples'] / 1e6 for p in run['curve']]],
-                    [0, *[p['fraction'] for p in run['curve']]],
+                    [p['samples'] / 1e6 for p in run['curve']],
+                    [p['fraction'] for p in run['curve']],
                     color=colour, alpha=1 if ship else 0.4, linewidth=1.2,
                     label=row.task if ship else None,
                 )  # fmt: skip
+        axis.set_xlim(left=0)
         axis.set_ylim(0, 1)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7, loc='lower right')
-        axis.set_xlabel('control steps, million')
+        axis.set_xlabel(f'{"plans" if name == "plans" else "control steps"}, million')
     for axis in axes[:, 0]:
-        axis.set_ylabel('return / 256, no noise')
+        axis.set_ylabel('return / maximum, no noise')
     for axis in axes.flat[len(panels) :]:
         axis.set_axis_off()
     figure.tight_layout()
