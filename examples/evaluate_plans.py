@@ -1,4 +1,4 @@
-"""How well footsteps are planned: the high-level tasks, by hand and by what was learnt.
+"""How well goals are reached: with footsteps planned, by hand and as learnt, and without hierarchy.
 
     python examples/evaluate_plans.py                                      # all, both policies
     python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
@@ -6,8 +6,9 @@
 Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
 `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares that do not
 fall, at all and in the first minute, speed towards the goal, goals per minute, distance along a
-trail, the share of time with the ball at its goal, and falls per kilometre. Writes into
-trained/plans.json what it has measured.
+trail, the share of time with the ball at its goal, and falls per kilometre. Rows without hierarchy
+have no scripted policy, and episodes as long as the others. Writes into trained/plans.json what it
+has measured.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ import numpy as np
 
 from trl_suite import catalogue, errors, files, policies, resources
 from trl_suite.scripted import scripted
+from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
 POLICIES = ('scripted', 'reference')
+TAGS = ('hierarchical', 'flat_control')  # of the rows with goals
+SECONDS = 200.0  # of a whole episode without hierarchy
 SEGMENT = 2.0  # m; of a trail
 MINUTE = 60.0  # s
 
@@ -44,10 +48,15 @@ def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarr
 def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int) -> dict:
     """Runs one episode in every row; returns what became of them."""
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
-    environments = VectorEnvironment(id_, episodes, 0, seeds, autoreset='disabled')
+    own = 'hierarchical' in catalogue.BY_ID[id_].tags
+    limit = -1 if own else round(SECONDS / CONTROL_TIMESTEP)
+    environments = VectorEnvironment(
+        id_, episodes, 0, seeds, step_limit=limit, autoreset='disabled'
+    )
     policy, observation = make(environments), environments.reset()
     task, limit = environments.task, environments.step_limit
     assert limit is not None
+    duration = np.full(episodes, CONTROL_TIMESTEP)  # s; of a step without hierarchy
     root = task.figure.kinematics.links[0]
 
     def places() -> np.ndarray:
@@ -62,10 +71,11 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
         step = environments.step(policy(observation))
         info, after = step.info, places()
         reward += step.reward * runs
-        seconds += info['duration'] * runs
-        towards += info['speed'] * info['duration'] * runs
+        duration = info.get('duration', duration)
+        seconds += duration * runs
+        towards += info['speed'] * duration * runs
         path += np.linalg.norm(after - before, axis=1) * runs
-        arrived += info.get('at_goal', np.zeros(episodes)) * info['duration'] * runs
+        arrived += info.get('at_goal', np.zeros(episodes)) * duration * runs
         goals[runs] = info['goals_reached'][runs]
         ended = step.terminated | step.truncated
         if (ended & runs).any():
@@ -91,7 +101,7 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('pattern', nargs='?', default='PD_Biped3D_HLC_*', help='of ids')
+    parser.add_argument('pattern', nargs='?', default='PD_Biped3D_*', help='of ids')
     parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES)
     parser.add_argument('--episodes', type=int, default=EPISODES)
     parser.add_argument('--seed', type=int, default=0)
@@ -99,7 +109,7 @@ def main() -> None:
     ids = [
         row.id
         for row in catalogue.ROWS
-        if 'hierarchical' in row.tags and fnmatch.fnmatchcase(row.id, arguments.pattern)
+        if row.tags.intersection(TAGS) and fnmatch.fnmatchcase(row.id, arguments.pattern)
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))
@@ -108,6 +118,8 @@ def main() -> None:
     for id_ in ids:
         for name in arguments.policies:
             make = scripted
+            if name == 'scripted' and 'hierarchical' not in catalogue.BY_ID[id_].tags:
+                continue
             if name == 'reference':
                 try:
                     policy = policies.reference(id_)

@@ -95,6 +95,19 @@ class PlansTest(absltest.TestCase):
         self.assertGreater(found['falls_per_km'], 50)
         self.assertEqual(found['at_goal'], 0)
 
+    def test_without_hierarchy(self):
+        """A walker that always acts at its limits falls at once; a step lasts 1/30 s."""
+        id_ = 'PD_Biped3D_Terrain_Soccer_Hard-v0'
+
+        def make(environments):
+            return lambda observation: np.ones((2, len(environments.action_map)))
+
+        found = evaluate_plans.run(id_, make, episodes=2, seed=0)
+        self.assertEqual(found['survived'], 0)
+        self.assertBetween(found['seconds'], 0.1, 5)
+        self.assertAlmostEqual(found['seconds'] * 60, round(found['seconds'] * 60), 6)
+        self.assertLess(found['reward'], found['seconds'] / evaluate_plans.SECONDS)
+
 
 class GuideTest(parameterized.TestCase):
     """Who shows policies how to plan footsteps."""
