@@ -7,6 +7,7 @@ import re
 from absl.testing import absltest, parameterized
 
 from trl_suite import catalogue, describe, suite
+from trl_suite.describe import options
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -78,6 +79,16 @@ class WordsTest(parameterized.TestCase):
         )  # fmt: skip
         own, shared = (suite.build_row(each, {}, {}) for each in (row, other))
         self.assertEqual(list(describe.sections(row, own)), list(describe.sections(row, shared)))
+
+    def test_every_option_is_explained(self):
+        known = {name for row in catalogue.ROWS for name in suite.task_options(row)}
+        known |= set(suite.task_options(suite.combine('dog', task='walk')))
+        self.assertEqual(known - {'interface'}, set(options.MEANINGS))
+        row = suite.find('PD_Biped3D_HLC_Forest-v0')
+        table = options.options(row, suite.task_options(row)).parts[0]
+        meanings = {name: (default, meaning) for name, default, meaning in table.cells}
+        self.assertIn('frame', meanings['interface'][1])
+        self.assertEqual(meanings['step_limit'][0], 400)
 
     def test_markdown(self):
         table = describe.Table(('a', 'b'), [('x|y', 0.5), ('2 * <3>', 12)])

@@ -369,13 +369,9 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
       ValueError: an unknown option; the message has the closest matches. Or a terrain with other
         dimensions than the character.
     """
-    make_task, takes = (_of_the_user, row.rules) if callable(row.rules) else _RULES[row.rules]
+    make_task = _of_the_user if callable(row.rules) else _RULES[row.rules][0]
     merged = {**row.options, **(options or {})}
-    known = [
-        name
-        for name, parameter in inspect.signature(takes).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
-    ]
+    known = task_options(row)
     parts = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     for name in merged:
         if name not in known:
@@ -383,6 +379,16 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
             raise ValueError(errors.unknown(f'option of {row.id}', name, choices))
     _check_dimensions(row)
     return composed.compose(make_task(row, merged), parts)
+
+
+def task_options(row: Row) -> dict[str, Any]:
+    """Returns the options of a row's task, besides those of every task, with their defaults."""
+    takes: Any = row.rules if callable(row.rules) else _RULES[row.rules][1]
+    return {
+        name: row.options.get(name, parameter.default)
+        for name, parameter in inspect.signature(takes).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
+    }
 
 
 def build_row(

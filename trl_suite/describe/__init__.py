@@ -48,7 +48,8 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
       environment: built from it, or from a row that differs by its terrain only.
     """
     # They import the engine, which the tables of the command line do without.
-    from trl_suite.describe import common, gait, high_level, planar, spatial
+    from trl_suite import suite
+    from trl_suite.describe import common, gait, high_level, options, planar, spatial
     from trl_suite.tasks.gait import GaitTask
     from trl_suite.tasks.high_level import HighLevel
     from trl_suite.tasks.imitation import Imitation
@@ -63,6 +64,7 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
         yield common.observation(environment, planar.blocks(task))
         yield common.action(environment)
         yield common.time(row, task)
+        yield options.options(row, suite.task_options(row))
         return
     yield from common.character(environment)
     yield from family.before(task)
@@ -72,3 +74,4 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
     yield common.ground(row)
     yield from family.rules(task)
     yield family.time(row, task)
+    yield options.options(row, suite.task_options(row))
