@@ -15,12 +15,13 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument('file', nargs='?', type=pathlib.Path)
 parser.add_argument('--feet', nargs='+', default=FEET)
 parser.add_argument('--fall', nargs='+', default=['trunk'])
-parser.add_argument('--terrain', default='checkers3d')
+parser.add_argument('--terrain', help='level ground by default')
+parser.add_argument('--spatial', action=argparse.BooleanOptionalAction)  # else as the root moves
 parser.add_argument('--seed', type=int, default=1)
 parser.add_argument('--output', type=pathlib.Path, default='own_character.png')
 args = parser.parse_args()
 if args.file is None:
-    args.file = args.output.with_name('table.urdf')
+    args.spatial, args.file = True, args.output.with_name('table.urdf')
     parts = [LINK.format('trunk', z=0, m=8, i=0.2, size='.6 .25 .12')]
     for k, (foot, leg) in enumerate((foot, foot[:-5]) for foot in FEET):
         parts += [LINK.format(x, z=-0.12, m=0.5, i=0.003, size='.05 .05 .22') for x in (leg, foot)]
@@ -28,11 +29,11 @@ if args.file is None:
         parts.append(JOINT.format(f'{leg}_hip', 'trunk', leg, place, -1.2))
         parts.append(JOINT.format(f'{leg}_knee', leg, foot, '0 0 -.25', -2))
     args.file.write_text(f'<robot name="table">{"".join(parts)}</robot>')
-row = characters.from_file(args.file, end_effectors=args.feet, fall_links=args.fall, spatial=True)
+links = {'end_effectors': args.feet, 'fall_links': args.fall}
+row = characters.from_file(args.file, **links, spatial=args.spatial)
 print(*row.notes, sep='\n')  # what was assumed
 env = suite.build(row, terrain=args.terrain, task='walk', task_kwargs={'random': args.seed})
 i = np.arange(len(env.action_map))
 bend, trot = 0.2 - 0.6 * (i % 2), np.pi * ((i // 2 + i // 4) % 2 - i % 2 / 2)
 policy = lambda _: bend + 0.3 * np.sin(15 * env.physics.time() + trot)  # noqa: E731
-frames = rendering.frames(env, policy, steps=40, height=240, width=320)
-rendering.film_strip(frames, args.output, columns=4)
+rendering.film_strip(rendering.frames(env, policy, steps=40), args.output, columns=4)

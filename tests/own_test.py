@@ -233,6 +233,23 @@ class CharacterTest(Folder):
             self.planar(**options)
 
     @parameterized.named_parameters(
+        ('radians', 'range="-60 60"', 'range="-1 1"', 'hardly move, rad: right_hip .-0.017, 0.017.'),
+        ('degrees', 'range="-60 60"', 'range="-3600 3600"', 'full circle, rad: right_hip'),
+        ('millimetres', '.2" type="box" pos="0 0 .2"', '200" type="box" pos="0 0 .2"', 'reaches .* are lengths in m'),
+        ('tons', '.2" type="box"', '.2" mass="8000" type="box"', 'weighs 80[0-9][0-9] kg'),
+    )  # fmt: skip
+    def test_doubtful_units_are_noted(self, before, after, message):
+        self.assertIn(before, MJCF)
+        self.assertNotRegex('; '.join(self.planar().notes), message)
+        self.assertRegex('; '.join(self.planar(MJCF.replace(before, after)).notes), message)
+
+    def test_a_root_that_says_otherwise_is_noted(self):
+        row = self.planar(spatial=True)
+        self.assertTrue(row.spatial)
+        self.assertRegex(row.notes[0], 'spatial=True was given, .* two slides and a hinge')
+        self.assertEqual(self.planar(spatial=False).notes, self.planar().notes)
+
+    @parameterized.named_parameters(
         ('twice', 'name="left_knee"', 'name="left_hip"', "repeated name 'left_hip' in joint"),
         ('no_geoms', '<geom ', '<geom contype="0" conaffinity="0" ', 'no geom of the character can'),
         ('no_root_joints', 'name="x" type="slide"', 'name="x"', 'has hinge, hinge, slide; expected'),

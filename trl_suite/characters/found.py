@@ -21,6 +21,11 @@ GRAVITY = 9.8  # m/s^2, of the arenas
 SLIDE_WEIGHTS = 2.0  # force limit of a slide, in weights of the character
 KD_SHARE = 0.1  # s; kd per kp
 ARMATURE_SHARE = 0.01 / 300  # s^2; armature per kp
+# What a figure in the wrong unit goes beyond.
+LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
+MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
+SIZES = (0.05, 10.0)  # m, from the root to the farthest end
+MASSES = (0.1, 2000.0)  # kg
 LATERAL = 1e-3  # how far an axis of a planar character may be from its plane or normal, rad
 
 _FREE, _BALL, _SLIDE, _HINGE = (
@@ -141,6 +146,7 @@ class Found:
         self.weight = float(model.body_mass[self.ids].sum()) * GRAVITY
         if not self.weight > 0:
             raise problem(file, f'the mass of {self.bodies[0]!r} and all that hangs on it is 0')
+        self._doubt()
 
     def _root(self, root: str | None) -> int:
         model = self.model
@@ -168,11 +174,17 @@ class Found:
         raise problem(self.file, errors.unknown('root', root, names))
 
     def _dimensions(self, root_joints: np.ndarray, spatial: bool | None) -> bool:
-        if spatial is not None:
-            return spatial
         kinds = sorted(KINDS[int(kind)] for kind in self.model.jnt_type[root_joints])
-        if kinds in (['free'], ['hinge', 'slide', 'slide']):
-            return kinds == ['free']
+        says = {('free',): True, ('hinge', 'slide', 'slide'): False}.get(tuple(kinds))
+        if spatial is not None:
+            if says is not None and says is not spatial:
+                self.notes.append(
+                    f'spatial={spatial} was given, and counts: the root of the file '
+                    f'{"has a free joint" if says else "moves in a plane, by two slides and a hinge"}'
+                )
+            return spatial
+        if says is not None:
+            return says
         raise problem(
             self.file, f'the root {self.bodies[0]!r} has {", ".join(kinds) or "no joints"}; expected '
             'a free joint, or two slides and a hinge, or that you say spatial=True or spatial=False',
@@ -196,6 +208,24 @@ class Found:
                     self.file, f'{KINDS[kind]} {name!r} (axis {axis.round(3).tolist()}) leaves the '
                     'x-z plane; expected hinges about y and slides in the plane, or spatial=True',
                 )  # fmt: skip
+
+    def _doubt(self) -> None:
+        """Notes what looks as if it were in another unit."""
+        model = self.model
+        hinges = [i for i in self.joints if model.jnt_type[i] == _HINGE and model.jnt_limited[i]]
+        found = {model.joint(i).name: model.jnt_range[i] for i in hinges}
+        for what, names in (
+            ('hardly move', [name for name, r in found.items() if np.ptp(r) < LEAST_SWING]),
+            ('turn full circle', [n for n, r in found.items() if np.abs(r).max() > MOST_SWING]),
+        ):
+            if names:
+                each = ', '.join(f'{name} {found[name].round(3).tolist()}' for name in names)
+                self.notes.append(f'joints that {what}, rad: {each}; is the unit of angles right?')
+        reach = self.reach(self.data.xpos[self.root], self.root)
+        if not SIZES[0] <= reach <= SIZES[1]:
+            self.notes.append(f'it reaches {reach:.3g} m from its root; are lengths in m?')
+        if not MASSES[0] <= self.weight / GRAVITY <= MASSES[1]:
+            self.notes.append(f'it weighs {self.weight / GRAVITY:.0f} kg; are masses in kg?')
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
         if isinstance(names, str) or not names:
