@@ -35,6 +35,13 @@ WITHOUT = {  # a shipped policy
     'clip': 'the clip itself, whose poses are the targets, without feedback (`--policy clip`)',
     'zero': 'action 0 throughout, of gaits the default one (`--policy zero`)',
 }
+_LANDING = ('footsteps', 'footsteps2d', 'hike', 'soccer')
+DRAWN = {  # beside the physics, and by which rules
+    ' Orange and blue: where the foot that swings and the other one are to land.': _LANDING,
+    ' Beads: the way of the centre of mass; red: the goal.': (
+        'hike', 'soccer', 'journey', 'ball_journey',
+    ),
+}  # fmt: skip
 README, SPEED = '../README.md', ('<!-- speed, written by docs/generate.py -->', '<!-- /speed -->')
 MACHINE = (  # of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
@@ -167,13 +174,14 @@ def environment_page(row: catalogue.Row, environment: Any) -> str:
 
 
 def strip(row: catalogue.Row, environment: Any) -> str:
-    seconds = gallery.LONGER if 'hierarchical' in row.tags else gallery.SECONDS
+    _, begin, end, _ = gallery.scene(row.id)
+    drawn = ''.join(text for text, rules in DRAWN.items() if row.rules in rules)
     name, _ = acting.best(environment, row.id)
     who = WITHOUT.get(name)
     said = f'No policy is shipped for it yet; this is {who}' if who else 'The shipped policy'
     return (
         f'{picture("Film strip", gallery.strip_path(row.id))}\n\n'
-        f'*{said}: the first {seconds:g} s of an episode, or until it ends.*'
+        f'*{said}: {begin:g} to {end:g} s of an episode, or until it ends.{drawn}*'
     )
 
 

@@ -96,6 +96,11 @@ class ListTest(CommandTest):
         self.assertEqual(lines[-1], f'{count} environments')
         self.assertLen(lines, count + 2 if count else 1)
 
+    def test_those_with_a_policy(self):
+        lines = self.output('list', '--trained', '--domain', 'plaid').splitlines()
+        shipped = {id_ for id_ in policies.available() if suite.find(id_).domain == 'plaid'}
+        self.assertEqual({line.split()[0] for line in lines[1:-1]}, shipped)
+
     def test_one_is_singular(self):
         out = self.output('list', '--domain', 'plaid', '--terrain', 'flat', '--character', 'dog',
                           '--tag', 'blind')  # fmt: skip
@@ -396,7 +401,7 @@ class RolloutTest(CommandTest):
         self.assertRegex(
             out,
             rf'\n{steps} steps in {episodes} episodes: return {t["rewards"].sum():.2f}, '
-            rf'{t["rewards"].sum() / steps:.3f} per step; -?[\d.]+ m\n$',
+            rf'{t["rewards"].sum() / steps:.3f} per step; -?[\d.]+ m\n.*npz\n$',
         )
         starts = np.flatnonzero(t['step_types'] == 0)
         lengths = np.diff([*starts, len(t['rewards'])]) - 1

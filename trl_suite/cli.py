@@ -91,6 +91,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command = add('list', 'list the environments of the catalogue')
     for name in FILTERS:
         command.add_argument(f'--{name}', help=f'only those of one {name}')
+    command.add_argument('--trained', action='store_true', help='only those with a shipped policy')
 
     command = add('info', 'tell everything about one environment')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")

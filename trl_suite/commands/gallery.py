@@ -47,7 +47,14 @@ LARGEST = 40_000  # bytes of a picture
 QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, until it is small enough
 COLOURS = 64  # of a palette
 SEED = 1  # of every environment
-SECONDS, LONGER = 4.0, 12.0  # that a film strip covers, or until its episode ends; of plans
+SECONDS, LONGER = 4.0, 12.0  # that a film strip covers; of plans
+# Episodes and times that show what an environment is about, where its first seconds do not: seed,
+# begin and end in s, camera.
+SCENES = {
+    'PD_Biped3D_HLC_Soccer-v0': (8, 6.0, 16.0, 'back'),
+    'PD_Biped3D_HLC_Conveyors-v0': (2, 21.5, 31.5, 'back'),
+    'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 9.0, 18.0, 'back'),
+}
 COLUMNS = 6  # pictures of a film strip
 STRIP_SIZE = (180, 240)  # height and width of each, pixels
 CHARACTER_SIZE = (360, 480)
@@ -61,13 +68,13 @@ FAMILIES = {
     'imitation': ('PD_Raptor2D_LLC_Imitate_Flat-v0', 2.0),
     'plaid': ('PD_Biped2D_Gaps_Terrain-v0', 2.0),
     'terrainrl': ('FSM_Dog2D_Terrain_Gaps-v0', 1.6),
-    'deeploco': ('PD_Biped3D_HLC_Soccer-v0', 9.6),
+    'deeploco': ('PD_Biped3D_HLC_Soccer-v0', 12.0),
 }
 SUITE = (
     (('PD_Biped2D_Walls_Terrain-v0', 3.0), ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 0.7),
      ('FSM_Raptor2D_Terrain_Cliffs-v0', 2.0)),
     (('FSM_Goat2D_Terrain_Variable_Steps-v0', 1.0), ('PD_Biped3D_HLC_Forest-v0', 5.0),
-     ('PD_Biped3D_HLC_Soccer-v0', 9.6)),
+     ('PD_Biped3D_HLC_Soccer-v0', 12.0)),
 )  # fmt: skip
 SUITE_SIZE, SUITE_LARGEST = (240, 320), 120_000  # pixels of each picture; bytes
 
@@ -208,14 +215,27 @@ def terrain_length(terrain: terrains.Terrain) -> float:
     return CLOSE_LENGTH if terrain.type in CLOSE else TERRAIN_LENGTH[terrain.spatial]
 
 
-def film_strip(id: str) -> np.ndarray:
-    """Draws the first seconds of an episode under the best policy there is: see `acting.best`.
+def scene(id: str) -> tuple[int, float, float, str]:
+    """Returns what a film strip shows: seed, begin and end (s), camera.
 
     Plans are seen from behind, with what is ahead, unless obstacles would stand in between.
     """
+    row = suite.find(id)
+    if row.id in SCENES:
+        return SCENES[row.id]
+    if 'hierarchical' not in row.tags:
+        return SEED, 0.0, SECONDS, 'side'
+    hidden = 'obstacles' in terrains.load(row.terrain).type
+    return SEED, 0.0, LONGER, 'above' if hidden else 'back'
+
+
+def film_strip(id: str) -> np.ndarray:
+    """Draws what `scene` says, or until the episode ends, under the best policy: `acting.best`."""
     moments: list[int] = []
     _run(id, lambda environment: moments.append(0))  # how many there are until the episode ends
-    images = _draw(id, set(rendering.spread(len(moments), COLUMNS)), STRIP_SIZE)
+    first = min(round(scene(id)[1] / FRAME), len(moments) - 1)
+    spread = rendering.spread(len(moments) - first, COLUMNS)
+    images = _draw(id, {first + number for number in spread}, STRIP_SIZE)
     return rendering.film_strip(images, columns=COLUMNS)
 
 
@@ -240,10 +260,7 @@ def together() -> np.ndarray:
 
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
     """Draws chosen moments of an episode, FRAME apart."""
-    row = suite.find(id)
-    planned = 'hierarchical' in row.tags
-    hidden = 'obstacles' in terrains.load(row.terrain).type
-    camera = ('above' if hidden else 'back') if planned else 'side'
+    camera = scene(id)[-1]
     images: list[np.ndarray] = []
     number = itertools.count()
 
@@ -256,10 +273,10 @@ def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
 
 
 def _run(id: str, look: Callable[[Environment], None]) -> None:
-    """Runs the first seconds of an episode, and has `look` called at every moment."""
-    environment = suite.make(id, {'random': SEED})
+    """Runs an episode to the end of the scene, and has `look` called at every moment."""
+    seed, _, seconds, _ = scene(id)
+    environment = suite.make(id, {'random': seed})
     _, policy = acting.best(environment, id)
-    seconds = LONGER if 'hierarchical' in suite.find(id).tags else SECONDS
     count = 0
 
     def seen() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from trl_suite import catalogue, describe, errors
+from trl_suite import catalogue, describe, errors, policies
 
 FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
 
@@ -20,6 +20,9 @@ def run(arguments: argparse.Namespace) -> None:
         if value not in known:
             raise ValueError(errors.unknown(name, value, known))
         chosen = [row for row in chosen if value in _values(row, name)]
+    if arguments.trained:
+        shipped = policies.available()
+        chosen = [row for row in chosen if row.id in shipped]
     if chosen:
         cells = [(row.id, f'{row.domain}/{row.task}', row.description) for row in chosen]
         print(describe.table(('id', 'domain/task', 'description'), cells, indent=''))

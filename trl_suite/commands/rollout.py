@@ -23,7 +23,7 @@ _ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Runs a policy, writes what was asked for, and prints a line per episode."""
+    """Runs a policy, writes what was asked for, and prints a line per episode and per file."""
     for path, suffixes in (
         (arguments.video, rendering.VIDEO_SUFFIXES),
         (arguments.strip, rendering.IMAGE_SUFFIXES),
@@ -67,6 +67,9 @@ def run(arguments: argparse.Namespace) -> None:
                 part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
             )
     print(record.summary())
+    for path in (arguments.video, arguments.strip, arguments.trajectory):
+        if path is not None:
+            print(path)
 
 
 def _run(

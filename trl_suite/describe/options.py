@@ -14,21 +14,21 @@ MEANINGS = {
     'controller': 'footstep controller: an id whose policy is shipped, a policy file, or a function',
     'footstep_scale': 'times the squared miss of a landing place in the reward: more teaches accuracy',
     'goal': 'whether plans head for a goal on the terrain',
-    'goal_distance': 'm, the least and the most, at which goals are drawn; None: where the terrain has them',
-    'goal_reached': 'm; nearer, a goal is reached; None: 1 m; soccer and without hierarchy 0.5 m',
+    'goal_distance': 'm, the least and the most, at which goals are drawn; by default where the terrain has them',
+    'goal_reached': 'm; nearer, a goal is reached; by default 1 m, in soccer and without hierarchy 0.5 m',
     'grace': 's after a push or a sharp turn in which no foot misses its place',
-    'half_range': 'rad per unit action; None: 1.5 in the plane; in space 1 about the clip, else 1.5',
+    'half_range': 'rad per unit action; by default 1.5, about a clip in space 1',
     'heading_scale': 'times the squared error of the heading in the reward',
     'mirrored': 'observe and act as if the right foot always stood first',
-    'miss': 'm; a foot that lands farther from its place ends the episode; None: it does not',
+    'miss': 'm; a foot that lands farther from its place ends the episode; by default it does not',
     'muscle_set': "'plain', or the motion that the muscles were optimised for",
-    'plans': 'how footstep plans are drawn: a mapping, see trl_suite.tasks.plans; None: as told above',
-    'pushes': 'forces on the torso: a mapping, see trl_suite.tasks.plans; None: there are none',
+    'plans': 'how footstep plans are drawn: a mapping, see trl_suite.tasks.plans; by default as told above',
+    'pushes': 'forces on the torso: a mapping, see trl_suite.tasks.plans; by default there are none',
     'reward': "'goal', or 'original': what the original computes",
     'sight': "maps that are observed, of 'height' and 'velocity'",
     'spawn': "where planar ground begins: as 'intended', or 'upstream', as the original builds it",
     'start_noise': 'rad; standard deviation of joint angles at the start',
-    'start_phase': 'phase of the clip at the start, in [0, 1), or pairs to draw it between; None: any',
+    'start_phase': 'phase of the clip at the start, in [0, 1), or pairs to draw it between; by default any',
     'start_phases': 'phases of the clock, one of which an episode starts with',
     'step_length': 'm; of the steps that action 0 means',
     'substeps': 'physics steps per step of the joint controller',
@@ -39,9 +39,9 @@ MEANINGS = {
     'terrain_view': 'observe the ground ahead, in space around',
 }
 _EVERYWHERE = (
-    ('rewards, observations, failures', None, 'functions of your own, see docs/make_your_own.md'),
-    ('random', None, 'seed; None: another one every time'),
-    ('time_limit', 'inf', 's of simulated time after which an episode is cut'),
+    ('rewards, observations, failures', '-', 'functions of your own, see docs/make_your_own.md'),
+    ('random', '-', 'seed; by default another one every time'),
+    ('time_limit', '-', 's of simulated time after which an episode is cut'),
 )
 _INTERFACES = {
     'gait': "'parameters': an action sets a gait cycle; 'base_action': prefers a gait, every 1/30 s",
@@ -70,4 +70,4 @@ def options(row: catalogue.Row, known: Mapping[str, Any]) -> Section:
 
 
 def _shown(value: Any) -> str:
-    return repr(dict(value) if isinstance(value, Mapping) else value)
+    return '-' if value is None else repr(dict(value) if isinstance(value, Mapping) else value)
