@@ -158,7 +158,12 @@ def plot(figures, path):
                 found[f'{n} rows, {threads} threads']['control steps per second'] / reference
                 for n in rows
             ]
-            axes.plot(rows, rates, 'o-' if threads == 1 else 's--', label=f'{id_}, {threads}')
+            axes.plot(
+                rows,
+                rates,
+                'o-' if threads == 1 else 's--',
+                label=f'{id_}, {threads} thread{"s" * (threads > 1)}',
+            )
     axes.set(xscale='log', xlabel='rows', ylabel='rate / raw mj_step on one thread')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)

@@ -657,7 +657,9 @@ def command_line(
 def main() -> None:
     id_, seed, changes, folder, threads = command_line(__doc__.splitlines()[0], 'control steps')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        print(f'{point["samples"]:9} {point["fraction"]:.3f} of the maximum, {point["full"]:.0%}')
+        print(
+            f'{point["samples"]:9} {point["fraction"]:.3f} of the maximum, {point["full"]:.0%} complete'
+        )
     print(folder / 'policy.npz')
 
 

@@ -434,6 +434,7 @@ class TerrainTest(Folder):
     @parameterized.named_parameters(
         ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name of its own'),
         ('taken', lambda _: terrain.from_function(np.abs, 'var2d_gaps'), 'exists; pass replace'),
+        ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'of shape .3,. with float64 of shape ..;'),
         ('arguments', lambda _: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
         ('shape', lambda _: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
         ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; those at \[1\]'),
@@ -477,6 +478,8 @@ class TerrainTest(Folder):
                 terrain.from_function(lambda x, factor=factor: factor * x, 'wedge')
 
     def test_heights_that_are_not_finite(self):
+        with self.assertRaisesRegex(TypeError, "function 'f' failed where .* np.sin"):
+            terrain.from_function(lambda x: math.sin(x), 'f')
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
         with self.assertRaisesRegex(
             ValueError, "terrain 'hole' returned nan at x = 3.* m; expected"

@@ -3,19 +3,24 @@
 import difflib
 from collections.abc import Iterable
 
+LIKE, ALIKE = 0.6, 0.4  # shares of two names that must agree, see `difflib`
+FEW = 20  # names that may all be listed where none is like the one given
 MANY = 40  # names; of more only some are listed
 
 
 def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
     """Returns a message for an unknown name, with its closest matches among `choices`."""
     known = sorted(choices)
-    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.4)
+    cutoff = LIKE if len(known) <= FEW else ALIKE  # few can all be told instead
+    near = difflib.get_close_matches(str(name), known, n=3, cutoff=cutoff)
     if not near:
         lowered = {choice.lower(): choice for choice in known}
         near = [
             lowered[match]
-            for match in difflib.get_close_matches(str(name).lower(), lowered, n=3, cutoff=0.4)
+            for match in difflib.get_close_matches(str(name).lower(), lowered, n=3, cutoff=cutoff)
         ]
+    if not near and str(name):
+        near = [choice for choice in known if choice.startswith(str(name))][:3]
     hint = f'did you mean {" or ".join(map(repr, near))}?' if near else f'known: {_listed(known)}'
     return f'unknown {kind} {name!r}; {hint}'
 

@@ -85,7 +85,7 @@ class CharacterRow:
     root_weight: float = 1.0
     path: str | None = None
     spatial: bool = False
-    xml: str | None = None
+    xml: str | None = dataclasses.field(default=None, repr=False)
     assets: Mapping[str, bytes] = dataclasses.field(default_factory=dict, repr=False)
     bodies: tuple[str, ...] | None = None
     solids: tuple[str, ...] | None = None

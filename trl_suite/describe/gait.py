@@ -123,7 +123,7 @@ def rules(task: Any) -> Iterator[Section]:
     links = ', '.join(row.fall_links)
     ends = [
         f'{"one of " if len(row.fall_links) > 1 else ""}{links} touches the ground in '
-        f'{looks_until_fall(gait)} looks in a row, or often enough',
+        f'{looks_until_fall(gait)} looks in a row, or so often that {running_share(gait)}',
         f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
         f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
         'the physics diverges',
@@ -133,6 +133,14 @@ def rules(task: Any) -> Iterator[Section]:
     yield section(
         f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',
         '\n'.join(f'- {end}' for end in ends),
+    )
+
+
+def running_share(rule: Any) -> str:
+    """Returns when links have been seen on the ground too often, from a module with the rule."""
+    return (
+        f'd > {rule.FALLEN:g}: with every look d becomes {rule.FADING:g} d, and 1/{1 / rule.SHARE:.0f} '
+        'more if one touches'
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from trl_suite import catalogue
 from trl_suite.describe import spatial
 from trl_suite.describe.common import Meanings, floats
-from trl_suite.describe.gait import looks_until_fall
+from trl_suite.describe.gait import looks_until_fall, running_share
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.describe.spatial import after, before
 from trl_suite.environment import Environment
@@ -86,7 +86,8 @@ def rules(task: Any) -> Iterator[Section]:
     yield section(
         f'Termination (discount 0), looked at every {every:g} s',
         f'one of {", ".join(task.character.row.fall_links)} touches the ground in '
-        f'{looks_until_fall(high_level)} looks in a row, or often enough; or the physics diverges',
+        f'{looks_until_fall(high_level)} looks in a row, or so often that {running_share(high_level)}; '
+        'or the physics diverges',
     )
 
 

@@ -69,8 +69,9 @@ def from_function(
       replace: whether an existing type of that name may be replaced.
 
     Raises:
-      ValueError: no name, a name that is taken, or a function of none or more than two arguments.
-      TypeError: it is no function.
+      ValueError: no name, a name that is taken, a function of none or more than two arguments, or
+        one that does not answer an array with an array of its shape.
+      TypeError: it is no function, or none of arrays.
     """
     if not callable(function):
         raise TypeError(f'a function of x, or of x and y, is needed, not {function!r}')
@@ -86,6 +87,7 @@ def from_function(
     again &= not _place(function)[1].endswith('<lambda>')
     if name in taken and known is not function and not again and not replace:
         raise ValueError(f'terrain type {name!r} exists; pass replace=True to replace it')
+    _check_answer(name, function, arguments)
     _functions[arguments, name] = function
     _register(name, function, arguments)
     recipe = functools.partial(from_function, start_span=start_span, replace=True), (function, name)
@@ -110,6 +112,23 @@ def _arguments(function: HeightFunction) -> int:
             f'{getattr(function, "__name__", function)!r} takes {count} arguments'
         )
     return count
+
+
+def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
+    """Asks for a few heights: what is wrong with a function is better said before an episode."""
+    shape = (2, 3)[-arguments:]
+    try:
+        found = np.asarray(function(*[np.zeros(shape)] * arguments))
+    except TypeError as error:
+        raise TypeError(
+            f'the height function {name!r} failed where it was given an array: {error}; numpy has '
+            'functions of arrays, as np.sin instead of math.sin'
+        ) from error
+    if found.shape != shape or found.dtype.kind not in 'fiu':
+        raise ValueError(
+            f'the height function {name!r} answers an array of shape {shape} with {found.dtype} of '
+            f'shape {found.shape}; expected numbers of the same shape'
+        )
 
 
 def _register(name: str, function: HeightFunction, arguments: int) -> None:
