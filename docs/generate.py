@@ -131,6 +131,7 @@ def home() -> str:
                 ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
                 ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
                 ('[What has been learnt](results.md)', 'the shipped policies, measured'),
+                ('[Beside the papers](findings.md)', 'what they found, and what was found here'),
                 ('[Differences from the original](differences.md)', 'and why'),
                 ('[Speed](speed.md)', 'against raw MuJoCo and other libraries'),
                 ('[The physics rate](../benchmarks/physics_rate.md)', 'how fine time must be'),

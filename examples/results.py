@@ -194,12 +194,14 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
         '# What has been learnt',
-        f'Made by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
+        f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is made '
+        f'by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
         'run of `examples/ppo.py`, or of `examples/search_gaits.py` where a gait acts, with the '
-        'settings in its JSON file; `examples/train_all.py` repeats them. Each environment ships with the policy of its best seed: '
-        '`suite.reference_policy(id)`.',
+        'settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
+        'shipped: `suite.reference_policy(id)`. What the papers found: [beside the papers](findings.md).',
         f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
-        'neither training nor the choice of the policy had seen. Return is a fraction of its '
+        'neither training nor the choice of the policy had seen, so that numbers here are not those of '
+        'the curves. Return is a fraction of its '
         'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
         'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
         'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
@@ -208,7 +210,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '(../examples/guide.py), whose samples are counted. '
         f'Machine: {machines}; one thread per '
         'run, with up to five others and other work beside it, so that minutes say little.',
-        '## Every environment',
+        '## Every environment with a policy',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
              'begins with'),
@@ -219,6 +221,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             ),
         ),
         '![Learning curves](learning_curves.png)',
+        'Learning curves, evaluated without noise; faint: other seeds.',
         '## Actuation models',
         'Mean over seeds; the milestones are the samples after which the noiseless policy first '
         'reached 0.5, 0.8 and 0.9 of the maximum, over the seeds that did (evaluated every 0.1 M).',
@@ -277,9 +280,6 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                 rows,
             ),
         ]  # fmt: skip
-    findings = DOCS / 'findings.md'
-    if findings.exists():  # written by hand
-        parts.append(findings.read_text().strip())
     return '\n\n'.join(parts) + '\n'
 
 
@@ -316,7 +316,7 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
         axis.set_xlim(left=0)
         axis.set_ylim(0, 1)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc='lower right')
+        axis.legend(fontsize=7, loc='best')
         axis.set_xlabel(f'{"plans" if name == "plans" else "control steps"}, million')
     for axis in axes[:, 0]:
         axis.set_ylabel('return / maximum, no noise')
