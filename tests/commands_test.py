@@ -142,7 +142,7 @@ class GalleryTest(CommandTest):
 
     def test_pictures(self):
         out = self.output('gallery', '--only', 'Hopper2D_Terrain_Walls-', '--output', 'g')
-        self.assertEqual(out, '1 pictures written to g, 0 failed\n')
+        self.assertEqual(out, '1 picture written to g, 0 failed\n')
         for only in ('characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}', 'families/plaid'):
             self.output('gallery', '--only', only, '--output', 'g')
         files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
@@ -170,7 +170,7 @@ class GalleryTest(CommandTest):
         only = ('gallery', '--only', f'curves/{GAPS}', '--output', 'g')
         for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
             with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
-                self.assertStartsWith(self.output(*only), f'{count} pictures')
+                self.assertStartsWith(self.output(*only), f'{count} picture')
         for suffix in ('.png', '.jpg'):
             path = self.folder / f'a{suffix}'
             gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
@@ -186,7 +186,7 @@ class GalleryTest(CommandTest):
         ]
         with mock.patch.object(gallery, 'items', lambda: iter(items)):
             status, out, err = run('gallery', '--output', 'g')
-        self.assertEqual((status, out), (1, '1 pictures written to g, 1 failed\n'))
+        self.assertEqual((status, out), (1, '1 picture written to g, 1 failed\n'))
         self.assertEqual(err, 'a.png: no such thing\n')
         self.assertEqual([path.name for path in pathlib.Path('g').iterdir()], ['b.png'])
         self.assert_refused("no picture matches 'cat'", 'gallery', '--only', 'cat')

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import tqdm
 
 from trl_suite.catalogue import Row
 from trl_suite.policies import Policy
@@ -22,6 +23,7 @@ from trl_suite.vector import VectorEnvironment
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 CHUNK = 256  # episodes that run side by side
+PROGRESS_DELAY = 2.0  # s before a progress bar appears
 _NORMAL_95 = 1.96  # standard errors on either side of a mean
 
 
@@ -34,6 +36,7 @@ def evaluate(
     task_kwargs: Mapping[str, Any] | None = None,
     *,
     factory: bool = False,
+    progress: bool = False,
 ) -> dict[str, Any]:
     """Runs whole episodes of an environment, and tells how each went and how they went on average.
 
@@ -51,6 +54,7 @@ def evaluate(
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
       factory: `policy` is not a policy but makes one: `VectorEnvironment` -> policy. So can a
         policy see more than observations; the values of `BASELINES` are such.
+      progress: show a bar of the steps of the longest episodes, where stderr is a terminal.
 
     Returns:
       What JSON can hold. Settings: 'id', 'episodes', 'seed' (None for a sequence),
@@ -75,6 +79,7 @@ def evaluate(
     else:
         seeds = np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
     chunks = []
+    silent = None if progress else True
     for start in range(0, len(seeds), CHUNK):
         chunk = seeds[start : start + CHUNK]
         environments = VectorEnvironment(
@@ -87,7 +92,11 @@ def evaluate(
                 raise ValueError(f'{row.id} has no step limit, so its episodes may never end')
             if isinstance(policy, Policy):
                 policy.check(environments)
-            chunks.append(_run(environments, policy(environments) if factory else policy))
+            with tqdm.tqdm(
+                total=step_limit, delay=PROGRESS_DELAY, disable=silent, unit='step'
+            ) as bar:
+                act = policy(environments) if factory else policy
+                chunks.append(_run(environments, act, bar))
         finally:
             environments.close()
     assert step_limit is not None
@@ -114,7 +123,7 @@ def evaluate(
     }
 
 
-def _run(environments: VectorEnvironment, policy: BatchPolicy) -> dict[str, np.ndarray]:
+def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict[str, np.ndarray]:
     """Runs one episode in every row."""
     n = environments.num_envs
     returns, lengths, distances = np.zeros(n), np.zeros(n, int), np.zeros(n)
@@ -123,6 +132,7 @@ def _run(environments: VectorEnvironment, policy: BatchPolicy) -> dict[str, np.n
     observation = environments.reset()
     while runs.any():
         observation, reward, terminated, truncated, info = environments.step(policy(observation))
+        bar.update()
         returns[runs] += reward[runs]
         lengths[runs] += 1
         ended = terminated | truncated

@@ -213,7 +213,7 @@ def no_gl(error: Exception) -> str:
     return (
         f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
         'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
-        'disable (no pictures)'
+        'disable (no pictures). `trl-suite doctor` tells which can draw here'
     )
 
 

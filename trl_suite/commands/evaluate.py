@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> None:
     baseline = evaluation.BASELINES.get(arguments.policy)
     result = evaluation.evaluate(
         row, baseline or acting.trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
-        arguments.threads, factory=baseline is not None,
+        arguments.threads, factory=baseline is not None, progress=True,
     )  # fmt: skip
     if arguments.json is not None:
         files.write_json({**result, 'policy': arguments.policy}, arguments.json)

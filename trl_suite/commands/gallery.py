@@ -375,5 +375,6 @@ def run(arguments: argparse.Namespace) -> int:
     written, failed = make(arguments.output, arguments.only, arguments.again)
     for path, error in failed.items():
         print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
-    print(f'{len(written)} pictures written to {arguments.output}, {len(failed)} failed')
+    noun = 'picture' if len(written) == 1 else 'pictures'
+    print(f'{len(written)} {noun} written to {arguments.output}, {len(failed)} failed')
     return int(bool(failed))

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from trl_suite.environment import Environment
 
 SHOWN_EPISODES = 8  # episodes that are printed one by one
-PROGRESS_DELAY = 2.0  # s before a progress bar appears
 _ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
 
 
@@ -77,6 +76,8 @@ def _run(
 ) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
     """Yields steps done, every time step, and the action taken from it: zeros where none is."""
     import tqdm  # dm_control brings it
+
+    from trl_suite.evaluation import PROGRESS_DELAY
 
     none = np.zeros(len(environment.action_map))
     time_step, done = environment.reset(), 0
