@@ -31,7 +31,8 @@ PLANS = (  # tag, title, words
         'By `examples/evaluate_plans.py`: whole episodes of 200 s, seed 0, by the scripted policy '
         'and the reference policy. Reward is normalised and cumulative: a fall ends it; speed is '
         'towards the goal (soccer: of the ball), m/s; along the trail, m, median; with the ball at '
-        'its goal, share of the time.',
+        'its goal, share of the time. In 2017: the reward that the DeepLoco paper reports for its trained '
+        'policies, in another simulator, as we remember it (not checked).',
     ),
     (
         'flat_control',
@@ -43,9 +44,16 @@ PLANS = (  # tag, title, words
     ),
 )
 PLAN_COLUMNS = (
-    'environment', 'policy', 'episodes', 'reward', 'no fall in 60 s', 'no fall', 'speed',
+    'environment', 'policy', 'episodes', 'reward', '2017', 'no fall in 60 s', 'no fall', 'speed',
     'goals a minute', 'trail', 'ball at goal', 'falls per km',
 )  # fmt: skip
+PUBLISHED_REWARDS = {  # share of the maximum; Peng et al. 2017, from memory
+    'PD_Biped3D_HLC_Soccer-v0': 0.77,
+    'PD_Biped3D_HLC_LargeBlocks-v0': 0.70,
+    'PD_Biped3D_HLC_DynamicsObstacles-v0': 0.18,
+    'PD_Biped3D_HLC_Forest-v0': 0.56,
+    'PD_Biped3D_HLC_PathFollowing-v0': 0.55,
+}
 PUBLISHED_DISTANCES = {  # m, mean; Peng, Berseth, van de Panne 2016, from memory
     'FSM_Dog2D_Terrain_Mixed-v0': 2094,
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': 1364,
@@ -177,6 +185,7 @@ def plan_rows(tag: str) -> list[list[str]]:
     return [
         [
             f'`{id_}`', name, str(found['episodes']), f'{found["reward"]:.2f}',
+            f'{PUBLISHED_REWARDS[id_]:.2f}' if name == 'reference' and id_ in PUBLISHED_REWARDS else '–',
             f'{found["survived_minute"]:.0%}', f'{found["survived"]:.0%}', f'{found["speed"]:.2f}',
             '–' if 'Soccer' in id_ else f'{found["goals_per_minute"]:.1f}',
             f'{found["trail"]:.0f}' if found['trail'] else '–',
