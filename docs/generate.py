@@ -430,7 +430,8 @@ def speed_page() -> str:
     return page(
         'Speed',
         f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random; a '
-        'control step is 10 physics steps; rows are simulations that step together. `trl-suite bench ID` measures your machine.',
+        'control step is 10 physics steps; rows are simulations that step together. `trl-suite bench '
+        'ID` measures your machine.',
         '## One environment',
         table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per row of many'), single),
         '## Many at once',
