@@ -480,6 +480,10 @@ class TerrainTest(Folder):
     def test_heights_that_are_not_finite(self):
         with self.assertRaisesRegex(TypeError, "function 'f' failed where .* np.sin"):
             terrain.from_function(lambda x: math.sin(x), 'f')
+        with self.assertRaisesRegex(
+            TypeError, "function 'f' failed where .* np.where instead of if"
+        ):
+            terrain.from_function(lambda x: x if x > 0 else 0.0, 'f')
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
         with self.assertRaisesRegex(
             ValueError, "terrain 'hole' returned nan at x = 3.* m; expected"

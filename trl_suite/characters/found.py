@@ -225,7 +225,7 @@ class Found:
         if not SIZES[0] <= reach <= SIZES[1]:
             self.notes.append(f'it reaches {reach:.3g} m from its root; are lengths in m?')
         if not MASSES[0] <= self.weight / GRAVITY <= MASSES[1]:
-            self.notes.append(f'it weighs {self.weight / GRAVITY:.0f} kg; are masses in kg?')
+            self.notes.append(f'it weighs {self.weight / GRAVITY:.4g} kg; are masses in kg?')
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
         if isinstance(names, str) or not names:

@@ -119,10 +119,10 @@ def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
     shape = (2, 3)[-arguments:]
     try:
         found = np.asarray(function(*[np.zeros(shape)] * arguments))
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise TypeError(
             f'the height function {name!r} failed where it was given an array: {error}; numpy has '
-            'functions of arrays, as np.sin instead of math.sin'
+            'functions of arrays, as np.sin instead of math.sin, or np.where instead of if'
         ) from error
     if found.shape != shape or found.dtype.kind not in 'fiu':
         raise ValueError(
