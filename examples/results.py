@@ -24,6 +24,7 @@ DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
 MILESTONES = (0.5, 0.8, 0.9)  # of the maximum return
 PANELS = {'hierarchical': 'plans', 'flat_control': 'without hierarchy'}  # else by character
+LONGEST = 20  # longest to shortest run of a panel above which its axis of samples is logarithmic
 PLANS = (  # tag, title, words
     (
         'hierarchical',
@@ -322,7 +323,11 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
                     color=colour, alpha=1 if ship else 0.4, linewidth=1.2,
                     label=row.task if ship else None,
                 )  # fmt: skip
-        axis.set_xlim(left=0)
+        lengths = [run['curve'][-1]['samples'] for id_ in ids for run in entries[id_]['runs']]
+        if max(lengths) > LONGEST * min(lengths):
+            axis.set_xscale('log')
+        else:
+            axis.set_xlim(left=0)
         axis.set_ylim(0, 1)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7, loc='best')
