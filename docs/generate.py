@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from trl_suite import acting, catalogue, characters, describe, files, policies, suite, terrain
+from trl_suite.characters.muscles import MUSCLES
 from trl_suite.commands import gallery
 from trl_suite.describe import common
 from trl_suite.mannequin import Mannequin
@@ -30,10 +31,28 @@ FAMILIES = {
     'terrainrl': 'TerrainRL: an action sets the gait of one whole cycle',
     'deeploco': 'DeepLoco: planned footsteps, and plans of them',
 }
+NAMES = (  # parts of ids
+    ('`FSM`', 'a finite state machine drives the joints; an action sets its parameters'),
+    (
+        '`PD`, `Vel`, `Torque`, `MTU`',
+        'actuation: position (proportional-derivative control), velocity, torque, muscle (muscle-tendon units)',
+    ),
+    ('`Imitate`, `LLC_Imitate`', 'a clip is tracked; LLC: low-level controller'),
+    ('`LLC_…_Step`', 'planned footsteps are followed'),
+    ('`HLC`', 'high-level controller: footsteps are planned, above a low-level controller'),
+    ('`Hard`', 'the same tasks without hierarchy: joints are driven'),
+    ('`FULL`', 'the three-dimensional biped with arms and head'),
+    (
+        '`…_Terrain-v0` of a biped, dog or raptor',
+        'PLAiD: the ground is seen; without it blind, or flat',
+    ),
+    ('PLAiD', 'progressive learning and integration via distillation (Berseth et al. 2018)'),
+    ('simbicon', 'a biped and its gait after SIMBICON (Yin, Loken, van de Panne 2007)'),
+)
 WITHOUT = {  # a shipped policy
     'scripted': 'a policy written by hand (`--policy scripted`)',
     'clip': 'the clip itself, whose poses are the targets, without feedback (`--policy clip`)',
-    'zero': 'action 0 throughout, of gaits the default one (`--policy zero`)',
+    'zero': 'action 0 throughout, which for a gait is the default one (`--policy zero`)',
 }
 _LANDING = ('footsteps', 'footsteps2d', 'hike', 'soccer')
 DRAWN = {  # beside the physics, and by which rules
@@ -202,16 +221,21 @@ def learnt(row: catalogue.Row) -> str:
     if found is None:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
-    result, samples = run['evaluation'], run['settings']['samples']
-    unit = {'terrainrl': 'cycles'}.get(
-        row.domain, 'plans' if 'hierarchical' in row.tags else 'steps'
-    )
+    result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
+    unit = 'plans' if 'hierarchical' in row.tags else 'steps'
+    trained = f'{samples / 1e6:.2g} million {unit}'
+    if row.rules == 'gait':
+        trained = f'{samples:g} decisions, each of which tries all base actions'
+    after = f'{taken:g} decisions' if row.rules == 'gait' else f'{taken / 1e6:.2g} million'
+    if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
+        after += ', when it had only been shown'
     seeds = len(found['runs'])
     facts = (
         ('return', f'{result["fraction"]:.1%} of the maximum {result["step_limit"]}'),
-        ('episodes that were not cut short', f'{result["full"]:.0%} of {result["episodes"]}'),
+        ('episodes that lasted to the step limit', f'{result["full"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
-        ('trained for', f'{samples / 1e6:.2g} million {unit}, seed {run["seed"]}'),
+        ('trained for', f'{trained}, seed {run["seed"]}'),
+        *([('policy taken after', after)] if taken < 0.99 * samples else []),
         *([('began with', begun(run['settings']))] if run['settings'].get('start') else []),
         ('on', run['machine']),
     )  # fmt: skip
@@ -240,8 +264,10 @@ def environment_index() -> str:
     return page(
         'Environments',
         f'{len(catalogue.ROWS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
-        f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family, '
-        'character, actuation, terrain or tag, and `trl-suite info ID` prints what a page says.',
+        f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
+        'character, actuation, terrain or tag, and `trl-suite info ID` prints what a page says. Their '
+        'names are those of the original, misspelt where it is.',
+        table(('in a name', 'means'), NAMES),
         *parts,
     )
 
@@ -254,7 +280,7 @@ def character_page(name: str) -> str:
     mannequin = Mannequin(name)
     figure = mannequin.character
     weights = [joint.weight for joint in row.joints.values()]
-    joints = common.links(figure, mannequin.environment.physics, ('reward weight', weights))
+    joints = common.links(figure, mannequin.environment.physics, (common.REWARD_WEIGHT, weights))
     used = [each.id for each in catalogue.ROWS if each.character == name]
     return page(
         name,
@@ -290,8 +316,10 @@ def character_index() -> str:
     ]  # fmt: skip
     return page(
         'Characters',
-        'Any of them goes with any actuation model and any terrain of as many dimensions: '
-        '`suite.build`. For one of your own see [Make your own](../make_your_own.md).',
+        f'Any of them goes with any terrain of as many dimensions and with position, velocity and torque '
+        f'control; {", ".join(MUSCLES)} with muscles too: `suite.build`. Who has no clip needs '
+        "`task='walk'`, or a clip of yours. For a character of your own see "
+        '[Make your own](../make_your_own.md).',
         table(('character', '', 'what', 'environments'), cells),
     )
 
@@ -305,7 +333,10 @@ def terrain_page(name: str) -> str:
     sets = ground.parameter_sets or ({},)
     titles = ['value'] if len(sets) == 1 else [f'set {i}' for i in range(len(sets))]
     cells = [
-        (key, unit(ground.type, key), *(f'{values.get(key, default):g}' for values in sets), f'{default:g}')
+        (
+            key, 'no effect' if key in terrain.IDLE.get(ground.type, ()) else unit(ground.type, key),
+            *(f'{values.get(key, default):g}' for values in sets), f'{default:g}',
+        )
         for key, default in defaults.items()
     ]  # fmt: skip
     length = gallery.terrain_length(ground)

@@ -5,10 +5,10 @@
 
 Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
 `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares that do not
-fall, at all and in the first minute, speed towards the goal, goals per minute, distance along a
-trail, the share of time with the ball at its goal, and falls per kilometre. Rows without hierarchy
-have no scripted policy, and episodes as long as the others. Writes into trained/plans.json what it
-has measured.
+fall, at all and in the first minute, speed towards the goal, goals per minute (in soccer none are
+counted), distance along a trail, the share of time with the ball at its goal, and falls per
+kilometre. Rows without hierarchy have no scripted policy, and episodes as long as the others. Writes
+into trained/plans.json what it has measured.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
         towards += info['speed'] * duration * runs
         path += np.linalg.norm(after - before, axis=1) * runs
         arrived += info.get('at_goal', np.zeros(episodes)) * duration * runs
-        goals[runs] = info['goals_reached'][runs]
+        if 'at_goal' not in info:
+            goals[runs] = info['goals_reached'][runs]
         ended = step.terminated | step.truncated
         if (ended & runs).any():
             last = along_trails(environments, after) - begin

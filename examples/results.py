@@ -210,17 +210,19 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
         'shipped: `suite.reference_policy(id)`. What the papers found: [beside the papers](findings.md).',
         f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
-        'neither training nor the choice of the policy had seen, so that numbers here are not those of '
-        'the curves. Return is a fraction of its '
+        'neither training nor the choice of a policy along its curve had seen, so that numbers here are not '
+        'those of the curves. (The best of several seeds is the best in these same episodes; each of '
+        'them is under *Actuation models*.) Return is a fraction of its '
         'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
         'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
         'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
         'the run began with, whose samples are not counted again; or what it was shown at first: '
         '`scripted`, the rules written by hand, or `guide`, the plans of [one who has a map]'
-        '(../examples/guide.py), whose samples are counted. '
+        '(../examples/guide.py), whose samples are counted; the page of an environment says whether its policy '
+        'was taken while it was shown, or after. '
         f'Machine: {machines}; one thread per '
-        'run, with up to five others and other work beside it, so that minutes say little.',
-        '## Every environment with a policy',
+        'run, up to five runs and other work side by side, so that minutes say little.',
+        '## Every environment with a policy, but for gaits',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
              'begins with'),
@@ -270,7 +272,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             '## Where the feet are told to go',
             'The footstep controller by `examples/evaluate_footsteps.py`: episodes of 20 s, seed 0; '
             'landing error in m, mean and 90th percentile, and mean error of the heading in rad when '
-            'a foot lands.',
+            'a foot lands. *General*: as the environment draws plans, with sharp turns; *made from the root*: '
+            'each laid out from root and heading, as by the policies that plan; *pushes*: of the torso, '
+            'for 0.2 s every 3 s; *belts*: strips 2 m wide, 1 m apart.',
             table(
                 ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
             ),

@@ -259,12 +259,13 @@ def every_row(id_):
         if high:
 
             def test_plain_composer_environment_is_refused(self):
-                for interface in ('plan', 'frame'):
-                    task = suite.build_task(suite.find(id_), {'interface': interface})
+                idle = {'idle': (0.1, lambda task: np.zeros(task.world.n))}
+                for options in ({}, {'interface': 'frame'}, {'rewards': idle}):
+                    task = suite.build_task(suite.find(id_), options)
                     environment = composer.Environment(task, random_state=3)
                     environment.reset()
                     with (
-                        self.subTest(interface),
+                        self.subTest(str(options)),
                         self.assertRaisesRegex(
                             RuntimeError, 'trl_suite.environment.Environment, not.*composer'
                         ),

@@ -255,6 +255,12 @@ class SingleTest(Same, parameterized.TestCase):
         np.testing.assert_array_equal(env.render(), expected)
         self.assertGreater(np.std(expected), 5)
         self.assertEqual(env.metadata['render_fps'], 30)
+        for id_, fps in (
+            ('PD_Biped3D_HLC_Soccer-v0', 2),
+            ('PD_Biped3D_HLC_PathFollowing_Run-v0', 3),
+        ):
+            self.assertEqual(SuiteEnv(id_).metadata['render_fps'], fps)
+            self.assertEqual(SuiteVectorEnv(id_, 2).metadata['render_fps'], fps)
         silent = SuiteEnv(GAPS)
         silent.reset()
         self.assertIsNone(silent.render())

@@ -931,11 +931,25 @@ class ScriptedTest(parameterized.TestCase):
             self.assertEqual(mine, total)
 
     @parameterized.parameters(
-        ('PD_Biped3D_LLC_General_Step-v0', {}), (FOREST, {'interface': 'frame'})
+        ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task Footsteps has no scripted policy'),
+        (FOREST, {'interface': 'frame'}, "needs the interface 'plan', not 'frame'"),
     )
-    def test_other_tasks_are_refused(self, id_, options):
-        with self.assertRaisesRegex(ValueError, 'has no scripted policy.*interface'):
+    def test_other_tasks_are_refused(self, id_, options, message):
+        with self.assertRaisesRegex(ValueError, message):
             scripted.scripted(suite.make(id_, options))
+
+    def test_with_terms_of_the_users(self):
+        rewards = {'idle': (0.1, lambda task: np.zeros(task.world.n))}
+        own, plain = (
+            suite.make(SOCCER, {'random': 1, **more}, {'flat_observation': True})
+            for more in ({'rewards': rewards}, {})
+        )
+        for environment in (own, plain):
+            environment.reset()
+        observation = plain.task.observation
+        np.testing.assert_array_equal(
+            scripted.scripted(own)(observation), scripted.scripted(plain)(observation)
+        )
 
 
 class SaveTest(parameterized.TestCase):
@@ -1056,11 +1070,45 @@ class OptionTest(parameterized.TestCase):
         ({'start_phase': 0.1}, "unknown option.*'start_phases'"),
         ({'goal_distance': 5}, 'goal_distance is 5; expected the least'),
         ({'goal_distance': (5, 3)}, 'goal_distance is'), ({'step_length': 0}, 'step_length is 0'),
+        ({'goal_distance': (5, 1e9)}, 'goal_distance is .*; expected at most 100 m'),
+        ({'step_length': 'long'}, "step_length is 'long'; expected a number"),
+        ({'start_phases': 0.5}, 'start_phases is 0.5; expected a list of numbers'),
+        ({'start_phases': '12'}, "start_phases is '12'; expected a list of numbers"),
+        ({'sight': None}, 'sight is None; expected a list of strings'),
+        ({'goal_reached': [1]}, r'goal_reached is \[1\]; expected a number or None'),
+        ({'substeps': 10.5}, 'substeps is 10.5; expected a whole number'),
+        ({'blend': np.nan}, 'blend is nan; expected a number'),
+        ({'blend': True}, 'blend is True; expected a number'),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
         for id_ in (FOREST, SOCCER):
             with self.assertRaisesRegex(ValueError, message):
                 suite.make(id_, options)
+
+    def test_a_ball_lies_on_level_ground_only(self):
+        for task, name in (('soccer', 'hills3d'), ('soccer', 'obstacles3d')):
+            with self.assertRaisesRegex(ValueError, f'level ground.*{name}.*are: flat3d, plane'):
+                suite.build('biped3d_mocap', terrain=name, task=task)
+        suite.build('biped3d_mocap', terrain='flat3d', task='soccer').close()
+
+    def test_goals_of_a_ball_as_far_as_asked_for(self):
+        environments = VectorEnvironment(SOCCER, 32, 0, 1, task_kwargs={'goal_distance': (1, 2)})
+        environments.reset()
+        task = environments.task
+        away = np.hypot(*(task.goal - task.ball.place)[:, :2].T)
+        self.assertBetween(away.min(), 1, 1.3)
+        self.assertBetween(away.max(), 1.7, 2)
+
+    def test_plans_that_are_none(self):
+        task = started(PLANE, interface='frame')[0].task
+        for action, message in (
+            (np.zeros(22), r'shape \(22,\); expected \(1, 22\)'),
+            (np.zeros((1, 5)), r'shape \(1, 5\); expected'),
+            (np.full((1, 22), np.nan), r'number 0 \(first_x\) is nan'),
+            ([['a'] * 22], 'not an array of numbers'),
+        ):
+            with self.assertRaisesRegex(ValueError, message):
+                task.lay(action)
 
     def test_substeps(self):
         environment, _ = started(PLANE, substeps=20)

@@ -36,6 +36,20 @@ def vertices(low, high):
     return np.arange(round(low / 0.2), round(high / 0.2) + 1)
 
 
+class ParameterTest(parameterized.TestCase):
+    @parameterized.parameters(sorted(terrain.IDLE))
+    def test_without_effect(self, type_name):
+        x, y = np.meshgrid(np.arange(-20, 20, 0.5) + 0.01, np.arange(-20, 20, 0.5) + 0.01)
+        heights = []
+        for factor in (1, 3):
+            values = terrain.GENERATORS3D[type_name].defaults
+            parameters = {name: factor * values[name] for name in terrain.IDLE[type_name]}
+            ground = make({'Type': type_name, 'Params': [parameters]}, 1)
+            heights.append(ground.height(x.ravel(), y.ravel()))
+        self.assertGreater(np.ptp(heights[0]), 0)
+        np.testing.assert_array_equal(*heights)
+
+
 class NoiseTest(parameterized.TestCase):
     def test_tile(self):
         tile = noise.tile()

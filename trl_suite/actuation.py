@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from dm_control import mjcf
 
 from trl_suite import errors, hill
@@ -87,6 +88,26 @@ class ActionMap:
     def action(self, control: np.ndarray) -> np.ndarray:
         """Maps controls (..., k) to the actions that cause them; not clipped."""
         return (control - self.centre) / self.half_range
+
+    def checked(self, action: npt.ArrayLike, rows: int) -> np.ndarray:
+        """Returns actions of some rows as floats, (rows, k).
+
+        Raises:
+          ValueError: another shape, or NaN or infinity; the row is named.
+        """
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'actions are not an array of numbers: {error}') from None
+        if action.shape != (rows, len(self)):
+            raise ValueError(f'actions have shape {action.shape}; expected {(rows, len(self))}')
+        if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
+            row, i = np.argwhere(~np.isfinite(action))[0]
+            raise ValueError(
+                f'action of row {row}, number {i} ({self.names[i]}) is {action[row, i]}; '
+                'expected finite numbers'
+            )
+        return action
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,11 +1,27 @@
 """Sentences for bad input: what it was, what was expected, and the nearest valid choice."""
 
+import collections.abc
 import difflib
-from collections.abc import Iterable
+import inspect
+import numbers
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
 
 LIKE, ALIKE = 0.6, 0.4  # shares of two names that must agree, see `difflib`
 FEW = 20  # names that may all be listed where none is like the one given
 MANY = 40  # names; of more only some are listed
+
+
+KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # what an annotation takes, in words
+    bool: ((bool, np.bool_), 'True or False', 'bools'),
+    int: ((numbers.Integral,), 'a whole number', 'whole numbers'),
+    float: ((numbers.Real,), 'a number', 'numbers'),
+    str: ((str,), 'a string', 'strings'),
+    types.NoneType: ((types.NoneType,), 'None', 'None'),
+}
 
 
 def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
@@ -29,3 +45,46 @@ def _listed(names: list[str]) -> str:
     if len(names) <= MANY:
         return ', '.join(names)
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
+
+
+def check_kinds(function: Callable[..., object], options: Mapping[str, object]) -> None:
+    """Checks options by the annotations of what takes them, before it stumbles over one.
+
+    Args:
+      function: a function, or a class.
+      options: keyword arguments; those whose annotation says nothing here pass.
+
+    Raises:
+      ValueError: one is of another kind; the message has its name, and what was expected.
+    """
+    takes = function.__init__ if inspect.isclass(function) else function
+    hints = typing.get_type_hints(takes)
+    for name, value in options.items():
+        choices = _choices(hints.get(name, typing.Any))
+        if not any(_fits(value, choice) for choice in choices):
+            expected = ' or '.join(dict.fromkeys(map(_words, choices)))
+            raise ValueError(f'{name} is {value!r}; expected {expected}')
+
+
+def _choices(hint: object) -> tuple[object, ...]:
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return typing.get_args(hint) if union else (hint,)
+
+
+def _fits(value: object, hint: object) -> bool:
+    if hint in KINDS:
+        if not isinstance(value, KINDS[hint][0]) or value != value:  # NaN
+            return False
+        return hint is bool or not isinstance(value, bool)
+    if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
+        (inner,) = typing.get_args(hint)
+        return isinstance(value, Iterable) and all(_fits(each, inner) for each in value)
+    return True
+
+
+def _words(hint: object, many: bool = False) -> str:
+    if hint in KINDS:
+        _, one, more = KINDS[hint]
+        return more if many else one
+    inner = ''.join(f' of {_words(each, many=True)}' for each in typing.get_args(hint)[:1])
+    return f'lists{inner}' if many else f'a list{inner}'

@@ -36,7 +36,7 @@ except ImportError as error:
     message = f"trl_suite.gym needs Gymnasium ({error}): pip install 'trl_suite[gymnasium]'"
     raise ImportError(message) from None
 
-METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}
+METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most
 BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; the others have none
 Info = dict[str, Any]
 
@@ -82,6 +82,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'
             )
         self.environment, self._flat, self._dtype = environment, flat_observation, np.dtype(dtype)
+        self.metadata = metadata(environment.task)
         shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
         self.observation_space = observation_space(shapes, flat_observation, dtype)
         self.action_space = action_space((len(environment.action_map),), dtype)
@@ -161,7 +162,6 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         mode = getattr(autoreset_mode, 'value', autoreset_mode)
         if mode not in modes:
             raise ValueError(errors.unknown('autoreset_mode', mode, modes))
-        self.metadata = {**METADATA, 'autoreset_mode': modes[mode]}
         self.autoreset_mode = modes[mode]  # as Gymnasium's own have it; TorchRL looks for it
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
@@ -173,6 +173,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
             task_kwargs=options,
         )  # fmt: skip
+        self.metadata = {**metadata(self.environment.task), 'autoreset_mode': modes[mode]}
         self.num_envs = n = self.environment.num_envs
         shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
         self.single_observation_space = observation_space(shapes, flat_observation, dtype)
@@ -213,6 +214,11 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulations."""
         self.environment.close()
+
+
+def metadata(task: Any) -> Info:
+    """What is said of pictures: one per step plays at its own speed, steps of gaits but for theirs."""
+    return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
 
 
 def limited(row: Row, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.tasks.composed import Composed
 from trl_suite.tasks.footsteps import SIDE
 from trl_suite.tasks.high_level import PLAN_NAMES, HighLevel
 from trl_suite.tasks.soccer import Soccer
@@ -46,10 +47,15 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
       ValueError: another task.
     """
     task = environments.task
-    if not isinstance(task, HighLevel) or task.interface != 'plan':
+    if isinstance(task, Composed):
+        task = task.task
+    if not isinstance(task, HighLevel):
         raise ValueError(
-            f'the task {type(task).__name__} has no scripted policy; high-level tasks with the '
-            "interface 'plan' have"
+            f'the task {type(task).__name__} has no scripted policy; hikes and soccer have'
+        )
+    if task.interface != 'plan':
+        raise ValueError(
+            f"the scripted policy plans footsteps: it needs the interface 'plan', not {task.interface!r}"
         )
     blocks = environments.blocks
 

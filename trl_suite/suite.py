@@ -377,18 +377,24 @@ def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
         if name not in known:
             choices = [*known, *composed.OPTIONS, 'random']
             raise ValueError(errors.unknown(f'option of {row.id}', name, choices))
+    if not callable(row.rules):  # the user's own check theirs
+        errors.check_kinds(_takes(row), merged)
     _check_dimensions(row)
     return composed.compose(make_task(row, merged), parts)
 
 
 def task_options(row: Row) -> dict[str, Any]:
     """Returns the options of a row's task, besides those of every task, with their defaults."""
-    takes: Any = row.rules if callable(row.rules) else _RULES[row.rules][1]
     return {
         name: row.options.get(name, parameter.default)
-        for name, parameter in inspect.signature(takes).parameters.items()
+        for name, parameter in inspect.signature(_takes(row)).parameters.items()
         if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
     }
+
+
+def _takes(row: Row) -> Callable[..., Any]:
+    """Returns what has the options of a row's task as keyword arguments."""
+    return row.rules if callable(row.rules) else _RULES[row.rules][1]
 
 
 def build_row(

@@ -219,7 +219,7 @@ class VectorEnvironment:
         self._check_usable()
         if self._fresh:
             raise RuntimeError('step before the first reset')
-        action = self._checked(action)
+        action = self.action_map.checked(action, self.num_envs)
         task, ended, stepped = self._task, self._ended, None
         resting: Any = False  # rows that do not move
         if rows is not None:
@@ -382,22 +382,6 @@ class VectorEnvironment:
         if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < self.num_envs):
             raise ValueError(f'rows {rows.tolist()} of an environment of {self.num_envs} rows')
         return numbers
-
-    def _checked(self, action: np.ndarray) -> np.ndarray:
-        shape = (self.num_envs, len(self.action_map))
-        try:
-            action = np.asarray(action, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'actions are not an array of numbers: {error}') from None
-        if action.shape != shape:
-            raise ValueError(f'actions have shape {action.shape}; expected {shape}')
-        if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
-            row, i = np.argwhere(~np.isfinite(action))[0]
-            raise ValueError(
-                f'action of row {row}, number {i} ({self.action_map.names[i]}) is {action[row, i]}; '
-                'expected finite numbers'
-            )
-        return action
 
     def _check_usable(self) -> None:
         if self._world is None:

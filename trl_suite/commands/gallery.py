@@ -52,6 +52,7 @@ SECONDS, LONGER = 4.0, 12.0  # that a film strip covers; of plans
 # begin and end in s, camera.
 SCENES = {
     'PD_Biped3D_HLC_Soccer-v0': (8, 6.0, 16.0, 'back'),
+    'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0, 8.5, 'back'),
     'PD_Biped3D_HLC_Conveyors-v0': (2, 21.5, 31.5, 'back'),
     'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 9.0, 18.0, 'back'),
 }
@@ -310,7 +311,7 @@ def curve(id: str) -> np.ndarray:
     value = 'distance' if gait else 'fraction'
     unit, name = (1e6, 'million control steps')
     if gait or 'hierarchical' in row.tags:
-        unit, name = 1e3, f'thousand {"cycles" if gait else "plans"}'
+        unit, name = 1e3, f'thousand {"decisions" if gait else "plans"}'
     figure = Figure(figsize=(4.2, 2.4), layout='constrained')
     axis = figure.subplots()
     for run in sorted(found['runs'], key=lambda run: run['seed'] == found['shipped']):

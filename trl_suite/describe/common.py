@@ -11,9 +11,20 @@ import numpy as np
 from trl_suite import catalogue, characters, terrain
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.environment import Environment
+from trl_suite.tasks import rewards
 from trl_suite.tasks.tracking3d import Tracking
 
 Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks
+REWARD_WEIGHT = 'reward weight'  # title of a column of links
+# What terms of a reward compare with the clip, or the step.
+_ERRORS = {
+    'pose': 'angles of joints and root, mean weighted as in Links; rad^2',
+    'velocity': 'their rates, mean weighted alike; rad^2/s^2',
+    'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
+    'root': 'height of the root above the ground; m^2',
+    'heading': '-',
+}
+_ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
 
 
 def character(environment: Environment) -> Iterator[Section]:
@@ -22,9 +33,9 @@ def character(environment: Environment) -> Iterator[Section]:
     figure, row = task.character, task.character.row
     # The last column: a weight in a reward that has none of a gait, or what a gait tracks.
     gait, above = getattr(task, 'gait', None), hasattr(task, 'controller')
-    title, last = 'reward weight', [joint.weight for joint in row.joints.values()]
+    title, last = REWARD_WEIGHT, [joint.weight for joint in row.joints.values()]
     if gait is not None:
-        title = 'target to'
+        title = 'target is to'
         last = ['the world' if j in gait.world_joints else 'its parent' for j in row.joints]
     elif above:
         title, last = '', [''] * len(last)
@@ -57,7 +68,8 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
       last: title of one more column, and what is in it for each joint.
     """
     masses = floats(physics.bind(figure.bodies).mass)
-    cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', '')]
+    own = figure.row.root_weight if last[0] == REWARD_WEIGHT else ''
+    cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', own)]
     for (name, joint), mass, (low, high), limit, slides, ball, more in zip(
         figure.row.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
         figure.prismatic, figure.spherical, last[1], strict=True,
@@ -93,6 +105,31 @@ def observation(environment: Environment, meanings: Meanings) -> Section:
                 for name, part in blocks.items()
             ],
         ),
+    )
+
+
+def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
+    """Returns the terms of a reward for tracking.
+
+    Args:
+      task: it has them.
+      steps: whether footsteps are tracked, not a clip.
+      more: meanings of terms that only this task has; terms without a meaning are left out.
+    """
+    average = 'sum' if steps else 'mean'
+    errors = {
+        **_ERRORS,
+        'end_effector': f'joints of the end effectors, their way from {_ABOUT[task.ABOUT]} and their '
+        f'height above the ground, {average} over them; m^2',
+        **more,
+    }
+    return Table(
+        ('term', 'weight', 'scale', 'error: squared difference of'),
+        [
+            (name, weight, '' if name == 'heading' else scale, errors[name])
+            for name, (weight, scale) in task.TERMS.items()
+            if name in errors
+        ],
     )
 
 
@@ -134,7 +171,10 @@ def _limits(environment: Environment) -> tuple[str, Any]:
 def ground(row: catalogue.Row) -> Section:
     """Returns the terrain and its parameters."""
     found = terrain.load(row.terrain)
-    parameters = ', '.join(f'{name} {value:g}' for name, value in found.parameters().items())
+    idle = terrain.IDLE.get(found.type, ())
+    parameters = ', '.join(
+        f'{name} {value:g}' for name, value in found.parameters().items() if name not in idle
+    )
     sets = len(found.parameter_sets)
     more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
     return section(

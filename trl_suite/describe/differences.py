@@ -15,18 +15,29 @@ _CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS, _HIGH, _HARD = (
     lambda row: row.rules in ('journey', 'ball_journey'),
 )  # fmt: skip
 _SPACE = lambda row: _SPATIAL(row) or _HIGH(row)  # noqa: E731
+_FINE = lambda row: _HIGH(row) and row.terrain in (  # noqa: E731
+    'dynamic_obstacles3d', 'pillars3d', 'conveyor3d', 'conveyor3d_wide',
+)  # fmt: skip
 _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     (
         lambda row: 'completion' in row.tags,
         'not in the registry of the original: a combination that its papers name or imply',
     ),
-    (_CLIP, 'MuJoCo at 300 Hz (some rows 600 Hz) instead of Bullet at 3000 Hz; task option substeps'),
+    (
+        lambda row: _CLIP(row) and 'substeps' not in row.options,
+        'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps',
+    ),
+    (
+        lambda row: _CLIP(row) and 'substeps' in row.options,
+        'MuJoCo at 600 Hz instead of Bullet at 3000 Hz; task option substeps',
+    ),
     (_GAIT, 'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at which they fall here'),
     (_CLIP3D, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
     (
-        lambda row: row.rules == 'footsteps' or _HIGH(row) or _HARD(row),
+        lambda row: (row.rules == 'footsteps' or _HIGH(row) or _HARD(row)) and not _FINE(row),
         'MuJoCo at 300 Hz instead of Bullet at 1200 Hz; task option substeps',
     ),
+    (_FINE, 'MuJoCo at 300 Hz instead of Bullet at 3000 Hz; task option substeps'),
     (
         _HIGH,
         'a step is a whole footstep, from one switch of stance to the next; that of the original is 1/30 s '
@@ -159,7 +170,8 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     ),
     (
         lambda row: row.actuation == 'muscle' and row.character == 'raptor',
-        'episodes start in the air: in stance its muscles cannot brake the clip',
+        'episodes start in the air, in phases 0.25 to 0.5 and 0.75 to 1: in stance its muscles cannot brake '
+        'the clip',
     ),
     (_CLIP, "the clip is our own, close to the original's in gait and speed"),
     (
@@ -167,9 +179,10 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         "the clip is our own, 1.2 m/s; the original's walks at 1.535 m/s",
     ),
     (
-        lambda row: (row.rules == 'imitation3d' and row.clip != 'biped3d_walk') or _HARD(row),
+        lambda row: row.rules == 'imitation3d' and row.clip != 'biped3d_walk',
         "the clip is our own, close to the original's in gait and speed",
     ),
+    (_HARD, "the clip is our own, 1.3 m/s; the original's walks at 1.535 m/s"),
     (
         lambda row: row.rules == 'footsteps' and row.character != 'biped3d_mocap_run',
         'the steps are our own, 27 of them; the original chooses among 14 captured ones',
@@ -188,6 +201,21 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         '1 m beside the start',
     ),
     (
+        lambda row: row.terrain in ('obstacles3d', 'pillars3d', 'ramp3d'),
+        'what stands on the ground has vertical faces, and where it overlaps the higher one counts; faces of the '
+        'original slope over 0.2 m, and the later one counts',
+    ),
+    (
+        lambda row: row.terrain == 'dynamic_obstacles3d',
+        'moving boxes have an inertia of 10^6 kg: they push, carry, and are not stopped; those of the original '
+        'are kinematic, and of 1 kg to whom they meet',
+    ),
+    (
+        lambda row: row.terrain.startswith('conveyor3d'),
+        'a belt is one box whose surface moves; that of the original is a row of boxes that move and '
+        're-enter behind',
+    ),
+    (
         lambda row: row.terrain == 'mixed_humanoid',
         'the terrain is inferred: slopes_mixed_humanoid without slopes',
     ),
@@ -201,8 +229,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
     ),
     (
         _HIGH,
-        f'episodes are cut after {catalogue.HIKE_LIMIT} steps, 200 s (discount 1); the registry of the original '
-        'cuts them after 256 steps of 1/30 s',
+        'episodes are cut after 200 s (discount 1); the limit that the original configures ends none',
     ),
 )  # fmt: skip
 

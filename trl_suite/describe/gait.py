@@ -30,6 +30,22 @@ _UNITS = {
         ('BackForceX', 'BackForceY', 'FrontForceX', 'FrontForceY', 'ForceX', 'ForceY'), 'N'
     ),
 }  # fmt: skip
+# What parameters do, by name without state; the others are targets of the joints that they name.
+_EFFECTS = {
+    'TransTime': 'length of the states that end after it',
+    'BackForceX': 'push of the hind foot on the body, ahead, in BackStance and Extend',
+    'BackForceY': 'the same, upwards',
+    'FrontForceX': 'push of the fore foot on the body, ahead, in FrontStance and Gather',
+    'FrontForceY': 'the same, upwards',
+    'SpineCurve': 'target of every joint of the spine',
+    'Cd': 'in Passing and Up, times the way from the stance foot to the centre of mass: added to SwingHip',
+    'RootPitch': 'pitch of the root, held by the hip of a stance foot on the ground in Contact and Down',
+    'MagicGain': 'of the torque that keeps the root upright on the ground, by the hip',
+}
+_FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
+    True: 'in Contact and Down, times the forward speed: added to SwingHip',
+    False: 'times the forward speed: added to Hip and Shoulder of a leg in the air',
+}
 
 
 def blocks(task: Any) -> Meanings:
@@ -66,7 +82,7 @@ def before(task: Any) -> Iterator[Section]:
         f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
         Table(('base action', 'parameter set'), blends),
         f'action 0 is {" = ".join(chosen)}',
-        f'sign does not count: {", ".join(figures.names[i] for i in figures.absolute)}',
+        f'taken without their sign: {", ".join(figures.names[i] for i in figures.absolute)}',
         *([f'fixed: {", ".join(fixed)}'] if fixed else []),
     )
 
@@ -86,11 +102,14 @@ def action(environment: Environment) -> Section:
             'it begins with the next cycle',
         )
     units = [_unit(task, name) for name in action_map.names]
-    columns = (action_map.names, floats(action_map.centre), floats(action_map.half_range), units)
+    effects = [_effect(task, name) for name in action_map.names]
+    columns = (
+        action_map.names, floats(action_map.centre), floats(action_map.half_range), units, effects,
+    )  # fmt: skip
     return section(
         f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
         Table(
-            ('sets', 'centre', 'half range', 'unit'),
+            ('sets', 'centre', 'half range', 'unit', 'which is'),
             list(zip(*columns, strict=True)),
             numbered=True,
         ),
@@ -101,6 +120,13 @@ def _unit(task: Any, parameter: str) -> str:
     own = parameter.split('.')[-1]
     slides = own == 'Knee' and task.character.prismatic.any()
     return 'm' if slides else _UNITS.get(own, 'rad')
+
+
+def _effect(task: Any, parameter: str) -> str:
+    own = parameter.split('.')[-1]
+    if own == 'Cv':
+        return _FROM_SPEED['Cd' in task.gait.parameters.names]
+    return _EFFECTS.get(own, 'a target')
 
 
 def rules(task: Any) -> Iterator[Section]:

@@ -60,11 +60,12 @@ def rules(task: Any) -> Iterator[Section]:
         'Footstep controller',
         f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
     )
+    yield spatial.start(task)
     if isinstance(task, soccer.Soccer):
-        yield spatial.goal_and_ball()
+        yield spatial.goal_and_ball(task._goal_distance)
         formulas, full = spatial.ball_terms(task._target_speed, task._goal_reached)
     else:
-        yield spatial.goal(task)
+        yield spatial.goal(task, 'hike')
         formulas = [
             f'exp(-{high_level.SPEED_SHARPNESS:g} min(0, v - {task._target_speed:g})^2), v: speed of the '
             'centre of mass towards the goal, m/s',

@@ -14,7 +14,7 @@ MEANINGS = {
     'controller': 'footstep controller: an id whose policy is shipped, a policy file, or a function',
     'footstep_scale': 'times the squared miss of a landing place in the reward: more teaches accuracy',
     'goal': 'whether plans head for a goal on the terrain',
-    'goal_distance': 'm, the least and the most, at which goals are drawn; by default where the terrain has them',
+    'goal_distance': 'm, the least and the most from the walker (soccer: from the ball) at which goals are drawn; by default as told above',
     'goal_reached': 'm; nearer, a goal is reached; by default 1 m, in soccer and without hierarchy 0.5 m',
     'grace': 's after a push or a sharp turn in which no foot misses its place',
     'half_range': 'rad per unit action; by default 1.5, about a clip in space 1',

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite.describe.common import Meanings, action, time
-from trl_suite.describe.layout import Section, Table, section
-from trl_suite.describe.spatial import BLOCKS, plan, span
+from trl_suite.describe.common import Meanings, action, time, tracking_terms
+from trl_suite.describe.layout import Section, section
+from trl_suite.describe.spatial import BLOCKS, REWARD, plan, span
 from trl_suite.tasks.footsteps2d import PlanarFootsteps
 
 __all__ = ['action', 'after', 'before', 'blocks', 'rules', 'time']
@@ -60,19 +60,13 @@ def rules(task: Any) -> Iterator[Section]:
         notes = [
             'end_effector: in the second half of a step, that of the swing foot is the way to its '
             'landing place',
-            'heading: full while the trunk faces ahead, 0 while it faces backwards',
+            'heading: the whole weight while the trunk faces ahead, 0 while it faces backwards',
         ]
         if task.miss is not None:
             miss = f'a foot lands more than {task.miss:g} m from its place; '
     yield section(
-        'Reward: sum of weight * exp(-scale * squared error), at most 1; 0 after a fall',
-        Table(
-            ('term', 'weight', 'scale'),
-            [
-                (name, weight, scale if name != 'heading' else '')
-                for name, (weight, scale) in task.TERMS.items()
-            ],
-        ),
+        REWARD,
+        tracking_terms(task, bool(notes)),
         *notes,
     )
     yield section(

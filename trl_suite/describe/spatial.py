@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.describe.common import Meanings, action, time
+from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.tasks import ball, high_level, journey
+from trl_suite.terrain import Ground, ground
+from trl_suite.terrain.layout import Layout
 
 __all__ = ['BLOCKS', 'action', 'after', 'before', 'blocks', 'rules', 'time']
 
+REWARD = 'Reward: sum of weight * exp(-scale * error), at most 1; 0 after a fall'
 BLOCKS = {
     'terrain': (
         'm',
@@ -131,9 +134,9 @@ def rules(task: Any) -> Iterator[Section]:
         noun = 'step' if len(motion) == 1 else 'steps'
         yield section(
             f'Steps: {motion.name}',
-            f'{motion.description}: {len(motion)} {noun} and the mirrored; the nearest to the plan is '
-            f'the reference of a step. Period of two steps {task.period:.4g} s; the right foot '
-            'stands while the phase is below 0.5',
+            f'{motion.description}: {len(motion)} {noun} and as many mirror images; the one nearest to '
+            f'the plan is the reference of a step. Period of two steps {task.period:.4g} s; the right '
+            'foot stands while the phase is below 0.5',
         )
         yield _plans(task)
     else:
@@ -142,9 +145,10 @@ def rules(task: Any) -> Iterator[Section]:
             f'{motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
         )
     if isinstance(task, journey.Journey):
-        yield goal_and_ball() if 'ball' in task.blocks else goal(task)
+        yield start(task)
+        yield goal_and_ball() if 'ball' in task.blocks else goal(task, 'step')
     yield section(
-        'Reward: sum of weight * exp(-scale * squared error), at most 1; 0 after a fall',
+        REWARD,
         *_reward(task, steps),
     )
     miss = ''
@@ -159,23 +163,16 @@ def rules(task: Any) -> Iterator[Section]:
 
 def _reward(task: Any, steps: bool) -> Iterator[Table | str]:
     of_ball = 'ball' in task.blocks
-    yield Table(
-        ('term', 'weight', 'scale'),
-        [
-            (name, weight, scale if name != 'heading' else '')
-            for name, (weight, scale) in task.TERMS.items()
-            if name not in ball.SOCCER_TERMS or not of_ball
-        ],
-    )
+    where = 'ball' if of_ball else 'goal'
+    away = f'distance to the {where} over {journey.NEAR:g} m'
+    yield tracking_terms(task, steps, **({'proximity': away} if 'proximity' in task.TERMS else {}))
     if 'heading' in task.TERMS:
-        aim = 'of the planned heading' if steps else 'of the heading from the way to go'
-        yield f'heading: weight * ((1 + cos error) / 2)^4, error {aim}'
+        aim = 'that planned' if steps else f'the way to the {where}'
+        yield f'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and {aim}'
     if 'proximity' in task.TERMS:
-        where = 'ball' if of_ball else 'goal'
         yield (
-            f'the way to go is that to the {where}: the clip is turned that way; within '
-            f'{journey.NEAR:g} m neither velocity nor heading counts; proximity is of the distance over '
-            f'{journey.NEAR:g} m'
+            f"com: the clip's velocity is turned towards the {where}; nearer than {journey.NEAR:g} m com "
+            'and heading are worth their whole weight'
         )
     if of_ball:
         formulas, full = ball_terms(ball.SPEED, task._goal_reached)
@@ -199,7 +196,11 @@ def _plans(task: Any) -> Section:
     if task.goal_given:
         lines.append('heads for a goal, drawn anew when it is reached')
     else:
-        lines.append(f'the heading changes by N(0, {plans.turn:g}) rad from step to step')
+        lines.append(
+            f'the heading changes by N(0, {plans.turn:g}) rad from step to step'
+            if plans.turn
+            else 'straight on'
+        )
         if plans.sharp:
             lines.append(f'with probability {plans.sharp:g} by anything up to pi instead')
     if plans.from_root:
@@ -216,21 +217,53 @@ def span(values: tuple[float, float]) -> str:
     return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
 
 
-def goal(task: Any) -> Section:
-    """Returns when the goal changes."""
-    times = _seconds(high_level.GOAL_LASTS)
-    return section('Goal', f'drawn anew within {task._goal_reached:g} m of it, or after {times}')
+def start(task: Any) -> Section:
+    """Returns where an episode begins."""
+    layout = _layout(task)
+    where = {
+        'start': 'at the origin, heading along x',
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
+        f'within {ground.START_ROOM:g} m, with any heading',
+        'trail': f'on the middle of the trail and along it, anywhere up to '
+        f'{ground.TRAIL_SPAN - ground.TRAIL_PAD:g} m from the origin along x and along y',
+    }
+    return section('Start', where[layout.place])
 
 
-def goal_and_ball() -> Section:
-    """Returns where ball and goal are, and when they change."""
-    low, high = ball.BALL_AWAY
+def goal(task: Any, rule: str) -> Section:
+    """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
+    layout = _layout(task)
+    segments = '1 to 10 segments' if rule == 'hike' else 'one segment'
+    where = {
+        'start': f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y',
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
+        f'within {layout.goal_room:g} m',
+        'trail': f'{segments} of the trail (2 m each) beyond the nearest, up to {ground.TRAIL_OFFSET:g} of '
+        'its width beside its middle',
+    }[layout.place]
+    away = getattr(task, '_goal_distance', None)
+    if away is not None:
+        where = f'{span(away)} from the walker, in any direction'
+    return section(
+        'Goal',
+        f'drawn {where}; the next one when the walker is within {task._goal_reached:g} m of it, or after '
+        f'{_seconds(high_level.GOAL_LASTS)}',
+    )
+
+
+def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
+    """Returns where ball and goal (`away` from it, m) are, and when they change."""
     return section(
         'Goal and ball',
-        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg lies {low:g} to {high:g} m from the walker, the '
-        f'goal up to {ball.GOAL_AWAY[1]:g} m from the ball; both are drawn anew, the ball after '
-        f'{_seconds(ball.BALL_LASTS)}, the goal after {_seconds(high_level.GOAL_LASTS)}',
+        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg is put {span(ball.BALL_AWAY)} from the walker, '
+        f'the goal {span(away or ball.GOAL_AWAY)} from the ball, in any direction; the ball is put elsewhere '
+        f'after {_seconds(ball.BALL_LASTS)}, the next goal is drawn after {_seconds(high_level.GOAL_LASTS)}',
     )
+
+
+def _layout(task: Any) -> Layout:
+    """Returns how ground of a task's terrain is laid out."""
+    return Ground(task.arena.terrain, 0).layout
 
 
 def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
@@ -243,9 +276,10 @@ def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
     speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
     formulas = [
         f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
-        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: from where it was to the ball, m',
+        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: on the ground from where the centre of mass was when the '
+        'step began to the ball, m',
         f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
-        f'exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball to the goal, m',
+        f"exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball's centre to the goal on the ground, m",
     ]
     return formulas, (
         f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '

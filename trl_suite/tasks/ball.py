@@ -12,8 +12,10 @@ import numpy as np
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.tasks.figure3d import polar, turn
 from trl_suite.tasks.task import drawn_way
+from trl_suite.terrain import PRESETS3D
 from trl_suite.world import World
 
+LEVEL = ('plane', 'var3d_flat')  # types of ground on which a ball may lie
 RADIUS, MASS = 0.2, 0.1  # m, kg
 FRICTION = (0.45, 0.005, 0.0001)  # 0.5 * 0.9, wherever it lies
 SOLREF = (0.01, 1)  # soft enough for a tenth of a kilogram
@@ -41,7 +43,18 @@ class Ball:
     """
 
     def __init__(self, arena: SpatialTerrain) -> None:
-        """Adds it to an arena; `bind` ties it to the compiled world."""
+        """Adds it to an arena; `bind` ties it to the compiled world.
+
+        Raises:
+          ValueError: the ground of the arena is not level.
+        """
+        ground = arena.terrain
+        if ground.type not in LEVEL:
+            level = ', '.join(name for name, each in PRESETS3D.items() if each.type in LEVEL)
+            raise ValueError(
+                f'a ball needs level ground, and terrain {ground.name!r} ({ground.type}) is not; '
+                f'presets that are: {level}'
+            )
         root = arena.mjcf_model
         body = root.worldbody.add('body', name='ball', pos=(0, 0, RADIUS))
         body.add('freejoint', name='ball')
@@ -78,9 +91,11 @@ class Ball:
         self.world.qvel[row, self.dof] = 0.0
         return random.uniform(*BALL_LASTS)
 
-    def goal(self, row: int, random: np.random.Generator) -> np.ndarray:
-        """Draws a goal about one ball, (3,) m."""
-        return np.append(self.world.qpos[row, self.qpos[:2]] + drawn_way(random, *GOAL_AWAY), 0.0)
+    def goal(
+        self, row: int, random: np.random.Generator, away: tuple[float, float] = GOAL_AWAY
+    ) -> np.ndarray:
+        """Draws a goal about one ball, between two distances (m) from it, (3,) m."""
+        return np.append(self.world.qpos[row, self.qpos[:2]] + drawn_way(random, *away), 0.0)
 
     def write(self, found: SimpleNamespace, out: np.ndarray) -> None:
         """Writes what is seen of the balls, (n, 9), in the heading frame.

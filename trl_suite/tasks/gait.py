@@ -13,7 +13,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
 
 from trl_suite import actuation, controllers, errors
 from trl_suite.actuation import ActionMap
@@ -22,7 +21,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, dynamics
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.reference import link_extents
-from trl_suite.tasks.task import Task, consecutive, drawn_seed
+from trl_suite.tasks.task import Task, check_simulated, consecutive, drawn_seed
 from trl_suite.terrain import Strip
 from trl_suite.world import World
 
@@ -314,6 +313,7 @@ class GaitTask(Task):
 
     def finish_step(self, stepped: np.ndarray | None = None) -> None:
         rows = np.arange(self.world.n) if stepped is None else np.flatnonzero(stepped)
+        check_simulated(self._lasted[rows])
         self.diverged[rows] |= self.world.diverged()[rows]
         self.failed |= self.diverged
         kept = self.observation[self.diverged]
@@ -333,14 +333,6 @@ class GaitTask(Task):
             terms[rows[speed < 0]] = 0.0
         terms[self.failed] = 0.0
         self.reward[...] = terms.sum(1)
-
-    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        if not self._lasted[0]:
-            raise RuntimeError(
-                'a gait runs the physics of its cycle by itself: step this task by '
-                'trl_suite.environment.Environment, not by a plain composer.Environment'
-            )
-        super().after_step(physics, random_state)
 
     def observe(self) -> None:
         self.figure.measure(self._view)

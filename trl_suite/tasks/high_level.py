@@ -11,7 +11,6 @@ from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
-from dm_control import mjcf
 
 from trl_suite import errors
 from trl_suite.actuation import ActionMap
@@ -24,7 +23,14 @@ from trl_suite.tasks import reflection3d, rewards
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
 from trl_suite.tasks.plans import span
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Marker, consecutive, drawn_seed, drawn_way
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Marker,
+    check_simulated,
+    consecutive,
+    drawn_seed,
+    drawn_way,
+)
 from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
 from trl_suite.terrain import Ground
@@ -46,6 +52,7 @@ GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is drawn anew
 HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
 FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples that touch the ground
 SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
+FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
 LONGEST = 60  # control steps of a step; the clock switches stance long before
 FLAG = (0.1, 0.6, 0.0)  # m; marker of the goal: radius and half height
 
@@ -103,8 +110,9 @@ class HighLevel(Footsteps):
           step_length: of the steps that action 0 means, m.
           target_speed: m/s towards the goal from which on the reward is full.
           goal_reached: m; nearer, a goal is drawn anew. By default `GOAL_REACHED`.
-          goal_distance: m; the least and the most from the walker, in any direction, at which goals
-            are drawn: for open ground. By default they are where the terrain has them.
+          goal_distance: m; the least and the most, up to 100, from the walker (in soccer: from the
+            ball), in any direction, at which goals are drawn: for open ground. By default they are
+            where the terrain has them.
           start_phases: of the clock, one of which every episode starts with.
           substeps: physics steps per 1/30 s.
           blend: which mixture of the terrain's parameter sets to draw from.
@@ -127,6 +135,10 @@ class HighLevel(Footsteps):
                 raise ValueError(f'{name} is {value}; expected a positive number')
         if goal_distance is not None:
             goal_distance = span('goal_distance', goal_distance, 'm')
+            if goal_distance[1] > FARTHEST_GOAL:
+                raise ValueError(
+                    f'goal_distance is {goal_distance}; expected at most {FARTHEST_GOAL:g} m'
+                )
         if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
             raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
         self._furnish(arena)
@@ -286,11 +298,15 @@ class HighLevel(Footsteps):
         With the interface 'frame' a footstep controller can so see a plan before it acts by it.
 
         Args:
-          action: (n, k); what lies behind the plan does not count.
+          action: (n, k), in [-1, 1]; what lies behind the plan does not count.
 
         Returns:
           What the footstep controller observes now, (n, size); the observation has it as well.
+
+        Raises:
+          ValueError: actions of another shape, or with NaN or infinity.
         """
+        action = self.action_map.checked(action, self.world.n)
         found = self.figure.measure()
         rows = self._beginning(np.arange(self.world.n))
         self.act(action)
@@ -333,6 +349,7 @@ class HighLevel(Footsteps):
 
     def finish_step(self, stepped: np.ndarray | None = None) -> None:
         rows = np.arange(self.world.n) if stepped is None else np.flatnonzero(stepped)
+        check_simulated(self._lasted[rows])
         found = self.figure.measure()
         self._reward_terms(rows, found)
         self.reward_terms[self.failed] = 0.0
@@ -394,14 +411,6 @@ class HighLevel(Footsteps):
         self._write_phase()
         self._off = rewards.wrap(self.heading - found.heading)
         self._write_extras(found)
-
-    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        if not self._lasted[0]:
-            raise RuntimeError(
-                'a high-level task runs the physics of its footstep by itself: step it by '
-                'trl_suite.environment.Environment, not by a plain composer.Environment'
-            )
-        super().after_step(physics, random_state)
 
     def infos(self) -> dict[str, Any]:
         """As for footsteps; and goals reached, speed towards the goal (m/s), duration (s)."""

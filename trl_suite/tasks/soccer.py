@@ -23,7 +23,8 @@ from trl_suite.world import World
 class Soccer(HighLevel):
     """A spatial biped dribbles a ball to a goal; an action is a plan of two footsteps.
 
-    `target_speed` is that of walker and ball, and `goal_reached` of the ball.
+    `target_speed` is that of walker and ball; `goal_reached` and `goal_distance` are from the ball,
+    whose ground must be level.
 
     Observation blocks, in this order (heading frame): pose, velocity as in `SpatialImitation`;
       target: bearing and distance of the goal as seen from the ball, rad and m.
@@ -61,7 +62,8 @@ class Soccer(HighLevel):
         self._ball_due[row] = self._count[row] + round(lasts / CONTROL_TIMESTEP)
 
     def _goal_drawn(self, row: int, place: np.ndarray) -> np.ndarray:
-        return self.ball.goal(row, self._random[row])
+        away = ball.GOAL_AWAY if self._goal_distance is None else self._goal_distance
+        return self.ball.goal(row, self._random[row], away)
 
     def simulate(self, rows: np.ndarray | None = None) -> None:
         self._ball_from[...] = self.ball.place

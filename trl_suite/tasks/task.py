@@ -175,6 +175,22 @@ class Task(composer.Task):
         return self._task_observables
 
 
+def check_simulated(lasted: np.ndarray) -> None:
+    """Checks that rows have run the physics of a step of a task that does so by itself.
+
+    Args:
+      lasted: how long each has, 0 where it has not.
+
+    Raises:
+      RuntimeError: some have not.
+    """
+    if not lasted.all():
+        raise RuntimeError(
+            'a task whose steps are long runs their physics by itself: step it by '
+            'trl_suite.environment.Environment, not by a plain composer.Environment'
+        )
+
+
 def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarray:
     """Draws a way on the ground in any direction, of any length from low to high, (2,) m."""
     angle = random.uniform(-np.pi, np.pi)

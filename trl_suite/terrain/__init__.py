@@ -28,7 +28,7 @@ from trl_suite.terrain.ground import Ground
 from trl_suite.terrain.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
 from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
-from trl_suite.terrain.spatial import GENERATORS3D, register3d
+from trl_suite.terrain.spatial import GENERATORS3D, IDLE, register3d
 from trl_suite.terrain.strip import Strip
 from trl_suite.terrain.surface import from_function, from_heights, from_image, from_mesh
 from trl_suite.terrain.surroundings import Surroundings, capacity
@@ -37,6 +37,7 @@ __all__ = [
     'GENERATORS',
     'GENERATORS3D',
     'GRID',
+    'IDLE',
     'PRESETS',
     'PRESETS3D',
     'SPACING',

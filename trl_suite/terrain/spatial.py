@@ -59,8 +59,7 @@ MOVER_SPAN = 20.0  # m; half side of the square of the ways of moving boxes
 PLACE_SPAN = {'obstacles3d': 24.0, 'moving': 12.0}  # m; half sides of the squares of starts
 BELT_TOP = 0.01  # m above the plane
 
-# Defaults of the parameters (those of the original). The last ones of each were read by the original
-# and had no effect there either; or, of belts, have none here.
+# Defaults of the parameters (those of the original).
 PATH = {'PathWidth0': 3, 'PathHeight0': 0, 'PathHeight1': -2, 'PathLength': 10,
         'PathTurnLength': 5}  # fmt: skip
 TRAIL = {'PathWidth0': 3, 'PathWidth1': 3, 'PathWidthDeltaStdev': 0.1, 'PathMaxTurnDelta': 1.5,
@@ -75,6 +74,11 @@ MOVING = {'ObstacleWidth0': 0.5, 'ObstacleWidth1': 7, 'ObstacleSpeed0': 0.1, 'Ob
 MOVERS = {'NumObstacles': 10, 'ObstacleHeight0': 1, 'ObstacleHeight1': 5, **MOVING}
 CONVEYORS = {'ConveyorStripLength': 10, 'ConveyorNumStrips': 4, 'ConveyorSpacing': 3, **MOVING,
              'ConveyorNumSlices': 10}  # fmt: skip
+# Parameters without effect, by type: the original reads them in vain too, but for those of belts.
+IDLE = {
+    'trail3d': ('PathLength', 'PathTurnLength'), 'var3d_stairs': ('StepSpacingMin', 'StepSpacingMax'),
+    'conveyor3d': ('ConveyorNumSlices',),
+}  # fmt: skip
 
 Corner = np.ndarray | tuple[float, float]
 Function3D = Callable[[Parameters, np.random.Generator], Layout]
