@@ -10,7 +10,7 @@ Prints, under random actions, resets included:
 - raw `Batch.step` and raw `mj_step` of the same model, and our single environment;
 - the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
   async) and EnvPool, each as a fraction of the raw `mj_step` rate of its own model with as many
-  physics steps, so that models of different cost compare. EnvPool 1.2.0 has MuJoCo 3.6.0 inside;
+  physics steps, so that models of different cost compare. EnvPool 1.2.5 has MuJoCo 3.6.0 inside;
   the wheels of 1.2.2 to 1.2.5 lack files without which they cannot be imported.
 """
 
@@ -149,8 +149,8 @@ def plot(figures, path):
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(figsize=(7, 4))
-    for id_, found in figures['ours'].items():
+    figure, axes = pyplot.subplots(figsize=(9, 4))
+    for k, (id_, found) in enumerate(figures['ours'].items()):
         reference = figures['single'][id_]['raw mj_step']
         for threads in THREADS:
             rows = [n for n in ROWS if f'{n} rows, {threads} threads' in found]
@@ -162,11 +162,12 @@ def plot(figures, path):
                 rows,
                 rates,
                 'o-' if threads == 1 else 's--',
+                color=f'C{k}',
                 label=f'{id_}, {threads} thread{"s" * (threads > 1)}',
             )
     axes.set(xscale='log', xlabel='rows', ylabel='rate / raw mj_step on one thread')
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, loc='center left', bbox_to_anchor=(1.01, 0.5))
     figure.tight_layout()
     figure.savefig(path, dpi=100)
 

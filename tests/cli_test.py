@@ -170,8 +170,13 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  terrain +0 +200 +200 +m .* to 10 m ahead')
         self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
         self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = centre', out)
-        self.assertRegex(out, r'\n  BackForceX +378.3 +432.7  N\n')
-        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad\n')
+        self.assertRegex(
+            out, r'\n  BackForceX +378.3 +432.7  N +push of the hind foot on the body, ahead'
+        )
+        self.assertRegex(
+            out, r'\n  Cv +\S+ +\S+  rad s/m +times the forward speed: added to Hip and Sh'
+        )
+        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +a target\n')
         self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
         self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
         self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+looks')
@@ -193,9 +198,9 @@ class InfoTest(CommandTest):
         self.assertRegex(
             out, r'\n  leg +0.2 +-0.2 to 0.2 m +180 N +1000 N/m +20 N s/m +its parent\n'
         )
-        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad\n')
-        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m\n')
-        self.assertRegex(out, r'\n  MagicGain +0.8405 +0.162  1\n')
+        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +a target\n')
+        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +a target\n')
+        self.assertRegex(out, r'\n  MagicGain +0.8405 +0.162  1 +of the torque that keeps the root')
         self.assertIn('\n  exp(-0.5 (v - 3)^2)\n', out)
         self.assertNotIn('share of the time', out)
         self.assertRegex(out, r'pose .*; last, pitch of the root \(rad\)\n')
@@ -217,8 +222,11 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  left_knee +-0\.4\d+ +1 +150\n')
         self.assertRegex(out, r'\n  right_hip +4\.5 +ball, up to 2\.57 +200 +300 +30 +0\.5\n')
         self.assertIn('42 kg', out)
-        self.assertRegex(out, r'\n  heading +0\.09524\n')
-        self.assertRegex(out, r'\n  end_effector +0\.1905 +5\n')
+        self.assertRegex(out, r'\n  heading +0\.09524 ')
+        self.assertRegex(
+            out, r'\n  end_effector +0\.1905 +5 .*from the root .*, sum over them; m\^2\n'
+        )
+        self.assertRegex(out, r'\n  com +0\.09524 +10 .*; 0\.1 of the m\^2/s\^2\n')
         self.assertIn('one of root, torso touches the ground', out)
         self.assertIn('steps 0.5 m long, feet 0.15 m apart', out)
         self.assertIn('N(0, 0.25) rad', out)
@@ -255,7 +263,13 @@ class InfoTest(CommandTest):
             self.assertRegex(out, rf'\n  {name} +{centre} +{half_range}  {unit}; ')
         self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
         self.assertRegex(out, r'\n  upright +0\.2  1\n')
-        self.assertRegex(out, r'drawn anew within 1 m of it, or after 50 to 100 s')
+        self.assertRegex(
+            out, r'\nStart\n  up to 12 m from the origin .* nothing stands or moves\s+within 1 m'
+        )
+        self.assertRegex(
+            out, r'\nGoal\n  drawn up to 12 m .* nothing stands or moves\s+within 0\.25 m;\s'
+        )
+        self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
         self.assertRegex(out, r'one of root, torso touches the ground in 4\s+looks')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
@@ -263,7 +277,7 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 116 numbers', out)
         self.assertRegex(out, r'\n  ball +107 +116 +9 ')
         self.assertRegex(out, r'as seen from the ball')
-        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg lies 0\.7 to 10 m')
+        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg is put 0\.7 to 10 m from')
         for name, weight in (
             ('approach', '0.1667'), ('near', '0.1667'), ('dribble', '0.3333'), ('goal', '0.3333'),
         ):  # fmt: skip
@@ -282,9 +296,11 @@ class InfoTest(CommandTest):
             'angles to the parent link': 'PD targets of a dog or raptor',
             'exactly vertical': 'terrain',
             'the clip is our own': 'clip',
-            '300 Hz': 'imitation',
+            'MuJoCo at 300 Hz': 'imitation',
+            'MuJoCo at 600 Hz': 'finer',
+            'Bullet at 1200 Hz': 'coarse',
             'takes physical units': 'imitation',
-            'at 600 Hz': 'gait',
+            'control at 600 Hz': 'gait',
             'ends with its cycle': 'gait',
             'taken at touch-down': 'hopper',
             'base action 1': 'raptor',
@@ -302,11 +318,14 @@ class InfoTest(CommandTest):
             'ankles of 0.03': 'run',
             'captured, 4.4 m/s': 'run',
             'drawn anew': 'goal',
+            'the later one counts': 'blocks',
+            'inertia of 10^6 kg': 'moving',
+            'belt is one box': 'belts',
             'treads': 'stairs',
             'whole footstep': 'high',
             'controller is inside': 'high',
             'over the whole step': 'high',
-            'cuts them after 256': 'high',
+            'cut after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
             'heights of its pillars': 'forest',
             'a goal is reached or its time': 'hike',
@@ -314,11 +333,11 @@ class InfoTest(CommandTest):
         }
         tracking = {'clip', 'imitation', 'short'}
         walking = {'space', 'vectors', 'straight on', 'clip', '3D walk', 'imitation', 'short'}
-        stepping = {'space', 'vectors', 'footsteps', 'steps', 'imitation', 'short'}
-        planning = {'space', 'imitation', 'high'}
+        stepping = {'space', 'vectors', 'footsteps', 'steps', 'imitation', 'short', 'coarse'}
+        planning = {'space', 'imitation', 'high', 'coarse'}
         for id_, expected in (
             ('PD_Biped2D_LLC_Imitate_Flat-v0', tracking),
-            ('Vel_Dog2D_LLC_Imitate_Flat-v0', tracking | {'completion'}),
+            ('Vel_Dog2D_LLC_Imitate_Flat-v0', tracking | {'completion', 'finer'}),
             ('MTU_Raptor2D_LLC_Imitate_Flat-v0', tracking | {'muscle'}),
             ('PD_Dog2D_Gaps_Terrain-v0', tracking | {'PD targets of a dog or raptor', 'terrain'}),
             (
@@ -345,8 +364,13 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_LLC_Symetric_Step-v0', stepping | {'mirrored'}),
             ('PD_Biped3D_LLC_Run_FootStep-v0', stepping - {'steps'} | {'run'}),
             ('PD_Biped3D_LLC_Trail_Step-v0', stepping | {'goal', 'completion'}),
-            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'hike'}),
-            ('PD_Biped3D_HLC_Forest-v0', planning | {'hike', 'forest'}),
+            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'hike', 'blocks'}),
+            ('PD_Biped3D_HLC_Forest-v0', planning - {'coarse'} | {'hike', 'forest', 'blocks'}),
+            (
+                'PD_Biped3D_HLC_DynamicsObstacles-v0',
+                planning - {'coarse'} | {'hike', 'moving'},
+            ),
+            ('PD_Biped3D_HLC_Conveyors-v0', planning - {'coarse'} | {'hike', 'belts'}),
             ('PD_Biped3D_HLC_Soccer-v0', planning | {'soccer'}),
             ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'hike', 'completion'}),
         ):
@@ -511,7 +535,7 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('the task Imitation has no scripted policy; high-level tasks with', GAPS, '--policy',
+        ('the task Imitation has no scripted policy; hikes and soccer have', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('no such file', GAPS, '--policy', 'none.npz'),

@@ -611,7 +611,7 @@ class HelperTest(parameterized.TestCase):
         ({'start_phase': 1.0}, 'start_phase is 1.0'), ({'start_phase': -0.1}, 'start_phase is -0.1'),
         ({'start_phase': np.nan}, 'start_phase is nan'),
         ({'mirrored': True, 'target': True}, 'mirrored observations need the phase'),
-        ({'blend': np.nan}, 'blend must be a number'),
+        ({'blend': np.nan}, 'blend is nan; expected a number'),
         ({'terrain_samples': 50}, "unknown option.*'terrain_samples'"),
         ({'plans': {}}, "unknown option.*'plans'"),
     )  # fmt: skip

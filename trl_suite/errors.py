@@ -13,8 +13,6 @@ import numpy as np
 LIKE, ALIKE = 0.6, 0.4  # shares of two names that must agree, see `difflib`
 FEW = 20  # names that may all be listed where none is like the one given
 MANY = 40  # names; of more only some are listed
-
-
 KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # what an annotation takes, in words
     bool: ((bool, np.bool_), 'True or False', 'bools'),
     int: ((numbers.Integral,), 'a whole number', 'whole numbers'),

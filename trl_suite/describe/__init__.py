@@ -72,6 +72,6 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
     yield from family.after(task)
     yield family.action(environment)
     yield common.ground(row)
-    yield from family.rules(task)
+    yield from family.rules(row, task)
     yield family.time(row, task)
     yield options.options(row, suite.task_options(row))

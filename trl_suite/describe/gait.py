@@ -39,7 +39,7 @@ _EFFECTS = {
     'FrontForceY': 'the same, upwards',
     'SpineCurve': 'target of every joint of the spine',
     'Cd': 'in Passing and Up, times the way from the stance foot to the centre of mass: added to SwingHip',
-    'RootPitch': 'pitch of the root, held by the hip of a stance foot on the ground in Contact and Down',
+    'RootPitch': 'pitch at which the hip of a stance foot on the ground holds the root',
     'MagicGain': 'of the torque that keeps the root upright on the ground, by the hip',
 }
 _FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
@@ -129,9 +129,9 @@ def _effect(task: Any, parameter: str) -> str:
     return _EFFECTS.get(own, 'a target')
 
 
-def rules(task: Any) -> Iterator[Section]:
+def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     """Yields reward and termination."""
-    row, weights = task.character.row, task.reward_weights
+    figure, weights = task.character.row, task.reward_weights
     weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
     lines = [
         f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {task.gait.parameters.target_speed:g})^2)',
@@ -141,20 +141,20 @@ def rules(task: Any) -> Iterator[Section]:
         lines[0] += f' + {weights["stumble"]:g} / (1 + {gait.STUMBLE_SHARPNESS:g} s)'
         lines.append(
             's: share of the time in which a link other than '
-            f'{", ".join(row.stumble_exempt)} touches the ground'
+            f'{", ".join(figure.stumble_exempt)} touches the ground'
         )
-    if row.name in gait.NO_REWARD_BACKWARDS:
+    if figure.name in gait.NO_REWARD_BACKWARDS:
         lines.append('0 if v is negative')
     yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
-    links = ', '.join(row.fall_links)
+    links = ', '.join(figure.fall_links)
     ends = [
-        f'{"one of " if len(row.fall_links) > 1 else ""}{links} touches the ground in '
+        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
         f'{looks_until_fall(gait)} looks in a row, or so often that {running_share(gait)}',
         f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
         f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
         'the physics diverges',
     ]
-    if row.name in gait.FORWARD_ONLY:
+    if figure.name in gait.FORWARD_ONLY:
         ends.insert(2, 'it moves backwards')
     yield section(
         f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',

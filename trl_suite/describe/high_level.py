@@ -54,18 +54,18 @@ def action(environment: Environment) -> Section:
     )
 
 
-def rules(task: Any) -> Iterator[Section]:
+def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     """Yields controller, goal, reward and termination."""
     yield section(
         'Footstep controller',
         f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
     )
-    yield spatial.start(task)
+    yield spatial.start(row)
     if isinstance(task, soccer.Soccer):
         yield spatial.goal_and_ball(task._goal_distance)
         formulas, full = spatial.ball_terms(task._target_speed, task._goal_reached)
     else:
-        yield spatial.goal(task, 'hike')
+        yield spatial.goal(row, task, 'hike')
         formulas = [
             f'exp(-{high_level.SPEED_SHARPNESS:g} min(0, v - {task._target_speed:g})^2), v: speed of the '
             'centre of mass towards the goal, m/s',

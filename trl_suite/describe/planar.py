@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from trl_suite import catalogue
 from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, section
 from trl_suite.describe.spatial import BLOCKS, REWARD, plan, span
@@ -43,9 +44,9 @@ def after(task: Any) -> Iterator[Section]:
         yield plan(task)
 
 
-def rules(task: Any) -> Iterator[Section]:
+def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     """Yields clip, reward and termination."""
-    clip, row = task.clip, task.character.row
+    clip = task.clip
     notes, miss = [], ''
     yield section(
         f'Clip: {clip.name}',
@@ -71,6 +72,6 @@ def rules(task: Any) -> Iterator[Section]:
     )
     yield section(
         'Termination (discount 0)',
-        f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
+        f'a fall: one of {", ".join(task.character.row.fall_links)} touches the ground at the end of a step; '
         f'{miss}or the physics diverges',
     )

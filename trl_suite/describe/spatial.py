@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite import catalogue, terrain
 from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.tasks import ball, high_level, journey
@@ -126,17 +127,15 @@ def plan(task: Any, mirrored: bool = False) -> Section:
     )
 
 
-def rules(task: Any) -> Iterator[Section]:
+def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     """Yields what is tracked, reward and termination."""
-    row, motion = task.character.row, task.motion
+    motion = task.motion
     steps = hasattr(task, 'plans')
     if steps:
-        noun = 'step' if len(motion) == 1 else 'steps'
         yield section(
             f'Steps: {motion.name}',
-            f'{motion.description}: {len(motion)} {noun} and as many mirror images; the one nearest to '
-            f'the plan is the reference of a step. Period of two steps {task.period:.4g} s; the right '
-            'foot stands while the phase is below 0.5',
+            f'{motion.description}, and mirrored; the nearest to the plan is the reference of a step. '
+            f'Period of two steps {task.period:.4g} s; the right foot stands while the phase is below 0.5',
         )
         yield _plans(task)
     else:
@@ -145,8 +144,8 @@ def rules(task: Any) -> Iterator[Section]:
             f'{motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
         )
     if isinstance(task, journey.Journey):
-        yield start(task)
-        yield goal_and_ball() if 'ball' in task.blocks else goal(task, 'step')
+        yield start(row)
+        yield goal_and_ball() if 'ball' in task.blocks else goal(row, task, 'step')
     yield section(
         REWARD,
         *_reward(task, steps),
@@ -156,7 +155,7 @@ def rules(task: Any) -> Iterator[Section]:
         miss = f'a foot lands more than {task.miss:g} m from its place; '
     yield section(
         'Termination (discount 0)',
-        f'a fall: one of {", ".join(row.fall_links)} touches the ground at the end of a step; '
+        f'a fall: one of {", ".join(task.character.row.fall_links)} touches the ground at the end of a step; '
         f'{miss}or the physics diverges',
     )
 
@@ -217,9 +216,9 @@ def span(values: tuple[float, float]) -> str:
     return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
 
 
-def start(task: Any) -> Section:
+def start(row: catalogue.Row) -> Section:
     """Returns where an episode begins."""
-    layout = _layout(task)
+    layout = _layout(row)
     where = {
         'start': 'at the origin, heading along x',
         'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
@@ -230,9 +229,9 @@ def start(task: Any) -> Section:
     return section('Start', where[layout.place])
 
 
-def goal(task: Any, rule: str) -> Section:
+def goal(row: catalogue.Row, task: Any, rule: str) -> Section:
     """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
-    layout = _layout(task)
+    layout = _layout(row)
     segments = '1 to 10 segments' if rule == 'hike' else 'one segment'
     where = {
         'start': f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y',
@@ -261,9 +260,9 @@ def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
     )
 
 
-def _layout(task: Any) -> Layout:
-    """Returns how ground of a task's terrain is laid out."""
-    return Ground(task.arena.terrain, 0).layout
+def _layout(row: catalogue.Row) -> Layout:
+    """Returns how ground of an environment's terrain is laid out."""
+    return Ground(terrain.load(row.terrain), 0).layout
 
 
 def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
