@@ -80,6 +80,15 @@ class WordsTest(parameterized.TestCase):
         own, shared = (suite.build_row(each, {}, {}) for each in (row, other))
         self.assertEqual(list(describe.sections(row, own)), list(describe.sections(row, shared)))
 
+    @parameterized.parameters(
+        ('journey', '1 to 3 m ahead of the walker along x'), ('hike', 'up to 3 m from the walker'),
+    )  # fmt: skip
+    def test_goals_of_open_ground(self, task, words):
+        row = suite.combine('biped3d_mocap', terrain='plane', task=task)
+        told = dict(describe.sections(row, suite.build_row(row, {}, {})))
+        self.assertIn(words, told['Goal'])
+        self.assertIn('at the origin', told['Start'])
+
     def test_every_option_is_explained(self):
         known = {name for row in catalogue.ROWS for name in suite.task_options(row)}
         known |= set(suite.task_options(suite.combine('dog', task='walk')))

@@ -217,7 +217,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
 
 def metadata(task: Any) -> Info:
-    """What is said of pictures: one per step plays at its own speed, steps of gaits but for theirs."""
+    """What is said of pictures; one per step plays as fast as it happened, but for cycles of gaits."""
     return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
 
 

@@ -201,7 +201,7 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         '1 m beside the start',
     ),
     (
-        lambda row: row.terrain in ('obstacles3d', 'pillars3d', 'ramp3d'),
+        lambda row: row.terrain in ('obstacles3d', 'pillars3d'),
         'what stands on the ground has vertical faces, and where it overlaps the higher one counts; faces of the '
         'original slope over 0.2 m, and the later one counts',
     ),

@@ -232,9 +232,13 @@ def start(row: catalogue.Row) -> Section:
 def goal(row: catalogue.Row, task: Any, rule: str) -> Section:
     """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
     layout = _layout(row)
-    segments = '1 to 10 segments' if rule == 'hike' else 'one segment'
+    segments = '1 to 10 segments'
+    near = f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y'
+    if rule == 'step':
+        segments = 'one segment'
+        near = f'1 to {ground.GOAL_SPREAD:g} m ahead of the walker along x, where y is 0'
     where = {
-        'start': f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y',
+        'start': near,
         'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
         f'within {layout.goal_room:g} m',
         'trail': f'{segments} of the trail (2 m each) beyond the nearest, up to {ground.TRAIL_OFFSET:g} of '
