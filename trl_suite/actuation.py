@@ -17,16 +17,14 @@ servos, which MuJoCo clamps axis by axis, get that limit / sqrt(3) about each.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dm_control import mjcf
 
 from trl_suite import errors, hill
+from trl_suite.action_map import AXIS_OFFSET, ActionMap, AngleAxisMap, TorqueMap
 from trl_suite.characters import muscles as muscle_tables
 from trl_suite.characters.character import Character
 from trl_suite.characters.muscles import Muscle
@@ -40,150 +38,7 @@ SLIDE_VELOCITY_SCALE = 10.0  # m/s; at rest the hopper's leg then meets its forc
 POSITION_HALF_RANGE = 1.5  # rad at full action; of a prismatic joint half its range
 ORIGINAL_SPAN = 2.0  # of the range of a joint; how far the original's position targets go at most
 ROTATIONS = ('vector', 'angle_axis')  # how position actions describe the rotation of a ball joint
-AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
 EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
-# The original's axis lies behind the angle: forward, up, right.
-_FORWARD_LEFT_UP, _SIGNS = np.array([1, 3, 2]), np.array([1.0, -1.0, 1.0])
-_TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
-
-
-@dataclasses.dataclass(frozen=True)
-class ActionMap:
-    """The map from an action in [-1, 1] to control: centre + half_range * action.
-
-    Attributes:
-      names: what each action drives, shape (k,).
-      quantity: what the controls are, e.g. 'target angle'.
-      unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
-      centre: control at action 0, shape (k,).
-      half_range: change of control per unit action, shape (k,).
-      actuators: names of the actuators that take the controls, one after the other; those of ball
-        joints take three each. Empty where a controller stands between.
-    """
-
-    names: tuple[str, ...]
-    quantity: str
-    unit: str
-    centre: np.ndarray
-    half_range: np.ndarray
-    actuators: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def control(self, action: np.ndarray) -> np.ndarray:
-        """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
-        low, high, half_range, centre = self._rows
-        control = np.maximum(action, low)  # packed rows: quicker than scalars
-        np.minimum(control, high, out=control)
-        control *= half_range
-        control += centre
-        return control if np.ndim(action) > 1 else control[0]
-
-    @functools.cached_property
-    def _rows(self) -> tuple[np.ndarray, ...]:
-        ones = np.ones((1, len(self)))
-        return -ones, ones, self.half_range[None], self.centre[None]
-
-    def action(self, control: np.ndarray) -> np.ndarray:
-        """Maps controls (..., k) to the actions that cause them; not clipped."""
-        return (control - self.centre) / self.half_range
-
-    def checked(self, action: npt.ArrayLike, rows: int) -> np.ndarray:
-        """Returns actions of some rows as floats, (rows, k).
-
-        Raises:
-          ValueError: another shape, or NaN or infinity; the row is named.
-        """
-        try:
-            action = np.asarray(action, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'actions are not an array of numbers: {error}') from None
-        if action.shape != (rows, len(self)):
-            raise ValueError(f'actions have shape {action.shape}; expected {(rows, len(self))}')
-        if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
-            row, i = np.argwhere(~np.isfinite(action))[0]
-            raise ValueError(
-                f'action of row {row}, number {i} ({self.names[i]}) is {action[row, i]}; '
-                'expected finite numbers'
-            )
-        return action
-
-
-@dataclasses.dataclass(frozen=True)
-class TorqueMap(ActionMap):
-    """Torques of joints, some of them spherical: their norm is clamped after the affine map.
-
-    Attributes:
-      balls: where the three torques of each ball joint are, shape (B, 3).
-      limits: the largest norm of each, N m, shape (B,).
-    """
-
-    balls: np.ndarray = dataclasses.field(kw_only=True)
-    limits: np.ndarray = dataclasses.field(kw_only=True)
-
-    def control(self, action: np.ndarray) -> np.ndarray:
-        control = super().control(action)
-        torque = control.take(self.balls, -1)
-        torque *= (self.limits / np.maximum(_norm(torque), self.limits))[..., None]
-        control[..., self.balls] = torque
-        return control
-
-
-@dataclasses.dataclass(frozen=True)
-class AngleAxisMap(ActionMap):
-    """The position actions of the original: angle and axis of a rotation for every ball joint.
-
-    The affine map yields an angle, then an axis of any length, forward, up and right; the axis of
-    length 0 stands for the one to the right. `control` goes on to rotation vectors, so it returns
-    fewer numbers than it takes, and `action` gives back one of many equal actions.
-
-    Attributes:
-      angles: where the angle of each ball joint is in an action, shape (B,); its axis follows.
-      balls: where its rotation vector is in the controls, shape (B, 3).
-      hinges: where the other joints are in an action and in the controls, shape (2, H).
-    """
-
-    angles: np.ndarray = dataclasses.field(kw_only=True)
-    balls: np.ndarray = dataclasses.field(kw_only=True)
-    hinges: np.ndarray = dataclasses.field(kw_only=True)
-
-    def control(self, action: np.ndarray) -> np.ndarray:
-        value = super().control(action)
-        axis = value.take(self._axes, -1)
-        axis *= _SIGNS
-        length = _norm(axis)
-        if not length.all():
-            axis[length == 0] = _TO_THE_RIGHT
-            length[length == 0] = 1
-        axis *= (value.take(self.angles, -1) / length)[..., None]
-        control = np.empty((*value.shape[:-1], self.balls.size + len(self.hinges[1])))
-        control[..., self.hinges[1]] = value.take(self.hinges[0], -1)
-        control[..., self.balls] = axis
-        return control
-
-    @functools.cached_property
-    def _axes(self) -> np.ndarray:
-        """Where forward, left and up are in an action, shape (B, 3)."""
-        return self.angles[:, None] + _FORWARD_LEFT_UP
-
-    def action(self, control: np.ndarray) -> np.ndarray:
-        vector = control[..., self.balls]
-        angle = _norm(vector)
-        turned = angle[..., None] > 0
-        axis = np.where(turned, vector / np.where(turned, angle[..., None], 1), _TO_THE_RIGHT)
-        value = np.empty((*control.shape[:-1], len(self)))
-        value[..., self.hinges[0]] = control[..., self.hinges[1]]
-        value[..., self.angles] = angle
-        # Of such a length that actions in [-1, 1] reach every axis.
-        value[..., self._axes] = axis * _SIGNS * (1 - AXIS_OFFSET)
-        return super().action(value)
-
-
-def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Lengths of vectors (..., 3); in every row the same whatever the number of rows."""
-    square = vectors * vectors
-    return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])
 
 
 def _prepare(

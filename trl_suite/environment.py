@@ -75,7 +75,6 @@ class Environment(composer.Environment):
         # The constructor has compiled already; composer would do it again at the first reset.
         self._mjcf_never_compiled = False
         self._parts = tuple(task.blocks.items())
-        self._size = len(task.action_map)
         # Whether anything but the task has hooks around a step; asking them each time takes longer.
         self._hooked = bool(
             self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
@@ -126,7 +125,7 @@ class Environment(composer.Environment):
           RuntimeError: after `close`.
         """
         self._check_open()
-        action = self._checked(action)
+        action = self._task.action_map.checked(action)
         if self._reset_next_step:
             return self.reset()
         task, physics = self._task, self._physics_proxy
@@ -163,21 +162,6 @@ class Environment(composer.Environment):
         if self._physics is None:
             raise RuntimeError('the environment is closed')
 
-    def _checked(self, action: np.ndarray) -> np.ndarray:
-        try:
-            action = np.asarray(action, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'action is not an array of numbers: {error}') from None
-        if action.shape != (self._size,):
-            raise ValueError(f'action has shape {action.shape}; expected ({self._size},)')
-        if not np.vdot(action, action) < np.inf:  # the quick test; huge numbers pass the next
-            if np.isfinite(action).all():
-                return action
-            i = int(np.flatnonzero(~np.isfinite(action))[0])
-            name = self._task.action_map.names[i]
-            raise ValueError(f'action[{i}] ({name}) is {action[i]}; expected finite numbers')
-        return action
-
     def _observe(self) -> dict[str, np.ndarray]:
         row = self._task.observation[0].copy()
         if self._flat_observation:
@@ -213,7 +197,7 @@ class Environment(composer.Environment):
 
     @property
     def action_map(self) -> Any:
-        """The map from actions to physical units (`trl_suite.actuation.ActionMap`)."""
+        """The map from actions to physical units (`trl_suite.action_map.ActionMap`)."""
         return self._task.action_map
 
     @property

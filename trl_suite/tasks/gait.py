@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from trl_suite import actuation, controllers, errors
-from trl_suite.actuation import ActionMap
+from trl_suite.action_map import ActionMap
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, dynamics

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite import errors
-from trl_suite.actuation import ActionMap
+from trl_suite.action_map import ActionMap
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import llc

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from trl_suite.actuation import ActionMap, AngleAxisMap
+from trl_suite.action_map import ActionMap, AngleAxisMap
 from trl_suite.characters import Character
 from trl_suite.symmetry import blocks, exchanged
 from trl_suite.terrain.surroundings import SAMPLES

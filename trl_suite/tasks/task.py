@@ -13,7 +13,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from trl_suite.actuation import ActionMap
+from trl_suite.action_map import ActionMap
 from trl_suite.world import PhysicsWorld, World
 
 _ONLY_ROW = np.zeros(1, int)
