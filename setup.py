@@ -34,6 +34,7 @@ setup(
         'mujoco>=3.17,<4',
         'dm-control>=1.0.50',
         'dm-env',
+        'numba>=0.61',
         'numpy>=2.0',
         'lxml',
         'packaging',

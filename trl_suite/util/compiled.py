@@ -1,0 +1,192 @@
+"""Functions of one simulation that Numba compiles, and the folder where the machine code is kept.
+
+    @compiled
+    def fallen(i, contacts):
+        for k in range(contacts.shape[1]):
+            if contacts[i, k] > 0:
+                return True
+        return False
+
+A compiled function takes numbers, arrays and (named) tuples of them. It may call other compiled
+functions and `math`, allocates nothing in a loop, and never raises: a division by zero gives infinity
+or NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
+
+Numba is imported and the function is compiled when it is first called; the result is kept on disk.
+The folder is `$NUMBA_CACHE_DIR`, or else the user's cache folder, and in it one folder for each state
+of the package's sources, since Numba does not notice that a function called from another module has
+changed. Where no folder can be written, functions are compiled by every process anew. With
+`NUMBA_DISABLE_JIT=1` the same lines run as Python, for debugging.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import pathlib
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+PATIENCE = 2.0  # s; compiling that takes longer is announced on a terminal
+UNUSED = 30 * 86400.0  # s; folders of other sources that nobody used for so long are removed
+_PREFIX = 'trl_suite-'
+_MARK = b'@compiled'
+
+
+class Compiled:
+    """A function that is compiled when it is first called.
+
+    Attributes:
+      function: the Python function.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], native: Callable[[], Callable[..., Any]] | None = None
+    ) -> None:
+        """Wraps a function.
+
+        Args:
+          function: what runs if compiling is switched off, and what is compiled otherwise.
+          native: returns what is compiled in its place: for what only Numba can express.
+        """
+        functools.update_wrapper(self, function)
+        self.function, self._native = function, native
+        self._lock = threading.Lock()
+        self._dispatcher: Callable[..., Any] | None = None
+
+    @property
+    def dispatcher(self) -> Callable[..., Any]:
+        """What Numba made of the function; the function itself if compiling is switched off."""
+        if self._dispatcher is None:
+            with self._lock:
+                if self._dispatcher is None:
+                    self._dispatcher = self._compile()
+        return self._dispatcher
+
+    def _compile(self) -> Callable[..., Any]:
+        numba = _numba()
+        if numba.config.DISABLE_JIT:
+            return self.function
+        options = {'nogil': True, 'error_model': 'numpy'}
+        if self._native is not None:  # a line or two; what calls it is kept on disk
+            return numba.njit(self._native(), **options)
+        folder = cache_folder()
+        if folder is None:
+            return numba.njit(self.function, **options)
+        # Numba looks at its setting when a function is decorated; it is the user's otherwise.
+        with _setting:
+            before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+            try:
+                return numba.njit(self.function, cache=True, **options)
+            finally:
+                numba.config.CACHE_DIR = before
+
+    def __call__(self, *args: Any) -> Any:
+        return self.dispatcher(*args)
+
+
+def compiled(function: Callable[..., Any]) -> Compiled:
+    """Decorates a function of one simulation, or a loop over simulations."""
+    return Compiled(function)
+
+
+_setting = threading.Lock()
+
+
+@functools.cache
+def _numba() -> Any:
+    """Numba, which is told how to treat `Compiled` objects that compiled functions refer to."""
+    import numba
+    from numba.extending import typeof_impl
+
+    @typeof_impl.register(Compiled)
+    def type_of(value: Compiled, _: Any) -> Any:
+        return numba.types.Dispatcher(value.dispatcher)
+
+    return numba
+
+
+@functools.cache
+def cache_folder() -> pathlib.Path | None:
+    """Returns the folder of the machine code of these sources, made if need be; None if it cannot be.
+
+    A warning is issued once if there is none.
+    """
+    for base in (os.environ.get('NUMBA_CACHE_DIR'), _user_cache()):
+        if not base:
+            continue
+        folder = pathlib.Path(base) / f'{_PREFIX}{fingerprint()}'
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            continue
+        os.utime(folder)
+        _forget(folder)
+        return folder
+    warnings.warn(
+        'no folder for compiled code can be written, so every process compiles anew; set '
+        'NUMBA_CACHE_DIR to one that can',
+        stacklevel=2,
+    )
+    return None
+
+
+def _user_cache() -> str:
+    if sys.platform == 'win32':
+        return os.environ.get('LOCALAPPDATA', '')
+    if sys.platform == 'darwin':
+        return os.path.expanduser('~/Library/Caches')
+    return os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+
+
+@functools.cache
+def fingerprint() -> str:
+    """Returns a name for the state of all sources that hold compiled functions."""
+    digest = hashlib.sha256()
+    for path in sorted(pathlib.Path(__file__).parents[1].rglob('*.py')):
+        source = path.read_bytes()
+        if _MARK in source:
+            digest.update(path.name.encode() + b'\0' + source)
+    return digest.hexdigest()[:16]
+
+
+def _forget(folder: pathlib.Path) -> None:
+    """Removes the folders of other sources that were not used for long."""
+    for path in folder.parent.glob(f'{_PREFIX}*'):
+        try:
+            unused = path.stat().st_mtime < time.time() - UNUSED
+        except OSError:  # another process was faster
+            continue
+        if unused:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@contextmanager
+def announcing(what: str) -> Iterator[None]:
+    """Says on a terminal that something is being compiled, if it takes longer than `PATIENCE`."""
+
+    def announce() -> None:
+        print(f'trl_suite: compiling {what}, once for this machine ...', file=sys.stderr, flush=True)
+
+    if not sys.stderr.isatty():
+        yield
+        return
+    timer = threading.Timer(PATIENCE, announce)
+    timer.daemon = True
+    begun = time.monotonic()
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        if time.monotonic() - begun > PATIENCE:
+            print(f'trl_suite: compiled in {time.monotonic() - begun:.0f} s', file=sys.stderr)
