@@ -9,7 +9,7 @@ from dm_control import composer, mjcf
 
 from trl_suite import terrain
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
-from trl_suite.world import BatchWorld, PhysicsWorld, light_model
+from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
 TIMESTEP = 1 / 300  # s
 SUBSTEPS = 10

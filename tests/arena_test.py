@@ -7,7 +7,7 @@ from dm_control import mjcf
 
 from trl_suite import catalogue, suite, terrain
 from trl_suite.arenas import PlanarTerrain, boxes
-from trl_suite.world import PhysicsWorld
+from trl_suite.engine import PhysicsWorld
 
 TIMESTEP = 1 / 300  # s
 GRAVITY = 9.8  # m/s^2; the original's

@@ -9,7 +9,7 @@ from dm_control.locomotion.arenas import floors
 from trl_suite import actuation, characters, controllers, terrain
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.controllers import dynamics, parameters
-from trl_suite.world import BatchWorld, PhysicsWorld, light_model
+from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
 DT = 1 / 600
 NAMES = ('dog', 'goat', 'raptor', 'biped2d_simbicon', 'hopper')

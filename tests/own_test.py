@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from absl.testing import absltest, parameterized
 
-from trl_suite import characters, cli, gym, motion, suite, terrain, world
+from trl_suite import characters, cli, engine, gym, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk import Walk
@@ -325,7 +325,7 @@ class TerrainTest(Folder):
         ball.add('geom', size=(0.1,), condim=6, friction=(1, 0.01, 0.005))
         root = arena.mjcf_model
         physics = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
-        batch = world.BatchWorld(physics, 1, 1)
+        batch = engine.BatchWorld(physics, 1, 1)
         arena.bind(batch)
         arena.begin_episode(0, (terrain.Ground if ground.spatial else terrain.Strip)(ground, 0))
         batch.step(5000)

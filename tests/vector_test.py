@@ -52,17 +52,17 @@ class IdentityTest(parameterized.TestCase):
         rows.reset()
         rows.step(np.ones((4, len(rows.action_map))))
         world, which, found = rows.task.world, np.array([1, 3]), []
-        used = world.batch.state.copy()
-        for reset in (
-            world.reset,
-            lambda r: world.batch.reset(r, stage=mujoco.mjtStage.mjSTAGE_NONE),
-        ):
-            world.batch.state[...], world.batch.warning[...] = used, 5
-            reset(which)
-            found.append((world.batch.state.copy(), world.batch.warning.copy()))
-        for ours, engines in zip(*found, strict=True):
-            np.testing.assert_array_equal(ours, engines)
-            self.assertTrue((ours[which] != ours[[0, 2]]).any())
+        for row in which:
+            world.set_state(row, np.ones_like(world.get_state(row)))
+        world.reset(which)
+        fresh = mujoco.MjData(world.models[0])
+        initial = np.empty(len(world.get_state(0)))
+        mujoco.mj_getState(world.models[0], fresh, initial, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for row in range(4):
+            found.append((world.get_state(row) == initial).all())
+        self.assertEqual(found, [False, True, False, True])
+        np.testing.assert_array_equal(world.qpos[which], [fresh.qpos] * 2)
+        self.assertFalse(world.diverged()[which].any())
 
     def test_the_number_of_rows_does_not_matter(self):
         few = VectorEnvironment(GAPS, 2, 1, seed=[7, 8])

@@ -133,25 +133,22 @@ class Environment(composer.Environment):
             self._observation_updater.prepare_for_next_control_step()
         if self._hooked:
             self._hooks.before_step(physics, action, self._random_state)
-        else:
-            task.before_step(physics, action, self._random_state)
-        task.simulate()
-        if self._hooked:
+            task.simulate(task.world.all_ids)
             self._hooks.after_step(physics, self._random_state)
         else:
-            task.after_step(physics, self._random_state)
+            task.step(action[None], task.world.all_ids)
         self._steps += 1
         if self._extra_observables:
             self._observation_updater.update()
         observation = self._observe()
-        reward = task.get_reward(physics)
+        failed = bool(task.failed[0])
         self._reset_next_step = (
-            task.should_terminate_episode(physics)
+            failed
             or (self._step_limit is not None and self._steps >= self._step_limit)
             or (self._time_limit < np.inf and self._physics.time() >= self._time_limit)
         )
         step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
-        return dm_env.TimeStep(step_type, reward, task.get_discount(physics), observation)
+        return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
 
     def close(self) -> None:
         """Frees the simulation; may be called twice."""
@@ -206,14 +203,14 @@ class Environment(composer.Environment):
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in the last step beyond the time step: see the task's `infos`."""
+        """What happened in the last step beyond the time step: see the task's `info`."""
 
         def only_row(value: Any) -> Any:
             if isinstance(value, dict):
                 return {name: only_row(part) for name, part in value.items()}
             return value[0].item()
 
-        return only_row(self._task.infos())
+        return only_row(self._task.info())
 
     # State.
 

@@ -10,9 +10,7 @@ whatever the number of rows and threads, and whenever rows are reset.
 
 from __future__ import annotations
 
-import ctypes
 import os
-import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,24 +19,11 @@ from numpy.typing import DTypeLike
 
 from trl_suite import errors, suite
 from trl_suite.catalogue import Row
+from trl_suite.engine import BatchWorld, light_model
 from trl_suite.environment import Environment
 from trl_suite.tasks.task import Task
-from trl_suite.world import BatchWorld, light_model
 
 AUTORESET = ('next_step', 'same_step', 'disabled')
-
-_worlds: weakref.WeakSet[BatchWorld] = weakref.WeakSet()  # that live in this process
-
-
-def _keep_worlds() -> None:
-    # Freeing a batch waits for its threads, of which a forked child has none: it would wait for
-    # ever. One reference too many, so that nothing frees it, not even the interpreter's end.
-    for world in _worlds:
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(world))
-
-
-if hasattr(os, 'register_at_fork'):
-    os.register_at_fork(after_in_child=_keep_worlds)
 
 
 class Step(NamedTuple):
@@ -138,11 +123,7 @@ class VectorEnvironment:
         self._world: BatchWorld | None = BatchWorld(
             model, self.num_envs, self._num_threads, self._task.fields
         )
-        _worlds.add(self._world)
         self._task.bind(self._world)
-        # Simulated time of each row; a field that is bound is copied out in every step.
-        limited = self.time_limit < np.inf
-        self._time: np.ndarray | None = self._world.batch.bind('time') if limited else None
         self._pid = os.getpid()
         self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
         self.control_timestep: float = self._task.control_timestep
@@ -200,7 +181,6 @@ class VectorEnvironment:
             self.seed(seed, numbers)
         self._fresh = False
         self._begin(numbers)
-        self._task.observe()
         return self._observation()
 
     def step(self, action: np.ndarray, rows: np.ndarray | Sequence[int] | None = None) -> Step:
@@ -220,51 +200,46 @@ class VectorEnvironment:
         if self._fresh:
             raise RuntimeError('step before the first reset')
         action = self.action_map.checked(action, self.num_envs)
-        task, ended, stepped = self._task, self._ended, None
-        resting: Any = False  # rows that do not move
-        if rows is not None:
-            resting = np.ones(self.num_envs, bool)
-            resting[self._numbers(rows)] = False
-            stepped = ~resting
-        resetting = (ended > resting).nonzero()[0]
+        task, world, ended = self._task, self._world, self._ended
+        assert world is not None
+        asked = world.all_ids if rows is None else self._numbers(rows)
+        env_ids = asked
+        resetting = asked[ended[asked]]
         if len(resetting):
             if self.autoreset == 'disabled':
                 raise RuntimeError(
                     f'row {resetting[0]} has ended; reset it, or choose another autoreset'
                 )
-            stepped = ~(ended | resting)
+            env_ids = asked[~ended[asked]]
             self._begin(resetting)
-        task.act(action)
-        task.simulate(None if stepped is None else stepped.nonzero()[0])
-        self._steps += 1 if stepped is None else stepped
-        task.finish_step(stepped)
-        if stepped is not None:
-            task.reward[~stepped] = 0.0
-            task.failed[~stepped] = task.diverged[~stepped] = False
-        terminated = task.failed.copy()
-        limit = np.inf if self.step_limit is None else self.step_limit
-        over = self._steps >= limit
-        if self._time is not None:
-            over |= self._time >= self.time_limit
-        truncated = over > terminated
-        if rows is not None:
-            terminated &= ~resting
-            truncated &= ~resting
-        self._ended = np.where(resting, ended, over | terminated)
-        reward, info = task.reward.astype(self.dtype), task.infos()
+        task.step(action, env_ids)
+        self._steps[env_ids] += 1
+        reward, terminated = task.reward.copy(), task.failed.copy()
+        if len(env_ids) < self.num_envs:
+            resting = np.ones(self.num_envs, bool)
+            resting[env_ids] = False
+            reward[resting], terminated[resting] = 0.0, False
+        truncated = np.zeros(self.num_envs, bool)
+        if self.step_limit is not None:
+            truncated[asked] = self._steps[asked] >= self.step_limit
+        if self.time_limit < np.inf:
+            truncated[asked] |= world.time[asked] >= self.time_limit
+        truncated &= ~terminated
+        ended[asked] = terminated[asked] | truncated[asked]
+        info = task.info()
         if self.autoreset == 'same_step':
-            info['ended'] = self._ended.copy()
-            if self._ended.any():
+            info['ended'] = ended.copy()
+            if ended.any():
                 info['final_observation'] = self._observation()
-                self._begin(np.flatnonzero(self._ended))
-                task.observe()
+                self._begin(ended.nonzero()[0])
+        reward = reward.astype(self.dtype, copy=False)
         return Step(self._observation(), reward, terminated, truncated, info)
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in each row's last step, or its reset: see the task's `infos`."""
+        """What happened in each row's last step, or its reset: see the task's `info`."""
         self._check_usable()
-        return self._task.infos()
+        return self._task.info()
 
     def render(self, row: int = 0, **options: Any) -> np.ndarray:
         """Draws one row; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
@@ -287,8 +262,10 @@ class VectorEnvironment:
 
     def close(self) -> None:
         """Frees the simulations; may be called twice."""
+        if self._world is not None and os.getpid() == self._pid:
+            self._world.close()
         self._world = None
-        self._task = self._time = None  # type: ignore[assignment]
+        self._task = None  # type: ignore[assignment]
         if self._picture is not None:
             self._picture.close()
             self._picture = None
@@ -360,7 +337,9 @@ class VectorEnvironment:
         )
 
     def _begin(self, rows: np.ndarray) -> None:
-        self._task.begin_episodes(rows, [self._random[row] for row in rows.tolist()])
+        if not len(rows):
+            return
+        self._task.reset(rows, [self._random[row] for row in rows.tolist()])
         self._steps[rows] = 0
         self._ended[rows] = False
 

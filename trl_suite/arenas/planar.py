@@ -9,8 +9,8 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import boxes, stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.engine import World
 from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain
-from trl_suite.world import World
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew

@@ -12,10 +12,10 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.engine import World
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
 from trl_suite.terrain.ground import Random
 from trl_suite.terrain.surroundings import ALL, HALF, VERTICES, Rows
-from trl_suite.world import World
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
 BASE = 1.0  # m; of height fields, below their lowest point

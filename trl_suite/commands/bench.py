@@ -108,12 +108,12 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
     world: Any = others._world
     physics, begin = counted(environments), Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
-    substeps, controls = control_substeps(others), world.batch.bind('ctrl')
+    substeps, controls = control_substeps(others), world.ctrl
     directly = acts_directly(others, world.models[0])  # else raw bodies are limp
 
     def step() -> None:
         controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
-        world.batch.step(nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        world.share(lambda part: world.step(substeps, part), world.all_ids)
 
     control = Stopwatch(lambda: environments.step(next(drawn)), lambda: rows)
     batch = Stopwatch(step, lambda: rows * substeps)

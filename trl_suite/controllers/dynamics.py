@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from trl_suite.characters import Character
-from trl_suite.world import World
+from trl_suite.engine import World
 
 # What a world must bind beyond the fields that every task reads.
 FIELDS = ('M', 'qfrc_bias', 'xanchor', 'subtree_com', 'xipos', 'site_xpos')

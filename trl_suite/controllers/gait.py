@@ -26,7 +26,7 @@ from trl_suite.characters import Character
 from trl_suite.controllers import parameters
 from trl_suite.controllers.dynamics import PlanarDynamics
 from trl_suite.controllers.parameters import Parameters
-from trl_suite.world import World
+from trl_suite.engine import World
 
 CONTROL_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate and fall below 300 Hz
 

@@ -14,7 +14,7 @@ from trl_suite import errors
 from trl_suite.characters import Character
 from trl_suite.controllers.gait import Gait
 from trl_suite.controllers.parameters import Parameters
-from trl_suite.world import World
+from trl_suite.engine import World
 
 GRAVITY = 9.8  # m/s^2
 REGULARISATION = 1e-4  # of the contact forces that carry the weight

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
+from trl_suite.engine import World
 from trl_suite.tasks.figure3d import polar, turn
 from trl_suite.tasks.task import drawn_way
 from trl_suite.terrain import PRESETS3D
-from trl_suite.world import World
 
 LEVEL = ('plane', 'var3d_flat')  # types of ground on which a ball may lie
 RADIUS, MASS = 0.2, 0.1  # m, kg

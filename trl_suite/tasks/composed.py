@@ -17,11 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from dm_control import composer
+from dm_control import composer, mjcf
 
 from trl_suite import errors
-from trl_suite.tasks.task import Task, consecutive
-from trl_suite.world import World
+from trl_suite.engine import World
+from trl_suite.tasks.task import Task, consecutive, outcome
 
 Function = Callable[[Any], np.ndarray]
 OPTIONS = ('rewards', 'observations', 'failures')
@@ -105,56 +105,63 @@ class Composed(Task):
     def bind(self, world: World) -> None:
         self.task.bind(world)
         self.world, n = world, world.n
-        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
+        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()))
         self.action = np.zeros((n, len(self.action_map)))
-        self.reward, self._terms = np.zeros(n), np.zeros((len(self._rewards), n))
-        self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
+        self._terms = np.zeros((len(self._rewards), n))
 
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
-        self.task.begin_episodes(rows, random_states)
-        self.action[rows] = self.reward[rows] = 0.0
-        self._terms[:, rows] = 0.0
-        self.failed[rows] = self.diverged[rows] = False
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        self.task.reset(env_ids, random_states)
+        self.action[env_ids] = self.reward[env_ids] = 0.0
+        self._terms[:, env_ids] = 0.0
+        self.failed[env_ids] = self.diverged[env_ids] = False
+        self._write(env_ids)
 
-    def act(self, action: np.ndarray) -> None:
-        np.clip(action, -1.0, 1.0, out=self.action)
-        self.task.act(action)
+    def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
+        self.task.step(action, env_ids)
+        self._finish(env_ids)
 
-    def simulate(self, rows: np.ndarray | None = None) -> None:
-        self.task.simulate(rows)
+    # Of a plain composer.Environment, which calls these one by one.
 
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
+        self.task.apply_action(action, env_ids)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        self.task.finish_step(env_ids)
+        self._finish(env_ids)
+
+    def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        self.task.after_step(physics, random_state)
+        self._finish(self.world.all_ids)
+
+    def _finish(self, env_ids: np.ndarray) -> None:
+        """Adds the terms and failures of the user's to what the other task found."""
         inner = self.task
-        inner.finish_step(stepped)
-        if stepped is not None:
-            begun = ~stepped
-            self.action[begun] = inner.reward[begun] = 0.0
-            inner.failed[begun] = inner.diverged[begun] = False
-        self.diverged[:] = inner.diverged
-        self._write()
-        self.reward[:], self.failed[:] = inner.reward, inner.failed
-        counted = ~inner.failed if stepped is None else stepped & ~inner.failed
+        self.diverged[env_ids] = inner.diverged[env_ids]
+        self._write(env_ids)
+        self.reward[env_ids] = inner.reward[env_ids]
+        failed = inner.failed[env_ids]
         for term, (name, (weight, function)) in zip(
             self._terms, self._rewards.items(), strict=True
         ):
-            term[:] = np.where(counted, weight * self._ask('reward', name, function, 1)[:, 0], 0.0)
-            self.reward += term
+            value = self._ask('reward', name, function, 1)[env_ids, 0]
+            term[env_ids] = np.where(failed, 0.0, weight * value)
+            self.reward[env_ids] += term[env_ids]
         for name, function in self._failures.items():
-            failing = self._ask('failure', name, function, 1)[:, 0] != 0
-            self.failed |= failing if stepped is None else failing & stepped
+            failed = failed | (self._ask('failure', name, function, 1)[env_ids, 0] != 0)
+        self.failed[env_ids] = failed
 
-    def observe(self) -> None:
-        self.task.observe()
-        self._write()
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        self.task.observe(env_ids)
+        self._write(self.world.all_ids if env_ids is None else env_ids)
 
-    def _write(self) -> None:
-        self.observation[:, : self._own] = self.task.observation
-        usable = ~self.diverged[:, None]
+    def _write(self, env_ids: np.ndarray) -> None:
+        self.observation[env_ids, : self._own] = self.task.observation[env_ids]
+        usable = env_ids[~self.diverged[env_ids]]
         for name, (size, function) in self._extras.items():
             value = self._ask('observation', name, function, size)
-            np.copyto(self.observation[:, self.blocks[name]], value, where=usable)
+            self.observation[usable, self.blocks[name]] = value[usable]
 
     def _ask(self, kind: str, name: str, function: Function, size: int) -> np.ndarray:
         """Returns what a user's function says, (n, size), finite but where the physics broke down."""
@@ -173,28 +180,24 @@ class Composed(Task):
             value = np.where(finite[:, None], value, 0.0)
         return value
 
-    def infos(self) -> dict[str, Any]:
+    def info(self) -> dict[str, Any]:
         """As of the other task; the terms are of both."""
-        found = self.task.infos()
+        found = self.task.info()
         terms = {name: term.copy() for name, term in zip(self._rewards, self._terms, strict=True)}
         return {**found, 'reward_terms': {**found.get('reward_terms', {}), **terms}}
 
-    def get_state(self, row: int) -> dict[str, Any]:
+    def get_state(self, env_id: int) -> dict[str, Any]:
+        arrays = [self.action, self._terms.T, *self.outcome]
         return {
-            'task': self.task.get_state(row),
-            'observation': self.observation[row].copy(),
-            'action': self.action[row].copy(),
-            'reward': float(self.reward[row]),
-            'terms': self._terms[:, row].copy(),
-            'failed': bool(self.failed[row]),
-            'diverged': bool(self.diverged[row]),
+            'task': self.task.get_state(env_id),
+            'arrays': [array[env_id].copy() for array in arrays],
         }
 
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        self.task.set_state(row, state['task'])
-        self.observation[row], self.action[row] = state['observation'], state['action']
-        self.reward[row], self._terms[:, row] = state['reward'], state['terms']
-        self.failed[row], self.diverged[row] = state['failed'], state['diverged']
+    def set_state(self, env_id: int, state: dict[str, Any]) -> None:
+        self.task.set_state(env_id, state['task'])
+        arrays = [self.action, self._terms.T, *self.outcome]
+        for array, value in zip(arrays, state['arrays'], strict=True):
+            array[env_id] = value
 
 
 def compose(task: Task, parts: Mapping[str, Any]) -> Task:

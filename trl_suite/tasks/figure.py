@@ -8,7 +8,7 @@ import numpy as np
 
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
-from trl_suite.world import World
+from trl_suite.engine import World
 
 CLEARANCE = 0.001  # m; left under every link at the start
 _UPRIGHT = np.pi / 2  # rad; beyond it a trunk may point backwards

@@ -14,6 +14,7 @@ import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
+from trl_suite.engine import World
 from trl_suite.motion import Steps, quaternion, step_features
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import turn
@@ -27,7 +28,6 @@ from trl_suite.tasks.reference3d import SpatialReference
 from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
-from trl_suite.world import World
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
 SIDE = np.array([-1.0, 1.0])  # of each foot: to the right, to the left

@@ -14,13 +14,13 @@ import numpy as np
 
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character, CharacterRow
+from trl_suite.engine import World
 from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
 from trl_suite.tasks.footsteps import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
 from trl_suite.tasks.imitation import SUBSTEPS, Imitation
 from trl_suite.tasks.plans import StraightPlans, options
 from trl_suite.tasks.task import Marker, drawn_seed
-from trl_suite.world import World
 
 _DIGITS = 9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
 _END_EFFECTOR = list(rewards.STEP_TERMS).index('end_effector')
@@ -196,7 +196,7 @@ class PlanarFootsteps(Imitation):
         if facing is not None:
             self.reward_terms[:, -1] *= facing[:, 0] > 0
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         super().observe()
         self.observation[:, self.blocks['contact']] = self.figure.contacts()
         feet = np.stack([1 - self.stance, self.stance], axis=1)  # which of them lands where

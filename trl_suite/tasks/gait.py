@@ -19,11 +19,12 @@ from trl_suite.action_map import ActionMap
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, dynamics
+from trl_suite.engine import World
+from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.reference import link_extents
-from trl_suite.tasks.task import Task, check_simulated, consecutive, drawn_seed
+from trl_suite.tasks.task import check_simulated, consecutive, drawn_seed
 from trl_suite.terrain import Strip
-from trl_suite.world import World
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m
 SUBSTEPS = 2  # physics steps per control step: 1/1200 s
@@ -51,7 +52,7 @@ _SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
 
 
-class GaitTask(Task):
+class GaitTask(BatchTask):
     """Travel at the target speed by setting a gait's parameters.
 
     Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
@@ -334,7 +335,7 @@ class GaitTask(Task):
         terms[self.failed] = 0.0
         self.reward[...] = terms.sum(1)
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         self.figure.measure(self._view)
         measured = self._measured
         measured[:, -2] = self.world.qpos[:, self.figure.pose_qpos[2]]

@@ -17,6 +17,7 @@ from trl_suite.action_map import ActionMap
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import llc
+from trl_suite.engine import World
 from trl_suite.motion import Steps, quaternion
 from trl_suite.symmetry import Mirror
 from trl_suite.tasks import reflection3d, rewards
@@ -35,7 +36,6 @@ from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
 from trl_suite.terrain import Ground
 from trl_suite.terrain.surroundings import SAMPLES
-from trl_suite.world import World
 
 INTERFACES = ('plan', 'frame')
 SIGHTS = ('height', 'velocity')
@@ -383,7 +383,7 @@ class HighLevel(Footsteps):
         if reached or self._count[row] >= self._due[row]:
             self._draw_goal(row, place)
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._write(self.figure.measure())
 
     def _write(self, found: SimpleNamespace) -> None:

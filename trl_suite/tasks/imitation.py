@@ -17,19 +17,19 @@ from trl_suite import actuation, errors, hill
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.characters.muscles import PLAIN, Muscle
+from trl_suite.engine import World
 from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
+from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.reference import Reference
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
-    Task,
     consecutive,
     drawn_seed,
     start_phases,
 )
 from trl_suite.terrain import Strip
-from trl_suite.world import World
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
@@ -39,7 +39,7 @@ PHASE_BINS = 4
 CENTRES = ('clip', 'posture', 'original')  # of position control
 
 
-class Imitation(Task):
+class Imitation(BatchTask):
     """A planar character tracks a looping clip over random terrain.
 
     Observation blocks, in this order (N links, J joints; heading frame: x is mirrored while the
@@ -274,7 +274,7 @@ class Imitation(Task):
     def _step(self) -> None:
         """What a subclass changes between the physics and the observation."""
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         v = self._all
         self.figure.measure(v)
         # What the reward compares, side by side with the same features of the reference.

@@ -12,6 +12,7 @@ import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
+from trl_suite.engine import World
 from trl_suite.motion import Clip, quaternion
 from trl_suite.tasks import rewards
 from trl_suite.tasks.figure3d import polar
@@ -20,7 +21,6 @@ from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import drawn_seed
 from trl_suite.tasks.tracking3d import SUBSTEPS, Tracking
 from trl_suite.terrain import Ground
-from trl_suite.world import World
 
 GOAL_AHEAD = 3.0  # m along x; where the goal on the line through the start lies
 CYCLE_SAMPLES = 256  # poses whose mean is the middle of position control

@@ -16,6 +16,7 @@ import numpy as np
 from trl_suite import errors
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
+from trl_suite.engine import World
 from trl_suite.motion import Clip, Steps, quaternion
 from trl_suite.tasks import ball, rewards
 from trl_suite.tasks.figure3d import polar
@@ -26,7 +27,6 @@ from trl_suite.tasks.reflection3d import Reflection
 from trl_suite.tasks.task import Marker, consecutive
 from trl_suite.tasks.trace import Trace
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
-from trl_suite.world import World
 
 REWARDS = ('goal', 'original')
 GOAL_REACHED = 0.5  # m; of the root, on the ground

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
+from trl_suite.engine import World
 from trl_suite.tasks import ball
 from trl_suite.tasks.figure3d import polar
 from trl_suite.tasks.footsteps import GOAL_COLOUR
 from trl_suite.tasks.high_level import HighLevel
 from trl_suite.tasks.task import Marker
 from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP
-from trl_suite.world import World
 
 
 class Soccer(HighLevel):

@@ -1,4 +1,4 @@
-"""The base of all tasks: rules over a batch axis, worn as a composer task."""
+"""The base of all tasks: rules for n simulations at once, as a composer task."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from trl_suite.action_map import ActionMap
-from trl_suite.world import PhysicsWorld, World
+from trl_suite.engine import PhysicsWorld, World
+from trl_suite.util.compiled import compiled
 
-_ONLY_ROW = np.zeros(1, int)
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
 
@@ -39,31 +39,87 @@ class Marker(NamedTuple):
     yaw: float = 0.0
 
 
-class Task(composer.Task):
-    """Rules of an environment, written once over a leading axis of n simulations.
+class Outcome(NamedTuple):
+    """What a step of each simulation came to; rows of simulations.
 
-    A subclass owns arrays of n rows. It is driven by four methods: `bind` (a compiled world),
-    `begin_episodes` (some rows), `act` (all rows, before the physics) and `finish_step` (all rows,
-    after it). The composer hooks below are the case n = 1, so that a plain `composer.Environment`
-    runs the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
+    Attributes:
+      observation: all observation blocks side by side, (n, observation size).
+      reward: (n,).
+      reward_terms: its parts, weighted, (n, terms); 0 after a reset.
+      failed: whether the episode has ended with discount 0, (n,) bool.
+      diverged: whether that was since the physics broke down, (n,) bool.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    reward_terms: np.ndarray
+    failed: np.ndarray
+    diverged: np.ndarray
+
+
+def outcome(n: int, size: int, terms: int = 0) -> Outcome:
+    """Makes room for n simulations, an observation of some size, and some reward terms."""
+    return Outcome(
+        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), np.zeros(n, bool), np.zeros(n, bool)
+    )
+
+
+@compiled
+def begin(i: int, outcome: Outcome) -> None:
+    """Clears what the last episode of a simulation came to, but for its observation."""
+    outcome.reward[i] = 0.0
+    outcome.failed[i] = outcome.diverged[i] = False
+    for k in range(outcome.reward_terms.shape[1]):
+        outcome.reward_terms[i, k] = 0.0
+
+
+@compiled
+def conclude(i: int, failed: bool, outcome: Outcome) -> None:
+    """Sums the reward terms up, or drops them where the episode has failed."""
+    outcome.failed[i] = failed
+    reward = 0.0
+    for k in range(outcome.reward_terms.shape[1]):
+        if failed:
+            outcome.reward_terms[i, k] = 0.0
+        reward += outcome.reward_terms[i, k]
+    outcome.reward[i] = reward
+
+
+@compiled
+def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
+    """Whether any of some velocities is beyond a limit, or no number."""
+    for k in dofs:
+        if not abs(qvel[i, k]) <= limit:
+            return True
+    return False
+
+
+class Task(composer.Task):
+    """Rules of an environment for n simulations at once.
+
+    The rules of a family are compiled functions of one simulation `i` (see
+    `trl_suite.util.compiled`); its task holds the arrays that they work on and calls loops over
+    simulations. A task of the user's may do the same with plain NumPy.
+
+    An environment calls `bind` once, `reset` for simulations that begin an episode, and `step` for
+    those that take a step. A step is `apply_action`, `simulate` and `finish_step`, which the threads
+    call for parts of the simulations: each must touch the simulations that it is given, and no
+    others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
+    the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
 
     Attributes:
       world: the simulations, after compiling.
       action_map: what an action means.
-      observation: all observation blocks side by side, shape (n, observation size).
-      blocks: name -> slice of `observation`, in order, terrain first.
-      reward: shape (n,).
-      failed: rows whose episode has ended with discount 0, shape (n,) bool.
-      diverged: the failed rows whose physics broke down, shape (n,) bool.
+      blocks: name -> slice of the observation, in order, terrain first.
+      outcome: observation, reward and failure of each simulation.
+      saved: tuples of arrays with n rows that make up the state of the task, `outcome` among them.
     """
 
     world: World
     action_map: ActionMap
-    observation: np.ndarray
     blocks: dict[str, slice]
-    reward: np.ndarray
-    failed: np.ndarray
-    diverged: np.ndarray
+    outcome: Outcome
+    saved: tuple[NamedTuple, ...]
     fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
     _begun = False  # whether no step was taken since composer's reset
 
@@ -74,50 +130,89 @@ class Task(composer.Task):
         """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
 
     @abc.abstractmethod
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
-        """Draws terrain and start of some rows, each from its stream; `observe` is yet to follow."""
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        """Draws terrain and start of some simulations, each from its stream, and observes them."""
 
     @abc.abstractmethod
-    def observe(self) -> None:
-        """Writes the observations of all rows from the world's state."""
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        """Takes the actions of some simulations, among those of all, shape (n, k), in [-1, 1]."""
 
     @abc.abstractmethod
-    def act(self, action: np.ndarray) -> None:
-        """Takes actions, shape (n, k), in [-1, 1]."""
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        """Updates the outcome of some simulations after the physics has advanced."""
 
     @abc.abstractmethod
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        """Updates reward, failed and observation after the physics has advanced.
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        """Writes the observations of some simulations, or of all, from the state of the world."""
+
+    @abc.abstractmethod
+    def info(self) -> dict[str, Any]:
+        """Returns what happened beyond observation and reward: arrays of n rows, or dicts of such."""
+
+    # The step and the state, for all families.
+
+    def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        """Advances some simulations by one step.
 
         Args:
-          stepped: which rows took a step, (n,) bool; the others have just begun an episode. None if
-            all did.
+          action: of all simulations, (n, k), in [-1, 1]; those of the others do not count.
+          env_ids: sorted numbers of the simulations that take a step.
         """
 
-    @abc.abstractmethod
-    def infos(self) -> dict[str, Any]:
-        """What happened beyond observation and reward: arrays of n rows, or dicts of such."""
+        def advance(part: np.ndarray) -> None:
+            self.apply_action(action, part)
+            self.simulate(part)
+            self.finish_step(part)
 
-    @abc.abstractmethod
-    def get_state(self, row: int) -> dict[str, Any]:
-        """Everything about one row that the world's state does not hold."""
+        self.world.share(advance, env_ids)
 
-    @abc.abstractmethod
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Advances the physics of some simulations by one control step."""
+        self.world.step(self._substeps, env_ids)
+
+    def get_state(self, env_id: int) -> dict[str, Any]:
+        """Returns everything about one simulation that the world's state does not hold."""
+        arrays = [[array[env_id].copy() for array in group] for group in self.saved]
+        return {'arena': self.arena.state(env_id), 'arrays': arrays}  # type: ignore[attr-defined]
+
+    def set_state(self, env_id: int, state: dict[str, Any]) -> None:
         """Restores what `get_state` returned; the world's state is set afterwards."""
+        self.arena.restore(env_id, state['arena'])  # type: ignore[attr-defined]
+        for group, values in zip(self.saved, state['arrays'], strict=True):
+            for array, value in zip(group, values, strict=True):
+                array[env_id] = value
+
+    @property
+    def observation(self) -> np.ndarray:
+        """All observation blocks side by side, (n, observation size)."""
+        return self.outcome.observation
+
+    @property
+    def reward(self) -> np.ndarray:
+        """Reward of the last step, (n,)."""
+        return self.outcome.reward
+
+    @property
+    def reward_terms(self) -> np.ndarray:
+        """Its parts, weighted, (n, terms)."""
+        return self.outcome.reward_terms
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Whether the episode has ended with discount 0, (n,) bool."""
+        return self.outcome.failed
+
+    @property
+    def diverged(self) -> np.ndarray:
+        """Whether it has since the physics broke down, (n,) bool."""
+        return self.outcome.diverged
 
     @property
     def signature(self) -> str:
-        """Which task this is, for people and to tell whose a saved state is."""
+        """Which task this is, for people and to recognise the owner of a saved state."""
         blocks = ', '.join(f'{name} {part.stop - part.start}' for name, part in self.blocks.items())
         steps = f'{self._substeps} x {self.physics_timestep:.6g} s'
         return f'{type(self).__name__} by {self.action_map.quantity} ({blocks}; {steps})'
-
-    def simulate(self, rows: np.ndarray | None = None) -> None:
-        """Advances the physics of some rows (sorted numbers), or of all, by one control step."""
-        self.world.step(self._substeps, rows)
 
     # Composer's interface: one simulation.
 
@@ -131,8 +226,7 @@ class Task(composer.Task):
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
     ) -> None:
-        self.begin_episodes(_ONLY_ROW, [random_state])
-        self.observe()
+        self.reset(self.world.all_ids, [random_state])
         self._begun = True
 
     def before_step(
@@ -140,12 +234,12 @@ class Task(composer.Task):
     ) -> None:
         if self._begun:
             # A plain composer.Environment leaves a reset with the actuators' velocities at zero.
-            self.world.forward(_ONLY_ROW)
+            self.world.forward(self.world.all_ids)
             self._begun = False
-        self.act(np.asarray(action, dtype=float)[None])
+        self.apply_action(np.asarray(action, dtype=float)[None], self.world.all_ids)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        self.finish_step()
+        self.finish_step(self.world.all_ids)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         return float(self.reward[0])

@@ -12,20 +12,20 @@ import numpy as np
 from trl_suite import actuation, errors
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
+from trl_suite.engine import World
 from trl_suite.motion import Clip, Steps
 from trl_suite.symmetry import Mirror
 from trl_suite.tasks import reflection3d, rewards
+from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.reference3d import SpatialReference, mean_targets
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
-    Task,
     consecutive,
     drawn_seed,
     start_phases,
 )
 from trl_suite.terrain import Ground
-from trl_suite.world import World
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
@@ -36,7 +36,7 @@ CENTRES = ('clip', 'posture', 'original')  # of position control
 _DIGITS = 9  # of the clock, in cycles
 
 
-class Tracking(Task):
+class Tracking(BatchTask):
     """A spatial character is compared with a reference motion, over a clock that never stops.
 
     A subclass says what the reference is, how an episode starts, and what else is observed and
@@ -290,7 +290,7 @@ class Tracking(Task):
         """Which rows fail by rules of the subclass."""
         return False
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._observe(self.figure.measure())
         self._publish()
 

@@ -12,21 +12,22 @@ import numpy as np
 from trl_suite import actuation
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.characters import Character
+from trl_suite.engine import World
 from trl_suite.tasks import parts
+from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.reference import link_extents
-from trl_suite.tasks.task import MAX_JOINT_SPEED, Task, consecutive, drawn_seed
+from trl_suite.tasks.task import MAX_JOINT_SPEED, consecutive, drawn_seed
 from trl_suite.terrain import Ground, Strip
-from trl_suite.world import World
 
 SAMPLES = 50  # heights on the line that a planar character sees
 FROUDE = 0.25  # speed^2 / (gravity * height of the root) of a full reward
 GRAVITY = 9.8  # m/s^2
 
 
-class Walk(Task):
+class Walk(BatchTask):
     """A character, planar or spatial, stands in its working posture on random terrain.
 
     It fails when a fall link touches the ground. It has no reward of its own: `suite.build` adds
@@ -187,7 +188,7 @@ class Walk(Task):
         self.observation[self.diverged] = kept  # the last finite one stands for what broke down
         np.logical_or(found.fall.any(1), self.diverged, out=self.failed)
 
-    def observe(self) -> None:
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._measure()
 
     def _measure(self) -> SimpleNamespace:

@@ -175,7 +175,9 @@ def announcing(what: str) -> Iterator[None]:
     """Says on a terminal that something is being compiled, if it takes longer than `PATIENCE`."""
 
     def announce() -> None:
-        print(f'trl_suite: compiling {what}, once for this machine ...', file=sys.stderr, flush=True)
+        print(
+            f'trl_suite: compiling {what}, once for this machine ...', file=sys.stderr, flush=True
+        )
 
     if not sys.stderr.isatty():
         yield

@@ -1,0 +1,269 @@
+"""MuJoCo's own functions, called from compiled code by their addresses in the loaded library."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from trl_suite.util.compiled import Compiled, compiled
+
+# Of void f(const mjModel*, mjData*); the order of `Engine.functions`.
+NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData')
+STEP, STEP1, STEP2, FORWARD, RESET = range(len(NAMES))
+_PATTERNS = ('libmujoco.so*', 'libmujoco*.dylib', 'mujoco.dll')
+_TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+# Bad position, velocity and acceleration are neighbours among the warnings.
+_BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+_WARNING_STRIDE = 8  # bytes; a warning is two ints, the second of which counts
+
+
+class Engine(NamedTuple):
+    """n simulations as addresses, and the arrays that mirror their fields.
+
+    Attributes:
+      functions: addresses of MuJoCo's functions, in the order of `NAMES`.
+      models, data: addresses of the mjModel and mjData of each simulation, (n,).
+      warnings: addresses of the counter of the first warning of each simulation, (n,).
+      fields: addresses of fields in each mjData, (n, F); none where arrays are views of them.
+      arrays: addresses of the arrays (n, ...) that mirror these fields, (F,).
+      sizes: numbers in each field, (F,).
+      written: how many fields, the first ones, tasks may write.
+      time: simulated time, (n,) s.
+      timestep: duration of a physics step, s.
+    """
+
+    functions: np.ndarray
+    models: np.ndarray
+    data: np.ndarray
+    warnings: np.ndarray
+    fields: np.ndarray
+    arrays: np.ndarray
+    sizes: np.ndarray
+    written: int
+    time: np.ndarray
+    timestep: float
+
+
+@functools.cache
+def addresses() -> tuple[int, ...]:
+    """Returns the addresses of MuJoCo's functions, in the order of `NAMES`.
+
+    Raises:
+      ImportError: the library beside the Python package is missing, or is another version.
+    """
+    folder = pathlib.Path(mujoco.__file__).parent
+    found = sorted(path for pattern in _PATTERNS for path in folder.glob(pattern))
+    if not found:
+        raise ImportError(
+            f'no MuJoCo library ({", ".join(_PATTERNS)}) in {folder}; install mujoco from its wheel'
+        )
+    library = ctypes.CDLL(str(found[0]))
+    library.mj_versionString.restype = ctypes.c_char_p
+    check_version(library.mj_versionString().decode(), mujoco.mj_versionString(), str(found[0]))
+    return tuple(ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0 for name in NAMES)
+
+
+def check_version(found: str, expected: str, path: str) -> None:
+    """Checks that a library is the one that the Python package was built for.
+
+    Raises:
+      ImportError: it is not; its structures may have another layout.
+    """
+    if found != expected:
+        raise ImportError(
+            f'{path} is MuJoCo {found}, and the Python package is MuJoCo {expected}; reinstall '
+            'mujoco, so that both are of one version'
+        )
+
+
+# What only Numba can express: calls and copies by address. The Python functions do the same.
+
+
+def _call_native() -> Callable[..., Any]:
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
+
+    @intrinsic
+    def call(typing: Any, function: Any, model: Any, data: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            integer = ir.IntType(64)
+            pointer = ir.FunctionType(ir.VoidType(), [integer, integer]).as_pointer()
+            builder.call(builder.inttoptr(args[0], pointer), args[1:])
+            return context.get_dummy_value()
+
+        return types.void(types.int64, types.int64, types.int64), generate
+
+    def call_by_address(function: int, model: int, data: int) -> None:
+        call(function, model, data)  # type: ignore[call-arg]
+
+    return call_by_address
+
+
+def _call(function: int, model: int, data: int) -> None:
+    """Calls a function of (mjModel*, mjData*) by its address."""
+    _TYPE(int(function))(int(model), int(data))
+
+
+def _pointer(kind: str) -> Any:
+    """Returns an intrinsic that turns an address into a pointer to numbers of a kind."""
+    from numba import types
+    from numba.extending import intrinsic
+
+    @intrinsic
+    def pointer(typing: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+        return types.CPointer(getattr(types, kind))(types.int64), generate
+
+    return pointer
+
+
+def _copy_native() -> Callable[..., Any]:
+    import numba
+
+    pointer = _pointer('float64')
+
+    def copy(target: int, source: int, count: int) -> None:
+        to = numba.carray(pointer(target), (count,))
+        of = numba.carray(pointer(source), (count,))
+        for k in range(count):
+            to[k] = of[k]
+
+    return copy
+
+
+def _copy(target: int, source: int, count: int) -> None:
+    """Copies numbers from one address to another."""
+    ctypes.memmove(int(target), int(source), 8 * int(count))
+
+
+def _count_native() -> Callable[..., Any]:
+    import numba
+
+    pointer = _pointer('int32')
+
+    def count_at(address: int) -> int:
+        return numba.carray(pointer(address), (1,))[0]
+
+    return count_at
+
+
+def _count(address: int) -> int:
+    """Returns the int at an address."""
+    return ctypes.c_int32.from_address(int(address)).value
+
+
+call = Compiled(_call, _call_native)
+_copy_numbers = Compiled(_copy, _copy_native)
+_count_at = Compiled(_count, _count_native)
+
+
+# Row functions: of simulation i.
+
+
+@compiled
+def write(i: int, engine: Engine) -> None:
+    """Gives the physics what tasks may have written into the arrays."""
+    for k in range(min(engine.written, len(engine.sizes))):
+        size = engine.sizes[k]
+        _copy_numbers(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
+
+
+@compiled
+def read(i: int, engine: Engine) -> None:
+    """Brings the arrays up to date with the physics."""
+    for k in range(len(engine.sizes)):
+        size = engine.sizes[k]
+        _copy_numbers(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
+
+
+@compiled
+def step(i: int, nstep: int, engine: Engine) -> None:
+    """Advances a simulation by `nstep` physics steps.
+
+    In the order of dm_control's `legacy_step`: finish the open step, run the others, and begin the
+    next, so that positions and velocities of bodies belong to the new state.
+    """
+    model, data = engine.models[i], engine.data[i]
+    write(i, engine)
+    call(engine.functions[STEP2], model, data)
+    for _ in range(nstep - 1):
+        call(engine.functions[STEP], model, data)
+    call(engine.functions[STEP1], model, data)
+    for _ in range(nstep):  # as MuJoCo does, number by number
+        engine.time[i] += engine.timestep
+    read(i, engine)
+
+
+@compiled
+def forward(i: int, engine: Engine) -> None:
+    """Recomputes everything that depends on a written state."""
+    write(i, engine)
+    call(engine.functions[FORWARD], engine.models[i], engine.data[i])
+    read(i, engine)
+
+
+@compiled
+def reset(i: int, engine: Engine) -> None:
+    """Puts a simulation into the model's initial state, warnings cleared."""
+    call(engine.functions[RESET], engine.models[i], engine.data[i])
+    engine.time[i] = 0.0
+    read(i, engine)
+
+
+@compiled
+def diverged(i: int, engine: Engine) -> bool:
+    """Whether a simulation met a non-finite or huge state since its reset."""
+    for k in range(_BAD[0], _BAD[1]):
+        if _count_at(engine.warnings[i] + _WARNING_STRIDE * k) > 0:
+            return True
+    return False
+
+
+# Loops over simulations.
+
+
+@compiled
+def step_all(env_ids: np.ndarray, nstep: int, engine: Engine) -> None:
+    """Advances simulations by `nstep` physics steps each."""
+    for i in env_ids:
+        step(i, nstep, engine)
+
+
+@compiled
+def forward_all(env_ids: np.ndarray, engine: Engine) -> None:
+    """Recomputes what depends on the written states of simulations."""
+    for i in env_ids:
+        forward(i, engine)
+
+
+@compiled
+def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
+    """Puts simulations into the initial state."""
+    for i in env_ids:
+        reset(i, engine)
+
+
+@compiled
+def read_all(env_ids: np.ndarray, engine: Engine) -> None:
+    """Brings the arrays up to date for some simulations."""
+    for i in env_ids:
+        read(i, engine)
+
+
+@compiled
+def diverged_all(engine: Engine, out: np.ndarray) -> bool:
+    """Writes which simulations have diverged; returns whether any has."""
+    found = False
+    for i in range(len(out)):
+        out[i] = diverged(i, engine)
+        found |= out[i]
+    return found

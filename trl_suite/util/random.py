@@ -1,0 +1,197 @@
+"""Random numbers within compiled functions: NumPy's PCG64, a stream for each simulation.
+
+    streams = Streams(n)
+    streams.seed(3, np.random.SeedSequence(7))
+    uniform(3, 0.2, 0.7, streams.state)  # what np.random.default_rng(...).uniform(0.2, 0.7) gives
+
+The numbers are those of `numpy.random.Generator` to the last bit, so a stream may be used from Python
+and from compiled functions by turns.
+
+Source: NumPy's `PCG64` (M. E. O'Neill, 'PCG', 2014) and its ziggurat for the normal distribution.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from trl_suite.util.compiled import Compiled, compiled
+
+_FULL = (1 << 64) - 1
+_MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
+_HIGH, _LOW = _MULTIPLIER >> 64, _MULTIPLIER & _FULL
+_TAIL, _INVERSE_TAIL = 3.6541528853610087963519472518, 0.27366123732975827203338247596
+_DOUBLE = 1.0 / 9007199254740992.0
+
+
+class Streams:
+    """A PCG64 stream for each of n simulations.
+
+    Attributes:
+      state: (n, 6) uint64; state and increment, high and low words, then the buffered 32 bits.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.state = np.zeros((n, 6), np.uint64)
+
+    def seed(self, env_id: int, sequence: np.random.SeedSequence) -> None:
+        """Puts a stream where `np.random.default_rng(sequence)` begins."""
+        self._store(env_id, np.random.PCG64(sequence))
+
+    @contextlib.contextmanager
+    def generator(self, env_id: int) -> Iterator[np.random.Generator]:
+        """Yields a Generator that goes on from a stream, which goes on from there afterwards."""
+        bits = np.random.PCG64(0)
+        high, low, inc_high, inc_low, has_uint32, uinteger = self.state[env_id].tolist()
+        bits.state = {
+            'bit_generator': 'PCG64',
+            'state': {'state': high << 64 | low, 'inc': inc_high << 64 | inc_low},
+            'has_uint32': has_uint32,
+            'uinteger': uinteger,
+        }
+        yield np.random.Generator(bits)
+        self._store(env_id, bits)
+
+    def _store(self, env_id: int, bits: np.random.PCG64) -> None:
+        found: Any = bits.state
+        state, inc = found['state']['state'], found['state']['inc']
+        self.state[env_id] = (
+            state >> 64, state & _FULL, inc >> 64, inc & _FULL, found['has_uint32'],
+            found['uinteger'],
+        )  # fmt: skip
+
+
+def _next_native() -> Callable[..., Any]:
+    from numba import njit, uint64
+
+    high, low = np.uint64(_HIGH), np.uint64(_LOW)
+    half, mask = np.uint64(32), np.uint64(0xFFFFFFFF)
+    one, zero, turn, bits = np.uint64(1), np.uint64(0), np.uint64(58), np.uint64(64)
+
+    @njit(error_model='numpy')
+    def upper(a: Any, b: Any) -> Any:
+        """The upper word of a product."""
+        a1, a0, b1, b0 = a >> half, a & mask, b >> half, b & mask
+        middle = a1 * b0 + ((a0 * b0) >> half)
+        other = a0 * b1 + (middle & mask)
+        return a1 * b1 + (middle >> half) + (other >> half)
+
+    def next64(i: int, state: np.ndarray) -> Any:
+        s1, s0 = state[i, 0], state[i, 1]
+        lower = s0 * low
+        carried = upper(s0, low) + s1 * low + s0 * high + state[i, 2]
+        total = lower + state[i, 3]
+        if total < lower:
+            carried += one
+        state[i, 0], state[i, 1] = carried, total
+        mixed, by = carried ^ total, carried >> turn
+        if by == zero:
+            return uint64(mixed)
+        return uint64((mixed >> by) | (mixed << (bits - by)))
+
+    return next64
+
+
+def _next(i: int, state: np.ndarray) -> int:
+    """Returns the next 64 bits of stream i."""
+    high, low, inc_high, inc_low = (int(word) for word in state[i, :4])
+    whole = ((high << 64 | low) * _MULTIPLIER + (inc_high << 64 | inc_low)) & ((1 << 128) - 1)
+    state[i, 0], state[i, 1] = whole >> 64, whole & _FULL
+    mixed, by = (whole >> 64) ^ (whole & _FULL), whole >> 122
+    return (mixed >> by | mixed << (64 - by)) & _FULL
+
+
+_next64 = Compiled(_next, _next_native)
+
+
+def _random_native() -> Callable[..., Any]:
+    shift = np.uint64(11)
+
+    def random(i: int, state: np.ndarray) -> float:
+        return (_next64(i, state) >> shift) * _DOUBLE
+
+    return random
+
+
+def _random(i: int, state: np.ndarray) -> float:
+    """Draws from [0, 1), as `Generator.random()`."""
+    return (_next64(i, state) >> 11) * _DOUBLE
+
+
+random = Compiled(_random, _random_native)
+
+
+@compiled
+def uniform(i: int, low: float, high: float, state: np.ndarray) -> float:
+    """Draws from [low, high), as `Generator.uniform(low, high)`."""
+    return low + (high - low) * random(i, state)
+
+
+def _words_native() -> Callable[..., Any]:
+    eight, one, byte = np.uint64(8), np.uint64(1), np.uint64(0xFF)
+    mantissa = np.uint64(0x000FFFFFFFFFFFFF)
+
+    def words(i: int, state: np.ndarray) -> tuple[int, bool, int]:
+        bits = _next64(i, state)
+        rest = bits >> eight
+        return int(bits & byte), (rest & one) != np.uint64(0), int((rest >> one) & mantissa)
+
+    return words
+
+
+def _words(i: int, state: np.ndarray) -> tuple[int, bool, int]:
+    """Draws a layer of the ziggurat, a sign, and 52 bits."""
+    bits = _next64(i, state)
+    rest = bits >> 8
+    return bits & 0xFF, bool(rest & 1), rest >> 1 & 0x000FFFFFFFFFFFFF
+
+
+_draw_words = Compiled(_words, _words_native)
+
+
+def _tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    from numba.np.random import _constants
+
+    return (
+        _constants.ki_double.astype(np.int64), _constants.wi_double, _constants.fi_double,
+    )  # fmt: skip
+
+
+def _normal_native() -> Callable[..., Any]:
+    limits, widths, heights = _tables()
+    return _ziggurat(limits, widths, heights)
+
+
+def _ziggurat(limits: np.ndarray, widths: np.ndarray, heights: np.ndarray) -> Callable[..., Any]:
+    def normal(i: int, state: np.ndarray) -> float:
+        while True:
+            layer, negative, size = _draw_words(i, state)
+            x = size * widths[layer]
+            if negative:
+                x = -x
+            if size < limits[layer]:
+                return x
+            if layer == 0:
+                while True:
+                    beyond = -_INVERSE_TAIL * math.log1p(-random(i, state))
+                    level = -math.log1p(-random(i, state))
+                    if level + level > beyond * beyond:
+                        break
+                return -(_TAIL + beyond) if (size >> 8) & 1 else _TAIL + beyond
+            edge = (heights[layer - 1] - heights[layer]) * random(i, state) + heights[layer]
+            if edge < math.exp(-0.5 * x * x):
+                return x
+
+    return normal
+
+
+def _normal(i: int, state: np.ndarray) -> float:
+    """Draws from the standard normal distribution, as `Generator.standard_normal()`."""
+    return _ziggurat(*_tables())(i, state)
+
+
+standard_normal = Compiled(_normal, _normal_native)
