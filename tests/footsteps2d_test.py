@@ -40,12 +40,11 @@ def walked(n, switches, **options):
     rows.reset()
     task, found = rows._task, []
     while len(found) < switches:
-        before = task.landing.copy()
-        task.act(np.zeros((n, 11)))
-        task.finish_step()  # the physics stands still
-        if task.landed.any():
-            assert task.landed.all()
-            found.append((before, task.landing.copy()))
+        before = task.plan.landing.copy()
+        task.finish_step(np.arange(n))  # the physics stands still
+        if task.plan.landed.any():
+            assert task.plan.landed.all()
+            found.append((before, task.plan.landing.copy()))
     return found
 
 
@@ -59,13 +58,13 @@ class ClockTest(parameterized.TestCase):
         environment, _ = started(start_phase=phase)
         task, found = environment.task, []
         for i in range(1, expected[-1] + 1):
-            before = task.stance[0]
+            before = task.plan.stance[0]
             step = held(environment)
-            if task.stance[0] != before:
+            if task.plan.stance[0] != before:
                 found.append(i)
-            self.assertEqual(environment.info['landed'], task.stance[0] != before)
+            self.assertEqual(environment.info['landed'], task.plan.stance[0] != before)
             right = (phase + i / 30 + 1e-9) % 1 < 0.5
-            self.assertEqual(task.stance[0], RIGHT if right else LEFT)
+            self.assertEqual(task.plan.stance[0], RIGHT if right else LEFT)
             # What is observed says the same.
             self.assertEqual(step.observation['phase'][0] < 0.5, right)
             self.assertEqual(step.observation['phase'][1:3].any(), right)
@@ -103,7 +102,7 @@ class PlanTest(parameterized.TestCase):
         environment, _ = started(start_phase=phase)
         foot = ankles(environment)[RIGHT if phase < 0.5 else LEFT, 0]
         expected = [[foot + 0.4, 0, 0], [foot + 0.8, 0, 0]]
-        np.testing.assert_allclose(environment.task.landing[0], expected, atol=1e-12)
+        np.testing.assert_allclose(environment.task.plan.landing[0], expected, atol=1e-12)
 
     def test_each_step_is_laid_from_the_one_before(self):
         for before, after in walked(3, 8):
@@ -140,7 +139,7 @@ class PlanTest(parameterized.TestCase):
             right = step.observation['phase'][0] < 0.5
             slots, expected = step.observation['plan'][:12].reshape(2, 2, 3), np.zeros((2, 2, 3))
             for which, foot in ((0, LEFT if right else RIGHT), (1, RIGHT if right else LEFT)):
-                expected[which, foot, 0] = task.landing[0, which, 0] - ankles(environment)[foot, 0]
+                expected[which, foot, 0] = task.plan.landing[0, which, 0] - ankles(environment)[foot, 0]
             np.testing.assert_allclose(slots, expected, atol=1e-12)
             self.assertEqual(step.observation['plan'][12], 0)
             step = environment.step(task.clip_action(0))
@@ -151,7 +150,7 @@ class PlanTest(parameterized.TestCase):
         environment.physics.data.qpos[environment.task.figure.pose_qpos[2]] = np.pi
         environment.physics.forward()
         environment.task.observe()
-        way = environment.task.landing[0, 0, 0] - ankles(environment)[LEFT, 0]
+        way = environment.task.plan.landing[0, 0, 0] - ankles(environment)[LEFT, 0]
         self.assertGreater(ahead, 0)
         self.assertAlmostEqual(environment.observation()['plan'][3], -way, delta=1e-12)
         self.assertEqual(environment.task.reward_terms[0, -1], 0)  # the heading
@@ -178,12 +177,12 @@ class PlanTest(parameterized.TestCase):
         for _ in range(3):
             environment.reset()
             while not environment.step(task.clip_action(0)).last():
-                x, _, z = task.landing[0].T
-                np.testing.assert_array_equal(z, task.figure.ground(0, x))
+                x, _, z = task.plan.landing[0].T
+                np.testing.assert_array_equal(z, task.figure.ground_heights(0, x))
                 slots = environment.observation()['plan'][:12].reshape(2, 2, 3)
-                used = slots[[0, 1], [1 - task.stance[0], task.stance[0]], 2]
+                used = slots[[0, 1], [1 - task.plan.stance[0], task.plan.stance[0]], 2]
                 root = body(environment, 'xpos', 'root')[:1]
-                np.testing.assert_allclose(used, z - task.figure.ground(0, root), atol=1e-12)
+                np.testing.assert_allclose(used, z - task.figure.ground_heights(0, root), atol=1e-12)
 
 
 class RewardTest(parameterized.TestCase):
@@ -197,7 +196,7 @@ class RewardTest(parameterized.TestCase):
         put(environment, clip.pose(np.ceil(2 * phase + 1e-9) / 2), np.zeros(14))
         landing = ankles(environment)[swing, 0]
         put(environment, clip.pose(phase), clip.velocity(phase))
-        task.landing[0, 0] = landing, 0, 0
+        task.plan.landing[0, 0] = landing, 0, 0
         task.observe()
         return environment, landing
 
@@ -225,7 +224,7 @@ class RewardTest(parameterized.TestCase):
         task = environment.task
         away = landing - ankles(environment)[LEFT if phase < 0.5 else RIGHT, 0]
         for height in (0.0, 0.1):  # of the place; the reference's foot is as high above it
-            task.landing[0, 0, 2] = height
+            task.plan.landing[0, 0, 2] = height
             task.observe()
             error = 5 * scale * (away**2 + height**2)
             expected = WEIGHTS['end_effector'] * np.exp(-error)
@@ -234,7 +233,7 @@ class RewardTest(parameterized.TestCase):
     @parameterized.parameters(0.1, 0.24, 0.6)
     def test_first_half_of_a_step_does_not_see_the_plan(self, phase):
         environment, _ = self.placed(phase)
-        environment.task.landing[0] += 1.0
+        environment.task.plan.landing[0] += 1.0
         environment.task.observe()
         found = environment.task.reward_terms[0, 2]
         self.assertAlmostEqual(found, WEIGHTS['end_effector'], delta=1e-3)
@@ -282,7 +281,7 @@ class LandingTest(parameterized.TestCase):
     def test_landing_error(self, phase):
         environment, _ = started(start_phase=phase)
         task = environment.task
-        place = task.landing[0, 0, 0]
+        place = task.plan.landing[0, 0, 0]
         for _ in range(6):  # 0.2 s
             self.assertEqual(
                 (environment.info['landed'], environment.info['landing_error']), (0, 0)
@@ -336,7 +335,7 @@ class SaveTest(parameterized.TestCase):
         task = environment.task
         return advance(
             environment, seed, 40, 0.3,
-            lambda _: (task.landing_error, task.landing[0].ravel(), task.reference_pose(0)),
+            lambda _: (task.plan.landing_error, task.plan.landing[0].ravel(), task.reference_pose(0)),
         )  # fmt: skip
 
     @parameterized.parameters({}, {'plans': VARIED, 'miss': 0.5})
@@ -375,7 +374,7 @@ class HelperTest(parameterized.TestCase):
         environment, _ = started(start_phase=0.1)
         task = environment.task
         first, second = task.markers(0)
-        for marker, place in zip((first, second), task.landing[0], strict=True):
+        for marker, place in zip((first, second), task.plan.landing[0], strict=True):
             self.assertEqual(marker.shape, 'box')
             # The sole under an ankle, just above the ground.
             self.assertBetween(marker.position[0] - place[0], 0.02, 0.08)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from trl_suite.util.compiled import compiled
 
 AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
 # The original's axis lies behind the angle: forward, up, right.
@@ -78,6 +81,34 @@ class ActionMap:
                 f'{place} ({self.names[i]}) is {action[(*row, i)]}; expected finite numbers'
             )
         return action
+
+
+class Drive(NamedTuple):
+    """A plain `ActionMap` for compiled functions: what drives k actuators, one after the other.
+
+    Attributes:
+      offset: control at action 0, (k,).
+      scale: change of control per unit action, (k,).
+      first: address of the first control.
+    """
+
+    offset: np.ndarray
+    scale: np.ndarray
+    first: int
+
+
+@compiled
+def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
+    """Writes the controls of simulation i that its action (of (n, k), clipped) means."""
+    for k in range(len(by.offset)):
+        ctrl[i, by.first + k] = min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
+
+
+@compiled
+def drive_all(env_ids: np.ndarray, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
+    """Writes the controls of some simulations."""
+    for i in env_ids:
+        drive(i, action, by, ctrl)
 
 
 @dataclasses.dataclass(frozen=True)

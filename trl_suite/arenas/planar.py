@@ -11,6 +11,7 @@ from trl_suite.arenas import boxes, stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World
 from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain
+from trl_suite.terrain.planar_ground import PlanarGround
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
@@ -65,12 +66,17 @@ class PlanarTerrain(composer.Arena):
             for model in world.models
         ]
         self.strips: list[Strip | None] = [None] * world.n
-        self._start = np.full((world.n, 1), np.nan)  # vertex number of a window's first vertex
-        self._offset = np.arange(world.n)[:, None] * _WINDOW
         # Of every cell its first height and the rise to the next, m.
-        self._heights, self._rises = np.zeros((2, world.n, _WINDOW))
-        self._vertical = np.zeros((world.n, _WINDOW), bool)
-        self._centre = np.zeros((world.n, 1))  # m; of the travel that a window is good for
+        heights, rises = np.zeros((2, world.n, _WINDOW))
+        self.ground = PlanarGround(
+            np.full(world.n, np.nan), np.zeros(world.n), _REACH, heights, rises,
+            np.zeros((world.n, _WINDOW), bool), np.zeros((world.n, 3 * _WINDOW + 1)),
+            np.zeros(world.n, bool),
+        )  # fmt: skip
+        self._offset = np.arange(world.n)[:, None] * _WINDOW
+        self._start, self._centre = self.ground.start[:, None], self.ground.centre[:, None]
+        self._heights, self._rises = heights, rises
+        self._vertical = self.ground.vertical
 
     def begin_episode(self, row: int, strip: Strip) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
@@ -129,6 +135,21 @@ class PlanarTerrain(composer.Arena):
             low, high = (start - _WINDOW) * SPACING, (start + 2 * _WINDOW) * SPACING
             heights[row] = strip.height(np.clip(x[row], low, high))
 
+    def follow_all(self, env_ids: np.ndarray, x: np.ndarray) -> None:
+        """Lays the windows anew of some simulations, whose roots are at x (m,), m."""
+        for env_id, root in zip(env_ids.tolist(), x.tolist(), strict=True):
+            # The window starts at multiples of the advance, however far a character has jumped.
+            self._lay(env_id, round(root / ADVANCE) * _ADVANCE)
+        # Contacts of the open step name boxes that now lie elsewhere.
+        self._world.forward(env_ids)
+
+    def widen(self, env_id: int) -> None:
+        """Draws the ground up to the length of a window beyond the window of one simulation."""
+        strip, start = self.strips[env_id], int(self.ground.start[env_id])
+        assert strip is not None
+        heights, _ = strip.window(start - _WINDOW, 3 * _WINDOW + 1)
+        self.ground.wide[env_id], self.ground.is_wide[env_id] = heights, True
+
     def slope(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
         cell = np.floor(x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
@@ -151,6 +172,7 @@ class PlanarTerrain(composer.Arena):
         """Realises the strip around a vertex as boxes."""
         strip = self.strips[row]
         assert strip is not None
+        self.ground.is_wide[row] = False
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
         self._centre[row] = centre * SPACING

@@ -16,8 +16,8 @@ import numpy as np
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.planar_reference import tabulated
 from trl_suite.motion import quaternion
-from trl_suite.tasks.reference import tabulated
 from trl_suite.tasks.task import consecutive
 from trl_suite.terrain.surroundings import SAMPLES
 

@@ -1,4 +1,4 @@
-"""Walking in the plane where the feet are told to go: the footstep controller, straight on.
+"""Walking in the plane along planned footsteps: the footstep controller, straight on.
 
 Source: the step scenario of the original, as a configuration of it has it for the planar biped;
 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
@@ -6,26 +6,240 @@ Source: the step scenario of the original, as a configuration of it has it for t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character, CharacterRow
 from trl_suite.engine import World
+from trl_suite.kinematics.planar import has_fallen, measure, must_wait
+from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
-from trl_suite.tasks import rewards
+from trl_suite.tasks import imitation, rewards
 from trl_suite.tasks.footsteps import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
 from trl_suite.tasks.imitation import SUBSTEPS, Imitation
 from trl_suite.tasks.plans import StraightPlans, options
-from trl_suite.tasks.task import Marker, drawn_seed
+from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
+from trl_suite.terrain import planar_ground
+from trl_suite.util.compiled import compiled
+from trl_suite.util.random import Streams, random, uniform
 
-_DIGITS = 9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
+_DIGITS = 1e9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
 _END_EFFECTOR = list(rewards.STEP_TERMS).index('end_effector')
-_WEIGHTS = np.array([[weight for weight, _ in rewards.STEP_TERMS.values()]])
-_SCALES = np.array([[-scale for _, scale in rewards.STEP_TERMS.values()]])[:, :-1]
+_HEADING = list(rewards.STEP_TERMS).index('heading')
+RIGHT, LEFT = 0, 1
+
+
+class Plan(NamedTuple):
+    """The footsteps planned in each simulation.
+
+    Attributes:
+      stance: foot that stands, 0 the right one, 1 the left one, (n,).
+      landing: where the swing foot lands, then the stance foot: x, 0 and z, (n, 2, 3) m.
+      landing_error: distance between the last foot that landed and its place, along x, (n,) m.
+      landed: whether one landed in this step, (n,) bool.
+      length: of the current steps, (n,) m.
+      begun: time on the clip at the last switch, in periods, and the root's place then, (n, 2).
+      random: the stream that lengths are drawn from, (n, 6); see `util.random`.
+    """
+
+    stance: np.ndarray
+    landing: np.ndarray
+    landing_error: np.ndarray
+    landed: np.ndarray
+    length: np.ndarray
+    begun: np.ndarray
+    random: np.ndarray
+
+
+class Options(NamedTuple):
+    """How plans are drawn and judged, and where blocks begin in an observation.
+
+    Attributes:
+      shortest, longest: of the steps, m.
+      change: probability that a step has another length than the one before.
+      miss: landing error that ends an episode, m.
+      footstep_scale: times the squared distance between swing foot and landing place.
+      contact_block, plan_block: first columns.
+    """
+
+    shortest: float
+    longest: float
+    change: float
+    miss: float
+    footstep_scale: float
+    contact_block: int
+    plan_block: int
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def finish_step(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+    """Landing, reward, failure and observation, after the physics has advanced."""
+    imitation.advance_clock(i, rules.clip, rules.state)
+    diverged = imitation.breaks_down(i, rules)
+    missed = land(i, diverged, rules, plan, options)
+    if diverged:
+        conclude(i, True, rules.outcome)
+        return
+    measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+    compare(i, rules, plan, options)
+    conclude(i, missed or has_fallen(i, rules.body, rules.physics), rules.outcome)
+    observe(i, rules, plan, options)
+
+
+@compiled
+def read_clock(i: int, rules: imitation.Rules) -> int:
+    """Writes the phase; returns which foot stands by it."""
+    cycles = np.rint(rules.state.cycles[i] * _DIGITS) / _DIGITS
+    rules.state.phase[i] = cycles % 1.0
+    return LEFT if rules.state.phase[i] >= 0.5 else RIGHT
+
+
+@compiled
+def land(
+    i: int, diverged: bool, rules: imitation.Rules, plan: Plan, options: Options
+) -> bool:  # fmt: skip
+    """At a switch of stance, looks where the foot has landed and plans on; whether it has missed."""
+    stance = read_clock(i, rules)
+    plan.landed[i] = stance != plan.stance[i] and not diverged  # what breaks down lands nowhere
+    if not plan.landed[i]:
+        return False
+    plan.stance[i] = stance  # the foot that has just landed
+    foot = rules.physics.xpos[i, rules.body.effectors[stance], 0]
+    plan.landing_error[i] = abs(foot - plan.landing[i, 0, 0])
+    for axis in range(3):
+        plan.landing[i, 0, axis] = plan.landing[i, 1, axis]
+    plan.landing[i, 1, 0] += next_length(i, plan, options)
+    put_on_ground(i, rules, plan)
+    return plan.landing_error[i] > options.miss
+
+
+@compiled
+def next_length(i: int, plan: Plan, options: Options) -> float:
+    """Returns how long the next step of a plan is, which perhaps is drawn anew, m."""
+    if random(i, plan.random) < options.change:
+        plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
+    return plan.length[i]
+
+
+@compiled
+def put_on_ground(i: int, rules: imitation.Rules, plan: Plan) -> None:
+    """Gives the landing places the heights of the ground; notes where the plan was made."""
+    for which in range(2):
+        x = plan.landing[i, which, 0]
+        plan.landing[i, which, 2] = planar_ground.height(i, x, rules.ground)
+    plan.begun[i, 0] = rules.state.cycles[i]
+    plan.begun[i, 1] = rules.physics.qpos[i, rules.body.qpos[0]]
+
+
+@compiled
+def compare(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+    """Writes the reward terms; in the second half of a step the plan replaces the clip."""
+    imitation.compare(i, rules)
+    layout, found, terms = rules.layout, rules.found, rules.outcome.reward_terms
+    phase, swing = rules.state.phase[i], 1 - plan.stance[i]
+    twice = 2 * phase
+    late = twice - math.floor(twice) > 0.5
+    end_effector = 0.0
+    for k in range(found.effectors.shape[1]):
+        if k == swing and late:
+            continue  # its place is the plan's
+        off = found.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
+        end_effector += off * off
+    if late:
+        foot = rules.body.effectors[swing]
+        raised = feature(phase, layout.effectors + 2 + swing, rules.clip)
+        x = plan.landing[i, 0, 0] - rules.physics.xpos[i, foot, 0]
+        z = plan.landing[i, 0, 2] - rules.physics.xpos[i, foot, 2] + raised
+        end_effector += options.footstep_scale * (x * x + z * z)
+    weights, scales = rules.term_weights, rules.term_scales
+    terms[i, _END_EFFECTOR] = weights[_END_EFFECTOR] * math.exp(
+        -scales[_END_EFFECTOR] * end_effector
+    )
+    terms[i, _HEADING] = weights[_HEADING] if found.facing[i] > 0.0 else 0.0
+
+
+@compiled
+def observe(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+    """Writes the blocks behind velocity: muscles, phase, contacts, and the plan."""
+    imitation.observe(i, rules)
+    observation, body, physics = rules.outcome.observation, rules.body, rules.physics
+    for k in range(len(body.contact)):
+        touches = physics.sensordata[i, body.contact[k]] > 0.0
+        observation[i, options.contact_block + k] = 1.0 if touches else 0.0
+    for k in range(12):
+        observation[i, options.plan_block + k] = 0.0
+    for which in range(2):  # first and second step, as seen from the foot that lands there
+        foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
+        x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
+        place = options.plan_block + 6 * which + 3 * foot
+        observation[i, place] = x * rules.found.facing[i]
+        observation[i, place + 2] = plan.landing[i, which, 2] - rules.found.under[i]
+
+
+@compiled
+def draw_plan(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+    """Draws the first plan of an episode."""
+    plan.stance[i] = read_clock(i, rules)
+    plan.landing_error[i], plan.landed[i] = 0.0, False
+    plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
+    foot = rules.physics.xpos[i, rules.body.effectors[plan.stance[i]], 0]
+    plan.landing[i, 0, 0] = foot + next_length(i, plan, options)
+    plan.landing[i, 1, 0] = plan.landing[i, 0, 0] + next_length(i, plan, options)
+    put_on_ground(i, rules, plan)
+
+
+# Loops over simulations.
+
+
+@compiled
+def draw_plans(
+    env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options
+) -> None:  # fmt: skip
+    """Draws the first plans of some simulations."""
+    for i in env_ids:
+        draw_plan(i, rules, plan, options)
+
+
+@compiled
+def finish_steps(
+    env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options
+) -> int:  # fmt: skip
+    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+        else:
+            finish_step(i, rules, plan, options)
+    return waiting
+
+
+@compiled
+def observe_all(
+    env_ids: np.ndarray, fresh: bool, rules: imitation.Rules, plan: Plan, options: Options
+) -> int:
+    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+        compare(i, rules, plan, options)
+        observe(i, rules, plan, options)
+        if fresh:
+            begin(i, rules.outcome)
+    return waiting
 
 
 class PlanarFootsteps(Imitation):
@@ -42,10 +256,7 @@ class PlanarFootsteps(Imitation):
         13.
 
     Attributes:
-      stance: foot that stands, 0 the right one, 1 the left one, (n,).
-      landing: where the swing foot lands, then the stance foot: x, 0 and z, (n, 2, 3) m.
-      landing_error: distance between the last foot that landed and its place, along x, (n,) m.
-      landed: whether one landed in this step, (n,) bool.
+      plan: the footsteps; see `Plan`.
     """
 
     TERMS = rewards.STEP_TERMS
@@ -104,9 +315,9 @@ class PlanarFootsteps(Imitation):
 
     def bind(self, world: World) -> None:
         super().bind(world)
-        n, self._effectors = world.n, self._compared['effectors']
-        self._weights[self._effectors, _END_EFFECTOR] = 1.0  # the sum over both feet, not the mean
-        table = self.reference.features(np.arange(64) / 64)[:, self._effectors]
+        n = world.n
+        columns = self.reference.columns['effectors']
+        table = self.reference.features(np.arange(64) / 64)[:, columns]
         higher = (table[:, 2] - table[:, 3]).reshape(2, -1).mean(1)  # the right foot, by halves
         if not higher[0] < 0 < higher[1]:
             raise ValueError(
@@ -114,112 +325,43 @@ class PlanarFootsteps(Imitation):
                 'cycle and its left foot in the second; if the left one stands first, give '
                 'clip.mirrored()'
             )
-        self._random = [np.random.default_rng(0)] * n
-        self._every = np.arange(n)
-        self.stance = np.zeros(n, int)
-        self.landing = np.zeros((n, 2, 3))
-        self.landing_error, self.landed = np.zeros(n), np.zeros(n, bool)
-        self._length = np.zeros(n)  # m; of the steps of now
-        self._shift = np.zeros(n)  # m; where the clip's x = 0 is, for pictures
+        self._streams = Streams(n)
+        self.plan = Plan(
+            np.zeros(n, int), np.zeros((n, 2, 3)), np.zeros(n), np.zeros(n, bool), np.zeros(n),
+            np.zeros((n, 2)), self._streams.state,
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan)
+        plans = self.plans
+        self._options = Options(
+            plans.length[0], plans.length[1], plans.change, np.inf if self.miss is None else float(self.miss),
+            float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
+        )  # fmt: skip
 
-    def _read_clock(self) -> np.ndarray:
-        """Writes the phase of all rows; returns which foot stands by it, (n,)."""
-        np.remainder(np.round(self._cycles, _DIGITS), self._ones, self.phase)
-        return (self.phase >= 0.5).astype(int)
+    def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            self._streams.seed(i, drawn_seed(random_state))
+        draw_plans(env_ids, self.rules, self.plan, self._options)
 
-    # Plans.
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        parts = self.rules, self.plan, self._options
+        if finish_steps(env_ids, *parts):
+            finish_steps(self._widened(env_ids), *parts)
 
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
-        super().begin_episodes(rows, random_states)
-        self.stance[rows] = self._read_clock()[rows]
-        self.landing_error[rows], self.landed[rows] = 0.0, False
-        feet = self.figure.feet()
-        for row, random_state in zip(rows.tolist(), random_states, strict=True):
-            self._random[row] = np.random.default_rng(drawn_seed(random_state))
-            self._length[row] = self._random[row].uniform(*self.plans.length)
-            self.landing[row, 0, 0] = feet[row, self.stance[row], 0] + self._next_length(row)
-            self.landing[row, 1, 0] = self.landing[row, 0, 0] + self._next_length(row)
-        self._lay(rows)
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        parts = self.rules, self.plan, self._options
+        if observe_all(env_ids, fresh, *parts):
+            observe_all(self._widened(env_ids), fresh, *parts)
 
-    def _step(self) -> None:
-        stance = self._read_clock()
-        self.landed = (stance != self.stance) & ~self.diverged  # what breaks down lands nowhere
-        rows = np.flatnonzero(self.landed)
-        if not len(rows):
-            return
-        self.stance[rows] = stance[rows]  # the foot that has just landed
-        feet = self.figure.feet()[rows, stance[rows], 0]
-        self.landing_error[rows] = np.abs(feet - self.landing[rows, 0, 0])
-        self.landing[rows, 0] = self.landing[rows, 1]
-        for row in rows.tolist():
-            self.landing[row, 1, 0] += self._next_length(row)
-        self._lay(rows)
-
-    def _next_length(self, row: int) -> float:
-        """Returns how long the next step of a plan is, which perhaps is drawn anew, m."""
-        if self._random[row].uniform() < self.plans.change:
-            self._length[row] = self._random[row].uniform(*self.plans.length)
-        return float(self._length[row])
-
-    def _lay(self, rows: np.ndarray) -> None:
-        """Puts the landing places of some rows on the ground, and the clip where they are."""
-        self.landing[rows, :, 2] = self.arena.height(self.landing[rows, :, 0], rows)
-        there = self.clip.pose(self._cycles[rows] * self.reference.period)[:, 0]
-        self._shift[rows] = self._all.x[rows, 0] - there
-
-    # Reward and observation.
-
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        super().finish_step(stepped)
-        if self.miss is not None:
-            missed = self.landed & (self.landing_error > self.miss)
-            self.failed |= missed
-            self.reward_terms[missed] = self.reward[missed] = 0.0
-
-    def _compare(self, error: np.ndarray, reference: np.ndarray) -> None:
-        facing = self._all.facing
-        swing, twice = 1 - self.stance, 2 * self.phase
-        late = twice - np.floor(twice) > 0.5
-        # In the second half of a step the plan takes the place of the reference.
-        error[self._every, self._effectors.start + swing] *= ~late
-        np.matmul(error[:, None], self._weights, out=self._errors)
-        errors = self._errors[:, 0]
-        raised = reference[self._every, self._effectors.start + 2 + swing]
-        way = self.landing[:, 0, ::2] - self.figure.feet()[self._every, swing]
-        x, z = way[:, 0], way[:, 1] + raised
-        errors[:, _END_EFFECTOR] += late * self._footstep_scale * (x * x + z * z)
-        # Not into the terms themselves: exponentials of a part of an array depend on its rows.
-        self.reward_terms[:, :-1] = rewards.exponentials(errors, _WEIGHTS[:, :-1], _SCALES)
-        self.reward_terms[:, -1] = _WEIGHTS[0, -1]
-        if facing is not None:
-            self.reward_terms[:, -1] *= facing[:, 0] > 0
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        super().observe()
-        self.observation[:, self.blocks['contact']] = self.figure.contacts()
-        feet = np.stack([1 - self.stance, self.stance], axis=1)  # which of them lands where
-        way = self.landing.copy()
-        way[..., 0] -= self.figure.feet()[self._every[:, None], feet, 0]
-        way[..., 2] -= self._all.under
-        if self._all.facing is not None:
-            way[..., 0] *= self._all.facing
-        slots = np.zeros((len(way), 2, 2, 3))  # first and second step; as seen from right and left
-        slots[self._every[:, None], np.arange(2), feet] = way
-        plan = self.observation[:, self.blocks['plan']]
-        plan[:, :12] = slots.reshape(len(way), 12)
-
-    def infos(self) -> dict[str, Any]:
+    def info(self) -> dict[str, Any]:
         """As for `Imitation`; and of the last foot that landed, whether it did so in this step.
 
         `landed` (n,) bool; `landing_error` (n,) m, 0 before any landing; `heading_error` (n,), 0.
         """
         return {
-            **super().infos(),
-            'landed': self.landed.copy(),
-            'landing_error': self.landing_error.copy(),
-            'heading_error': np.zeros_like(self.landing_error),
+            **super().info(),
+            'landed': self.plan.landed.copy(),
+            'landing_error': self.plan.landing_error.copy(),
+            'heading_error': np.zeros_like(self.plan.landing_error),
         }
 
     def markers(self, row: int) -> list[Marker]:
@@ -227,35 +369,19 @@ class PlanarFootsteps(Imitation):
         return [
             Marker('box', (x + SOLE_AHEAD, y, z + SOLE[2]), SOLE, colour)
             for (x, y, z), colour in zip(
-                self.landing[row].tolist(), (SWING_COLOUR, STANCE_COLOUR), strict=True
+                self.plan.landing[row].tolist(), (SWING_COLOUR, STANCE_COLOUR), strict=True
             )
         ]
 
     def reference_pose(self, row: int) -> np.ndarray:
         """Pose of the reference where the character was at the last switch: x, z, pitch, joints."""
-        pose = self.clip.pose(self._cycles[row] * self.reference.period)
-        pose[0] += self._shift[row]
-        pose[1] += self.figure.ground(row, pose[:1])[0]
+        begun, x = self.plan.begun[row]
+        first, pose = self.clip.pose(
+            np.array([begun, self.state.cycles[row]]) * self.reference.period
+        )
+        pose[0] += x - first[0]
+        pose[1] += self.figure.ground_heights(row, pose[:1])[0]
         return pose
-
-    _KEPT: tuple[str, ...] = (
-        'stance', 'landing', 'landing_error', 'landed', '_length', '_shift',
-    )  # fmt: skip
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            **super().get_state(row),
-            'random': self._random[row].bit_generator.state,
-            **{name: getattr(self, name)[row].copy() for name in self._KEPT},
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        super().set_state(row, state)
-        random = np.random.default_rng(0)
-        random.bit_generator.state = state['random']
-        self._random[row] = random
-        for name in self._KEPT:
-            getattr(self, name)[row] = state[name]
 
 
 def check_feet(character: CharacterRow) -> None:

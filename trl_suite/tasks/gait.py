@@ -20,9 +20,9 @@ from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, dynamics
 from trl_suite.engine import World
+from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure import PlanarFigure
-from trl_suite.tasks.reference import link_extents
 from trl_suite.tasks.task import check_simulated, consecutive, drawn_seed
 from trl_suite.terrain import Strip
 

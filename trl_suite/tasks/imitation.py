@@ -7,29 +7,46 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType, SimpleNamespace
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite import actuation, errors, hill
+from trl_suite.action_map import Drive, drive_all
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.characters.muscles import PLAIN, Muscle
-from trl_suite.engine import World
+from trl_suite.engine import World, native
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarFigure,
+    PlanarMeasurement,
+    PlanarState,
+    has_fallen,
+    measure,
+    must_wait,
+)
+from trl_suite.kinematics.planar_reference import ClipTable, Reference, feature
 from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
-from trl_suite.tasks.batch_task import BatchTask
-from trl_suite.tasks.figure import PlanarFigure
-from trl_suite.tasks.reference import Reference
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    Outcome,
+    Task,
+    begin,
+    conclude,
     consecutive,
     drawn_seed,
+    outcome,
     start_phases,
+    too_fast,
 )
 from trl_suite.terrain import Strip
+from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.util.compiled import compiled
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
@@ -38,8 +55,188 @@ VIEW_AHEAD = 3.0  # m; where it ends
 PHASE_BINS = 4
 CENTRES = ('clip', 'posture', 'original')  # of position control
 
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
-class Imitation(BatchTask):
+
+class ImitationState(NamedTuple):
+    """Where each simulation is in the clip, (n,).
+
+    Attributes:
+      phase: in [0, 1).
+      cycles: time on the clip in periods: the phase, not wrapped.
+      start: `cycles` at the start of the episode.
+    """
+
+    phase: np.ndarray
+    cycles: np.ndarray
+    start: np.ndarray
+
+
+class Layout(NamedTuple):
+    """Where things lie: columns of the clip's table, and of the observation (-1: not observed).
+
+    Attributes:
+      angles, rates, effectors, com_velocity, height, positions, phase: first columns of features.
+      strain_block, phase_block, target_block: where these blocks begin.
+      target: number of columns in the target block.
+    """
+
+    angles: int
+    rates: int
+    effectors: int
+    com_velocity: int
+    height: int
+    positions: int
+    phase: int
+    strain_block: int
+    phase_block: int
+    target_block: int
+    target: int
+
+
+_FEATURES = Layout._fields[:7]  # that are columns of the clip's table
+
+
+class Rules(NamedTuple):
+    """All that the rules of imitation work on.
+
+    Attributes:
+      weights: of pitch and joints in the errors of pose and velocity, (1 + J,).
+      term_weights, term_scales: of the reward terms, (5,).
+      rest, scale: length of every muscle at rest, and of its fibre, m.
+    """
+
+    engine: native.Engine
+    body: PlanarBody
+    physics: PlanarState
+    ground: PlanarGround
+    clip: ClipTable
+    layout: Layout
+    weights: np.ndarray
+    term_weights: np.ndarray
+    term_scales: np.ndarray
+    rest: np.ndarray
+    scale: np.ndarray
+    found: PlanarMeasurement
+    state: ImitationState
+    outcome: Outcome
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def finish_step(i: int, rules: Rules) -> None:
+    """Reward, failure and observation, after the physics has advanced."""
+    advance_clock(i, rules.clip, rules.state)
+    if breaks_down(i, rules):
+        conclude(i, True, rules.outcome)
+        return
+    measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+    compare(i, rules)
+    conclude(i, has_fallen(i, rules.body, rules.physics), rules.outcome)
+    observe(i, rules)
+
+
+@compiled
+def advance_clock(i: int, clip: ClipTable, state: ImitationState) -> None:
+    """Moves on along the clip by a control step."""
+    state.cycles[i] += CONTROL_TIMESTEP / clip.period
+    state.phase[i] = state.cycles[i] % 1.0
+
+
+@compiled
+def breaks_down(i: int, rules: Rules) -> bool:
+    """Whether the physics has diverged; the last finite observation then stands."""
+    joints = rules.body.dof[2:]
+    diverged = native.diverged(i, rules.engine) or too_fast(
+        i, joints, MAX_JOINT_SPEED, rules.physics.qvel
+    )
+    rules.outcome.diverged[i] = diverged
+    return diverged
+
+
+@compiled
+def compare(i: int, rules: Rules) -> None:
+    """Writes the reward terms: how near pose, velocities and feet are to those of the clip."""
+    body, physics, clip, layout = rules.body, rules.physics, rules.clip, rules.layout
+    phase, found, terms = rules.state.phase[i], rules.found, rules.outcome.reward_terms
+    pose = velocity = 0.0
+    for k in range(len(rules.weights)):  # pitch, then joints
+        angle = physics.qpos[i, body.qpos[2 + k]] - feature(phase, layout.angles + k, clip)
+        if k == 0:
+            angle = rewards.wrapped(angle)
+        rate = physics.qvel[i, body.dof[2 + k]] - feature(phase, layout.rates + k, clip)
+        pose += rules.weights[k] * (angle * angle)
+        velocity += rules.weights[k] * (rate * rate)
+    end_effector, count = 0.0, found.effectors.shape[1]
+    for k in range(count):
+        off = found.effectors[i, k] - feature(phase, layout.effectors + k, clip)
+        end_effector += off * off
+    com = 0.0
+    for k in range(2):
+        off = found.com_velocity[i, k] - feature(phase, layout.com_velocity + k, clip)
+        com += rewards.COM_ERROR_FACTOR * (off * off)
+    height = found.height[i] - feature(phase, layout.height, clip)
+
+    weights, scales = rules.term_weights, rules.term_scales
+    terms[i, POSE] = weights[POSE] * math.exp(-scales[POSE] * pose)
+    terms[i, VELOCITY] = weights[VELOCITY] * math.exp(-scales[VELOCITY] * velocity)
+    end_effector /= count // 2
+    terms[i, END_EFFECTOR] = weights[END_EFFECTOR] * math.exp(-scales[END_EFFECTOR] * end_effector)
+    terms[i, COM] = weights[COM] * math.exp(-scales[COM] * com)
+    terms[i, ROOT] = weights[ROOT] * math.exp(-scales[ROOT] * (height * height))
+
+
+@compiled
+def observe(i: int, rules: Rules) -> None:
+    """Writes the blocks behind terrain, pose and velocity: muscles, and phase or target."""
+    layout, clip, observation = rules.layout, rules.clip, rules.outcome.observation
+    phase = rules.state.phase[i]
+    for k in range(len(rules.rest)):
+        length = rules.physics.ten_length[i, k] - rules.rest[k]
+        observation[i, layout.strain_block + k] = length / rules.scale[k]
+    if layout.phase_block >= 0:
+        for k in range(1 + PHASE_BINS):
+            observation[i, layout.phase_block + k] = feature(phase, layout.phase + k, clip)
+    for k in range(layout.target):
+        observation[i, layout.target_block + k] = feature(phase, layout.height + k, clip)
+
+
+# Loops over simulations.
+
+
+@compiled
+def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
+    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+        else:
+            finish_step(i, rules)
+    return waiting
+
+
+@compiled
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
+    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+        compare(i, rules)
+        observe(i, rules)
+        if fresh:
+            begin(i, rules.outcome)
+    return waiting
+
+
+class Imitation(Task):
     """A planar character tracks a looping clip over random terrain.
 
     Observation blocks, in this order (N links, J joints; heading frame: x is mirrored while the
@@ -165,152 +362,97 @@ class Imitation(BatchTask):
         return f'{super().signature} of {" / ".join(parts)}'
 
     def bind(self, world: World) -> None:
-        self.world = world
+        self.world, n = world, world.n
         figure, row = self.figure, self.character.row
-        figure.bind(world, self.ABOUT)
+        figure.bind(world, self.blocks, self.ABOUT)
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
-        self._ctrl = world.ctrl[:, controls[0] : controls[-1] + 1]  # added one after the other
+        # They were added one after the other.
+        self._drive = Drive(self.action_map.centre, self.action_map.half_range, int(controls[0]))
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
         )  # fmt: skip
-        columns = self.reference.columns
-        # Pitch and joints.
-        self._angles, self._rates = figure.pose_qpos[2:], figure.pose_dof[2:]
-        self._phase_step = np.full(world.n, self.control_timestep / self.reference.period)
-        self._target_columns = slice(columns['height'].start, columns['velocities'].stop)
-        self._phase_columns = slice(columns['phase'].start, columns['quarter'].stop)
-        # What each squared difference contributes to each error, (features compared, terms).
-        effectors = len(figure.effectors)
-        parts = {
-            'angles': row.weights, 'rates': row.weights, 'effectors': np.full(2 * effectors, 1 / effectors),
-            'com_velocity': np.full(2, rewards.COM_ERROR_FACTOR), 'height': np.ones(1),
-        }  # fmt: skip
-        self._compared = {name: columns[name] for name in parts}
-        self._weights = np.zeros((columns['height'].stop, len(parts)))
-        for term, (name, weight) in enumerate(parts.items()):
-            self._weights[columns[name], term] = weight
+        self.state = ImitationState(*np.zeros((3, n)))
+        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), len(self.TERMS))
+        self.saved = (self.state, self.outcome)
+        self._found = figure.measurement()
+        terms = np.array(list(self.TERMS.values()))
+        self.rules = Rules(
+            world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
+            self._layout(), np.asarray(row.weights), terms[:, 0].copy(), terms[:, 1].copy(),
+            self._rest, self._scale, self._found, self.state, self.outcome,
+        )  # fmt: skip
 
-        n = world.n
-        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
-        self.reward = np.zeros(n)
-        self.reward_terms = np.zeros((n, len(self.TERMS)))
-        self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
-        self.phase = np.zeros(n)  # of the clip, in [0, 1)
-        self._start_cycles = np.zeros(n)  # phase of the start
-        self._ones = np.ones(n)
-        self._cycles = np.zeros(n)  # time on the clip in periods: the phase, not wrapped
-        self._comparison = np.zeros((n, len(self._weights)))
-        self._errors = np.zeros((n, 1, len(parts)))
-        self._all = self._views()
-
-    def _views(self) -> SimpleNamespace:
-        """The parts of all arrays that an observation reads and writes."""
-        part = {name: self._comparison[:, columns] for name, columns in self._compared.items()}
-        view = self.figure.views(
-            self.observation, self.blocks, part['effectors'], part['com_velocity']
+    def _layout(self) -> Layout:
+        columns = {name: part.start for name, part in self.reference.columns.items()}
+        starts = {name: part.start for name, part in self.blocks.items()}
+        target = self.blocks.get('target', slice(0, 0))
+        return Layout(
+            **{name: columns[name] for name in _FEATURES},
+            strain_block=starts.get('strain', -1),
+            phase_block=starts.get('phase', -1),
+            target_block=starts.get('target', -1),
+            target=target.stop - target.start,
         )
-        block = {name: self.observation[:, columns] for name, columns in self.blocks.items()}
-        view.angles_out, view.rates_out = part['angles'], part['rates']
-        view.height_out = part['height']
-        view.strain, view.target = block.get('strain'), block.get('target')
-        view.phase_out = block.get('phase')
-        return view
 
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
+    @property
+    def phase(self) -> np.ndarray:
+        """Phase of the clip in [0, 1), (n,)."""
+        return self.state.phase
+
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         terrain, centre = self.arena.terrain, 0.0
-        phases = np.empty(len(rows))
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+        phases = np.empty(len(env_ids))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
-            phases[i] = self._start_phase(drawn)
+            phases[k] = self._start_phase(drawn)
             if self._spawn == 'upstream':
                 # Where the original's segments meet: it builds them before it moves the root to 0.
-                centre = self.clip.pose(phases[i : i + 1] * self.reference.period)[0, 0] - 0.5
+                centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
             seed = drawn_seed(random_state)
             strip = Strip(terrain, seed, blend=self._blend, spawn=self._spawn, centre=centre)
-            self.arena.begin_episode(row, strip)
-        self.phase[rows] = self._cycles[rows] = self._start_cycles[rows] = phases
-        self.figure.place(rows, *self.reference.state(phases))
-        self.failed[rows] = self.diverged[rows] = False
-        self.reward[rows] = 0.0
+            self.arena.begin_episode(i, strip)
+        for array in self.state:
+            array[env_ids] = phases
+        self.figure.place(env_ids, *self.reference.state(phases))
+        self._begin(env_ids, random_states)
+        self._observe(env_ids, True)
 
-    def act(self, action: np.ndarray) -> None:
-        self._ctrl[...] = self.action_map.control(action)
+    def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        """What a subclass draws at the start, once characters stand."""
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        drive_all(env_ids, action, self._drive, self.world.ctrl)
         # Ground ahead is laid before the physics, so that its pictures are current after it.
-        self.arena.follow(self._all.x)
+        self.figure.follow(env_ids)
 
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        v = self._all
-        # Not in place: for a single number numpy takes three times as long in place.
-        step = self._phase_step if stepped is None else self._phase_step * stepped
-        self._cycles = self._cycles + step
-        np.remainder(self._cycles, self._ones, self.phase)
-        # Sums of squares are the cheapest tests for what happens once in many steps.
-        broken = False
-        self.diverged.fill(False)
-        if np.vdot(v.rates, v.rates) > MAX_JOINT_SPEED**2 or self.world.any_diverged():
-            too_fast = np.abs(v.rates).max(1) > MAX_JOINT_SPEED
-            np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
-            broken = bool(self.diverged.any())  # sums of many rows say little
-        self._step()
-        if broken:
-            # The last finite observation stands for what broke down.
-            kept = self.observation[self.diverged]
-            self.observe()
-            self.observation[self.diverged] = kept
-        else:
-            self.observe()
-        if broken or np.vdot(v.fall, v.fall) > 0:
-            np.logical_or(v.fall.any(1), self.diverged, out=self.failed)
-            self.reward_terms[self.failed] = 0.0
-        else:
-            self.failed.fill(False)
-        np.add.reduce(self.reward_terms, axis=1, out=self.reward)
-
-    def _step(self) -> None:
-        """What a subclass changes between the physics and the observation."""
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if finish_steps(env_ids, self.rules):
+            finish_steps(self._widened(env_ids), self.rules)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        v = self._all
-        self.figure.measure(v)
-        # What the reward compares, side by side with the same features of the reference.
-        reference = self.reference.features(self.phase)
-        v.qpos.take(self._angles, 1, v.angles_out, 'clip')
-        v.qvel.take(self._rates, 1, v.rates_out, 'clip')
-        v.height_out[...] = v.height
-        error = self._comparison - reference[:, : self._comparison.shape[1]]
-        if v.facing is not None:
-            error[:, 0] = rewards.wrap(error[:, 0])
-        error *= error
-        self._compare(error, reference)
+        self._observe(self.world.all_ids if env_ids is None else env_ids, False)
 
-        if v.strain is not None:
-            np.subtract(self.world.ten_length, self._rest, out=v.strain)
-            v.strain /= self._scale
-        if v.target is not None:
-            v.target[...] = reference[:, self._target_columns]
-        else:
-            v.phase_out[...] = reference[:, self._phase_columns]
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if observe_all(env_ids, fresh, self.rules):
+            observe_all(self._widened(env_ids), fresh, self.rules)
 
-    def _compare(self, error: np.ndarray, reference: np.ndarray) -> None:
-        """Writes the reward terms of squared differences from the features of the reference."""
-        # Row by row, so that a row's sums do not depend on how many rows there are.
-        np.matmul(error[:, None], self._weights, out=self._errors)
-        rewards.imitation(self._errors[:, 0], out=self.reward_terms)
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self._found.waiting[env_ids]]
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting
 
-    def infos(self) -> dict[str, Any]:
+    def info(self) -> dict[str, Any]:
         """Reward terms, fall and divergence flags, and the distance travelled in m."""
-        # An observation has terms, also that of a start; but a start has no reward, nor its parts.
-        terms = self.reward_terms.T * (self.reward != 0)
         return {
-            'reward_terms': dict(zip(self.TERMS, terms, strict=True)),
+            'reward_terms': dict(zip(self.TERMS, self.reward_terms.T.copy(), strict=True)),
             'fell': self.failed > self.diverged,
             'diverged': self.diverged.copy(),
-            'distance': self._all.x[:, 0].copy(),
+            'distance': self.world.qpos[:, self.figure.pose_qpos[0]].copy(),
         }
 
     def clip_action(self, row: int) -> np.ndarray:
@@ -330,33 +472,11 @@ class Imitation(BatchTask):
 
     def reference_pose(self, row: int) -> np.ndarray:
         """Pose of the reference beside the simulated character: x, z, pitch, joints."""
-        cycles = np.array([self._start_cycles[row], self._cycles[row]])
+        cycles = np.array([self.state.start[row], self.state.cycles[row]])
         first, pose = self.clip.pose(cycles * self.reference.period)
         pose[0] -= first[0]
-        pose[1] += self.figure.ground(row, pose[:1])[0]
+        pose[1] += self.figure.ground_heights(row, pose[:1])[0]
         return pose
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            'arena': self.arena.state(row),
-            'phase': float(self.phase[row]),
-            'start_cycles': float(self._start_cycles[row]),
-            'cycles': float(self._cycles[row]),
-            'observation': self.observation[row].copy(),
-            'reward': float(self.reward[row]),
-            'reward_terms': self.reward_terms[row].copy(),
-            'failed': bool(self.failed[row]),
-            'diverged': bool(self.diverged[row]),
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        self.arena.restore(row, state['arena'])
-        self.phase[row], self._cycles[row] = state['phase'], state['cycles']
-        self._start_cycles[row] = state['start_cycles']
-        self.observation[row] = state['observation']
-        self.reward[row] = state['reward']
-        self.reward_terms[row] = state['reward_terms']
-        self.failed[row], self.diverged[row] = state['failed'], state['diverged']
 
 
 def position_range(

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+from trl_suite.util.compiled import compiled
 
 # The imitation reward: weight * exp(-scale * error), weights summing to 1.
 # Source: the imitation scenario of the original; 'Does the choice of action space matter?'
@@ -71,6 +75,12 @@ def exponentials(
 def heading(error: np.ndarray) -> np.ndarray:
     """Returns ((1 + cos error) / 2)^4 of errors in rad: 1 where they are 0, 0 where opposite."""
     return (0.5 + 0.5 * np.cos(error)) ** 4
+
+
+@compiled
+def wrapped(angle: float) -> float:
+    """Returns an angle in rad wrapped to [-pi, pi]; one inside stays bit for bit."""
+    return angle - 2 * math.pi * np.rint(angle / (2 * math.pi))
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:

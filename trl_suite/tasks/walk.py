@@ -13,12 +13,12 @@ from trl_suite import actuation
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks import parts
 from trl_suite.tasks.batch_task import BatchTask
 from trl_suite.tasks.figure import PlanarFigure
 from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
-from trl_suite.tasks.reference import link_extents
 from trl_suite.tasks.task import MAX_JOINT_SPEED, consecutive, drawn_seed
 from trl_suite.terrain import Ground, Strip
 

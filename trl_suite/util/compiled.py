@@ -1,13 +1,14 @@
 """Functions of one simulation that Numba compiles, and the folder where the machine code is kept.
 
     @compiled
-    def fallen(i, contacts):
+    def has_fallen(i, contacts):
         for k in range(contacts.shape[1]):
             if contacts[i, k] > 0:
                 return True
         return False
 
-A compiled function takes numbers, arrays and (named) tuples of them. It may call other compiled
+A compiled function takes numbers, arrays and (named) tuples of them; a large tuple that Python passes
+again and again goes as a pack, see `packed`. It may call other compiled
 functions and `math`, allocates nothing in a loop, and never raises: a division by zero gives infinity
 or NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
 
@@ -32,7 +33,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 PATIENCE = 2.0  # s; compiling that takes longer is announced on a terminal
 UNUSED = 30 * 86400.0  # s; folders of other sources that nobody used for so long are removed
@@ -95,6 +96,24 @@ class Compiled:
 def compiled(function: Callable[..., Any]) -> Compiled:
     """Decorates a function of one simulation, or a loop over simulations."""
     return Compiled(function)
+
+
+class Unpacked(NamedTuple):
+    """What stands for a pack where functions run as Python."""
+
+    value: Any
+
+
+def packed(value: Any) -> Any:
+    """Returns a tuple of arrays as one argument; loops over simulations read its `value`.
+
+    The arrays stay alive as long as the pack.
+    """
+    if _numba().config.DISABLE_JIT:
+        return Unpacked(value)
+    from trl_suite.util.pack import pack
+
+    return pack(value)
 
 
 _setting = threading.Lock()

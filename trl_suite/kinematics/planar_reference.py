@@ -1,16 +1,42 @@
-"""A motion clip on a character: poses to start from and features to compare with."""
+"""A motion clip on a planar character: poses to start from and features to compare with."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from trl_suite.motion import Clip
+from trl_suite.util.compiled import compiled
 
 SAMPLES = 1024  # per cycle; in our clips links are placed within 0.5 mm of the exact pose
 _SAMPLES = np.full(1, float(SAMPLES))
+
+
+class ClipTable(NamedTuple):
+    """Features of a looping clip for compiled functions; see `Reference` for their columns.
+
+    Attributes:
+      table: features at SAMPLES phases, (SAMPLES, columns).
+      steps: differences to the next phase, (SAMPLES, columns).
+      period: duration of the cycle, s.
+    """
+
+    table: np.ndarray
+    steps: np.ndarray
+    period: float
+
+
+@compiled
+def feature(phase: float, column: int, clip: ClipTable) -> float:
+    """Returns a feature of the clip at a phase in [0, 1)."""
+    u = phase * SAMPLES
+    sample = min(max(math.floor(u), 0.0), SAMPLES - 1.0)
+    k = int(sample)
+    return clip.steps[k, column] * (u - sample) + clip.table[k, column]
 
 
 class Reference:
@@ -94,6 +120,11 @@ class Reference:
             name: slice(int(stop) - size, int(stop))
             for (name, size), stop in zip(sizes.items(), stops, strict=True)
         }
+
+    @property
+    def clip_table(self) -> ClipTable:
+        """The features for compiled functions."""
+        return ClipTable(self._table, self._steps, self.period)
 
     def state(self, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns where a character is at phases (n,).

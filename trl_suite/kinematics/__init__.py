@@ -1,0 +1,1 @@
+"""What tasks measure of a character: places, velocities and contacts, relative to its ground."""
