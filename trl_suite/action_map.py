@@ -104,13 +104,6 @@ def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
         ctrl[i, by.first + k] = min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
 
 
-@compiled
-def drive_all(env_ids: np.ndarray, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
-    """Writes the controls of some simulations."""
-    for i in env_ids:
-        drive(i, action, by, ctrl)
-
-
 @dataclasses.dataclass(frozen=True)
 class TorqueMap(ActionMap):
     """Torques of joints, some of them spherical: their norm is clamped after the affine map.

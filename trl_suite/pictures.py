@@ -17,7 +17,7 @@ import numpy as np
 
 from trl_suite import terrain as terrains
 from trl_suite.files import Path, check_path, replacing
-from trl_suite.terrain.surroundings import AHEAD, SAMPLES
+from trl_suite.terrain.spatial_ground import AHEAD, SAMPLES
 
 if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
     from dm_control import composer

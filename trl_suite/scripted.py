@@ -15,7 +15,7 @@ from trl_suite.tasks.composed import Composed
 from trl_suite.tasks.footsteps import SIDE
 from trl_suite.tasks.high_level import PLAN_NAMES, HighLevel
 from trl_suite.tasks.soccer import Soccer
-from trl_suite.terrain.surroundings import AHEAD, ASIDE, SAMPLES
+from trl_suite.terrain.spatial_ground import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
 CAUTIOUS = 0.5  # the same of one with something close ahead

@@ -15,7 +15,8 @@ from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
 from trl_suite.terrain.ground import Random
-from trl_suite.terrain.surroundings import ALL, HALF, VERTICES, Rows
+from trl_suite.terrain.spatial_ground import HALF, VERTICES
+from trl_suite.terrain.surroundings import ALL, Rows
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
 BASE = 1.0  # m; of height fields, below their lowest point

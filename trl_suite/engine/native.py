@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.util.compiled import Compiled, compiled
+from trl_suite.util.compiled import Compiled, compiled, compiled_loop
 
 # Of void f(const mjModel*, mjData*); the order of `Engine.functions`.
 NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData')
@@ -228,40 +228,45 @@ def diverged(i: int, engine: Engine) -> bool:
     return False
 
 
-# Loops over simulations.
+# Loops over simulations; the pack holds an Engine.
 
 
-@compiled
-def step_all(env_ids: np.ndarray, nstep: int, engine: Engine) -> None:
+@compiled_loop
+def step_all(env_ids: np.ndarray, nstep: int, pack: Any) -> None:
     """Advances simulations by `nstep` physics steps each."""
+    engine = pack.value
     for i in env_ids:
         step(i, nstep, engine)
 
 
-@compiled
-def forward_all(env_ids: np.ndarray, engine: Engine) -> None:
+@compiled_loop
+def forward_all(env_ids: np.ndarray, pack: Any) -> None:
     """Recomputes what depends on the written states of simulations."""
+    engine = pack.value
     for i in env_ids:
         forward(i, engine)
 
 
-@compiled
-def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
+@compiled_loop
+def reset_all(env_ids: np.ndarray, pack: Any) -> None:
     """Puts simulations into the initial state."""
+    engine = pack.value
     for i in env_ids:
         reset(i, engine)
 
 
-@compiled
-def read_all(env_ids: np.ndarray, engine: Engine) -> None:
+@compiled_loop
+def read_all(env_ids: np.ndarray, pack: Any) -> None:
     """Brings the arrays up to date for some simulations."""
+    engine = pack.value
     for i in env_ids:
         read(i, engine)
 
 
-@compiled
-def diverged_all(engine: Engine, out: np.ndarray) -> bool:
+@compiled_loop
+def diverged_all(pack: Any, out: np.ndarray) -> bool:
     """Writes which simulations have diverged; returns whether any has."""
+    engine = pack.value
     found = False
     for i in range(len(out)):
         out[i] = diverged(i, engine)

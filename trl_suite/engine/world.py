@@ -18,6 +18,7 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.engine import native
+from trl_suite.util.compiled import packed
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
 WRITABLE = (
@@ -37,6 +38,7 @@ class World:
       n: number of simulations.
       models: the MjModel of each; write terrain there, then call `set_const`.
       engine: the same simulations for compiled functions, see `trl_suite.engine.native`.
+      pack: of `engine`, for loops over simulations.
       qpos, qvel, ...: the fields of MjData named in `WRITABLE` and `READABLE`, and what else was
         asked for, shape (n, ...); all but the writable read-only.
     """
@@ -114,20 +116,21 @@ class World:
             time=np.zeros(self.n),
             timestep=models[0].opt.timestep,
         )
+        self.pack = packed(self.engine)
 
     # The verbs; env_ids are sorted numbers of simulations, without repeats.
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
         """Advances some or all simulations by `nstep` physics steps; velocities are then current."""
-        native.step_all(self.all_ids if env_ids is None else env_ids, nstep, self.engine)
+        native.step_all(self.all_ids if env_ids is None else env_ids, nstep, self.pack)
 
     def forward(self, env_ids: np.ndarray) -> None:
         """Recomputes everything that depends on a written state."""
-        native.forward_all(env_ids, self.engine)
+        native.forward_all(env_ids, self.pack)
 
     def reset(self, env_ids: np.ndarray) -> None:
         """Puts simulations into the model's initial state, warnings cleared."""
-        native.reset_all(env_ids, self.engine)
+        native.reset_all(env_ids, self.pack)
 
     def set_const(self, env_id: int) -> None:
         """Makes edits of the static geoms of a simulation take effect.
@@ -153,7 +156,7 @@ class World:
         data.warning.number[:] = 0
         self.engine.time[env_id] = data.time
         mujoco.mj_forward(model, data)
-        native.read_all(np.array([env_id]), self.engine)
+        native.read_all(np.array([env_id]), self.pack)
 
     def any_diverged(self) -> bool:
         """Whether `diverged` holds for any simulation."""
@@ -162,7 +165,7 @@ class World:
     def diverged(self) -> np.ndarray:
         """Returns which simulations met a non-finite or huge state since their reset, (n,)."""
         found = np.empty(self.n, bool)
-        native.diverged_all(self.engine, found)
+        native.diverged_all(self.pack, found)
         return found
 
     @property

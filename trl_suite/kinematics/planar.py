@@ -69,6 +69,7 @@ class PlanarMeasurement(NamedTuple):
       effectors: end effectors: all x ahead of the centre of mass, or of the root, then all z above
         the ground, (n, 2 * E) m.
       com_velocity: of the centre of mass, (n, 2) m/s.
+      leaving: whether the window of ground has to be laid anew, (n,).
       waiting: whether ground that a simulation looks back on has to be drawn first, (n,).
     """
 
@@ -77,6 +78,7 @@ class PlanarMeasurement(NamedTuple):
     height: np.ndarray
     effectors: np.ndarray
     com_velocity: np.ndarray
+    leaving: np.ndarray
     waiting: np.ndarray
 
 
@@ -175,16 +177,12 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 
 
 @compiled
-def roots_that_left(
-    env_ids: np.ndarray, body: PlanarBody, state: PlanarState, ground: PlanarGround, out: np.ndarray
-) -> int:
-    """Writes the ids of those whose windows must be laid anew; returns how many there are."""
-    count = 0
-    for i in env_ids:
-        if planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground):
-            out[count] = i
-            count += 1
-    return count
+def leaves(
+    i: int, body: PlanarBody, state: PlanarState, ground: PlanarGround, found: PlanarMeasurement
+) -> bool:
+    """Whether a window of ground must be laid anew; notes it."""
+    found.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
+    return found.leaving[i]
 
 
 class PlanarFigure:
@@ -268,7 +266,6 @@ class PlanarFigure:
             blocks['velocity'].start,
         )  # fmt: skip
         self.state = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
-        self._leaving = np.zeros(world.n, int)
 
     @property
     def ground(self) -> PlanarGround:
@@ -280,16 +277,12 @@ class PlanarFigure:
         n = self._world.n
         return PlanarMeasurement(
             np.ones(n), np.zeros(n), np.zeros(n), np.zeros((n, 2 * len(self.effectors))),
-            np.zeros((n, 2)), np.zeros(n, bool),
+            np.zeros((n, 2)), np.zeros(n, bool), np.zeros(n, bool),
         )  # fmt: skip
 
     def follow(self, env_ids: np.ndarray) -> None:
-        """Keeps ground under and ahead of some characters; called before the physics."""
-        leaving = np.empty(len(env_ids), int)
-        count = roots_that_left(env_ids, self.body, self.state, self.arena.ground, leaving)
-        if count:
-            env_ids = leaving[:count]
-            self.arena.follow_all(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
+        """Lays the windows of ground of some simulations anew, about where they are."""
+        self.arena.follow_all(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
 
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray

@@ -22,10 +22,11 @@ from trl_suite.motion import Clip
 from trl_suite.tasks import imitation, rewards
 from trl_suite.tasks.footsteps import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
 from trl_suite.tasks.imitation import SUBSTEPS, Imitation
-from trl_suite.tasks.plans import StraightPlans, options
+from trl_suite.tasks.plans import StraightPlans
+from trl_suite.tasks.plans import options as plans_from
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
 from trl_suite.terrain import planar_ground
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.random import Streams, random, uniform
 
 _DIGITS = 1e9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
@@ -196,23 +197,25 @@ def draw_plan(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> N
     put_on_ground(i, rules, plan)
 
 
-# Loops over simulations.
+# Loops over simulations; the pack holds Rules, Plan and Options.
 
 
-@compiled
+@compiled_loop
 def draw_plans(
-    env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options
+    env_ids: np.ndarray, pack: Any
 ) -> None:  # fmt: skip
     """Draws the first plans of some simulations."""
+    rules, plan, options = pack.value
     for i in env_ids:
         draw_plan(i, rules, plan, options)
 
 
-@compiled
+@compiled_loop
 def finish_steps(
-    env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options
+    env_ids: np.ndarray, pack: Any
 ) -> int:  # fmt: skip
     """Finishes the steps of all that can be measured; returns how many have to wait."""
+    rules, plan, options = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -223,11 +226,10 @@ def finish_steps(
     return waiting
 
 
-@compiled
-def observe_all(
-    env_ids: np.ndarray, fresh: bool, rules: imitation.Rules, plan: Plan, options: Options
-) -> int:
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, pack: Any) -> int:
     """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    rules, plan, options = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -305,7 +307,7 @@ class PlanarFootsteps(Imitation):
             raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
         if not 0 <= footstep_scale < np.inf:
             raise ValueError(f'footstep_scale is {footstep_scale}; expected 0 or more')
-        self.plans = options(StraightPlans, 'plans', {} if plans is None else plans)
+        self.plans = plans_from(StraightPlans, 'plans', {} if plans is None else plans)
         self.miss, self._footstep_scale = miss, footstep_scale
         super().__init__(
             character, arena, clip, actuation_model=actuation_model,
@@ -332,25 +334,24 @@ class PlanarFootsteps(Imitation):
         )  # fmt: skip
         self.saved = (*self.saved, self.plan)
         plans = self.plans
-        self._options = Options(
+        options = Options(
             plans.length[0], plans.length[1], plans.change, np.inf if self.miss is None else float(self.miss),
             float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
         )  # fmt: skip
+        self._plan_pack = packed((self.rules, self.plan, options))
 
     def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
             self._streams.seed(i, drawn_seed(random_state))
-        draw_plans(env_ids, self.rules, self.plan, self._options)
+        draw_plans(env_ids, self._plan_pack)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        parts = self.rules, self.plan, self._options
-        if finish_steps(env_ids, *parts):
-            finish_steps(self._widened(env_ids), *parts)
+        if finish_steps(env_ids, self._plan_pack):
+            finish_steps(self._widened(env_ids), self._plan_pack)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        parts = self.rules, self.plan, self._options
-        if observe_all(env_ids, fresh, *parts):
-            observe_all(self._widened(env_ids), fresh, *parts)
+        if observe_all(env_ids, fresh, self._plan_pack):
+            observe_all(self._widened(env_ids), fresh, self._plan_pack)
 
     def info(self) -> dict[str, Any]:
         """As for `Imitation`; and of the last foot that landed, whether it did so in this step.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite import actuation, errors, hill
-from trl_suite.action_map import Drive, drive_all
+from trl_suite.action_map import Drive, drive
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.characters.muscles import PLAIN, Muscle
@@ -26,6 +26,7 @@ from trl_suite.kinematics.planar import (
     PlanarMeasurement,
     PlanarState,
     has_fallen,
+    leaves,
     measure,
     must_wait,
 )
@@ -46,7 +47,7 @@ from trl_suite.tasks.task import (
 )
 from trl_suite.terrain import Strip
 from trl_suite.terrain.planar_ground import PlanarGround
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
@@ -101,6 +102,7 @@ class Rules(NamedTuple):
     """All that the rules of imitation work on.
 
     Attributes:
+      ctrl: controls of the physics, (n, ...).
       weights: of pitch and joints in the errors of pose and velocity, (1 + J,).
       term_weights, term_scales: of the reward terms, (5,).
       rest, scale: length of every muscle at rest, and of its fibre, m.
@@ -111,6 +113,8 @@ class Rules(NamedTuple):
     physics: PlanarState
     ground: PlanarGround
     clip: ClipTable
+    drive: Drive
+    ctrl: np.ndarray
     layout: Layout
     weights: np.ndarray
     term_weights: np.ndarray
@@ -203,12 +207,24 @@ def observe(i: int, rules: Rules) -> None:
         observation[i, layout.target_block + k] = feature(phase, layout.height + k, clip)
 
 
-# Loops over simulations.
+# Loops over simulations; the pack holds Rules.
 
 
-@compiled
-def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
+@compiled_loop
+def apply_actions(env_ids: np.ndarray, action: np.ndarray, pack: Any) -> int:
+    """Takes actions; returns how many windows of ground must be laid anew."""
+    rules = pack.value
+    leaving = 0
+    for i in env_ids:
+        drive(i, action, rules.drive, rules.ctrl)
+        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.found)
+    return leaving
+
+
+@compiled_loop
+def finish_steps(env_ids: np.ndarray, pack: Any) -> int:
     """Finishes the steps of all that can be measured; returns how many have to wait."""
+    rules = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -219,9 +235,10 @@ def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
     return waiting
 
 
-@compiled
-def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, pack: Any) -> int:
     """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    rules = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -368,7 +385,7 @@ class Imitation(Task):
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
         # They were added one after the other.
-        self._drive = Drive(self.action_map.centre, self.action_map.half_range, int(controls[0]))
+        by = Drive(self.action_map.centre, self.action_map.half_range, int(controls[0]))
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
@@ -380,9 +397,10 @@ class Imitation(Task):
         terms = np.array(list(self.TERMS.values()))
         self.rules = Rules(
             world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
-            self._layout(), np.asarray(row.weights), terms[:, 0].copy(), terms[:, 1].copy(),
+            by, world.ctrl, self._layout(), np.asarray(row.weights), terms[:, 0].copy(), terms[:, 1].copy(),
             self._rest, self._scale, self._found, self.state, self.outcome,
         )  # fmt: skip
+        self._pack = packed(self.rules)
 
     def _layout(self) -> Layout:
         columns = {name: part.start for name, part in self.reference.columns.items()}
@@ -424,20 +442,20 @@ class Imitation(Task):
         """What a subclass draws at the start, once characters stand."""
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        drive_all(env_ids, action, self._drive, self.world.ctrl)
-        # Ground ahead is laid before the physics, so that its pictures are current after it.
-        self.figure.follow(env_ids)
+        if apply_actions(env_ids, action, self._pack):
+            # Ground ahead is laid before the physics, so that its pictures are current after it.
+            self.figure.follow(env_ids[self._found.leaving[env_ids]])
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if finish_steps(env_ids, self.rules):
-            finish_steps(self._widened(env_ids), self.rules)
+        if finish_steps(env_ids, self._pack):
+            finish_steps(self._widened(env_ids), self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         self._observe(self.world.all_ids if env_ids is None else env_ids, False)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if observe_all(env_ids, fresh, self.rules):
-            observe_all(self._widened(env_ids), fresh, self.rules)
+        if observe_all(env_ids, fresh, self._pack):
+            observe_all(self._widened(env_ids), fresh, self._pack)
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
         """Draws the ground that some simulations look back on; returns which have waited for it."""

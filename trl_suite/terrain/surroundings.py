@@ -2,45 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from trl_suite.terrain import index, spatial_ground
 from trl_suite.terrain.ground import Ground
-from trl_suite.terrain.index import HALF, BoxIndex
-from trl_suite.terrain.layout import GRID, NO_BOXES, TURN_DISTANCE, Boxes
+from trl_suite.terrain.layout import GRID, NO_BOXES, Boxes
 from trl_suite.terrain.parameters import Terrain
+from trl_suite.terrain.spatial_ground import (
+    HALF,
+    SAMPLES,
+    SHIFT,
+    VERTICES,
+    Capacity,
+    SpatialGround,
+)
+from trl_suite.util.compiled import compiled
 
-SHIFT = 4.0  # m; windows are centred on multiples of it, and laid anew beyond it
-VERTICES = round(2 * HALF / GRID) + 1  # of a window, along each axis
 PROBES = 6  # draws by which the number of boxes of a window is foreseen
 SPARE = 1.3  # times the most boxes of any probe
-SAMPLES = 32  # of a map, along each axis
-AHEAD = (-1.0, 10.0)  # m; along the heading, from where to where a map reaches
-ASIDE = 5.5  # m; to each side
-_SPACING = (AHEAD[1] - AHEAD[0]) / (SAMPLES - 1), 2 * ASIDE / (SAMPLES - 1)  # m
-_FORWARD = np.linspace(*AHEAD, SAMPLES)
-_RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)[:, None]
-_CHUNK = 16  # rows whose maps are made at once: they fit into the processor's cache
-_CELLS_PER_METRE = 1 / GRID
-_LAST = VERTICES - 1.0 - 1e-6
-_CORNERS = (0, VERTICES, 1, VERTICES + 1)  # of a cell: near, along x, along y, far
 
 Rows = slice | np.ndarray
 ALL = slice(None)
-
-
-class Capacity(NamedTuple):
-    """The most that a window of a terrain holds."""
-
-    level: bool  # whether there is a plane
-    grid: bool  # whether there is a height grid
-    boxes: int
-    belts: int
-    movers: int
-    strips: bool  # whether all boxes reach from the right rim to the left one
 
 
 def capacity(terrain: Terrain) -> Capacity:
@@ -83,9 +69,11 @@ class Surroundings:
     that all it sees in a map lies inside.
 
     Attributes:
+      arrays: the windows, for the compiled functions of one simulation in
+        `trl_suite.terrain.spatial_ground`.
       grounds: of each character.
-      centre: middles of the windows, m, (n, 2).
       boxes: in each window, in order of x.
+      centre: middles of the windows, m, (n, 2).
       way: how far moving boxes are from the start of their ways, m, (n, M).
       direction: 1 where they go towards the end, -1 towards the start, (n, M).
       start, axis, length, half_size, speed: of their ways and of themselves; see `Movers`.
@@ -95,17 +83,16 @@ class Surroundings:
         self.n, self.capacity = n, capacity
         self.grounds: list[Ground | None] = [None] * n
         self.boxes: list[Boxes] = [NO_BOXES] * n
-        self.centre = np.zeros((n, 2))
-        self._row = np.arange(n)[:, None]
-        self._level = np.full((n, 1), -np.inf)
-        self._low = np.zeros((n, 2))  # corner of the window, m
-        if capacity.grid:
-            self._grid = np.zeros((n, VERTICES * VERTICES), np.float32)  # along x, then y
-        self._index = BoxIndex(n, capacity.boxes, capacity.belts, capacity.strips)
-        movers = (n, capacity.movers)
-        self.start, self.axis, self.half_size = np.zeros((3, *movers, 2))
-        self.length, self.speed, self.way, self._mover_top = np.zeros((4, *movers))
-        self.direction = np.ones(movers)
+        self.arrays: SpatialGround = spatial_ground.empty(n, capacity)
+        self._numbers = np.arange(n)
+        ground = self.arrays
+        self.centre, self.way, self.direction = (
+            ground.centre, ground.mover_distance, ground.mover_direction,
+        )  # fmt: skip
+        self.start, self.axis, self.length = (
+            ground.mover_start, ground.mover_axis, ground.mover_length,
+        )  # fmt: skip
+        self.half_size, self.speed = ground.mover_half_size, ground.mover_speed
 
     @property
     def windowed(self) -> bool:
@@ -141,15 +128,16 @@ class Surroundings:
                 f'a ground of type {ground.type!r} holds more than {capacity}, which {PROBES} draws '
                 'led to expect: its generator must make the same kinds of things every time'
             )
+        arrays = self.arrays
         self.grounds[row] = ground
-        self._level[row] = -np.inf if layout.level is None else layout.level
+        arrays.level[row] = -np.inf if layout.level is None else layout.level
         self.half_size[row], self.speed[row] = -1.0, 0.0
         if layout.movers is not None:
             part = layout.movers
             self.start[row, :movers], self.axis[row, :movers] = part.start, part.axis
             self.length[row, :movers], self.speed[row, :movers] = part.length, part.speed
             self.half_size[row, :movers] = part.half_size
-            self._mover_top[row, :movers] = self._level[row] + part.height
+            arrays.mover_top[row, :movers] = arrays.level[row] + part.height
             self.way[row, :movers] = part.phase * part.length
             self.direction[row, :movers] = part.direction
         self._lay(row, np.round(np.asarray(xy, float) / SHIFT) * SHIFT)
@@ -191,11 +179,7 @@ class Surroundings:
 
         Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
         """
-        away = self.centres(rows) - xy[:, None]
-        far = np.square(away).sum(2) > TURN_DISTANCE**2
-        way, direction = self.way[rows], self.direction[rows]
-        direction = np.where(far & (way <= 0), 1.0, direction)
-        self.direction[rows] = np.where(far & (way >= self.length[rows]), -1.0, direction)
+        _turn_all(self._numbers[rows], np.ascontiguousarray(xy, float), self.arrays)
 
     def centres(self, rows: Rows = ALL) -> np.ndarray:
         """Middles of the moving boxes, m, (rows, M, 2)."""
@@ -203,21 +187,22 @@ class Surroundings:
 
     def grid(self, row: int) -> np.ndarray:
         """The height grid of a window, along x, then y, m, (VERTICES, VERTICES)."""
-        return self._grid[row].reshape(VERTICES, VERTICES)
+        return self.arrays.grid[row].reshape(VERTICES, VERTICES)
 
     # Queries.
 
     def height(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
         """Heights of the surface at points (rows, k), m."""
-        return self._look(x, y, rows)[0]
+        out = np.empty(np.shape(x))
+        self._points(_heights, x, y, rows, out)
+        return out
 
     def velocity(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
         """Horizontal velocities of the surface at points (rows, k), m/s, (rows, k, 2)."""
-        if not self.moving:
-            return np.zeros((*x.shape, 2))
-        velocity = self._look(x, y, rows, np.zeros((2, *x.shape)))[1]
-        assert velocity is not None
-        return np.moveaxis(velocity, 0, 2)
+        out = np.zeros((*np.shape(x), 2))
+        if self.moving:
+            self._points(_velocities, x, y, rows, out)
+        return out
 
     def height_map(
         self,
@@ -241,10 +226,7 @@ class Surroundings:
           Heights in m, (rows, 1024).
         """
         out = np.empty((len(xy), SAMPLES**2)) if out is None else out
-        under = self.height(xy[:, :1], xy[:, 1:], rows)
-        for part, chosen in self._chunks(rows, len(xy)):
-            heights, _ = self._map(xy[part], heading[part], chosen, None)
-            np.subtract(heights, under[part], out=out[part])
+        self._maps(_height_maps, xy, heading, rows, out)
         return out
 
     def velocity_map(
@@ -262,147 +244,45 @@ class Surroundings:
           Velocities in m/s, (rows, 2048): along the heading at the samples of a height map, then
           to the right of it.
         """
-        count = SAMPLES**2
-        out = np.empty((len(xy), 2 * count)) if out is None else out
-        if not self.moving:
-            out[...] = 0.0
-            return out
-        under = self.velocity(xy[:, :1], xy[:, 1:], rows)
-        for part, chosen in self._chunks(rows, len(xy)):
-            velocity = np.zeros((2, len(xy[part]), count))
-            self._map(xy[part], heading[part], chosen, velocity)
-            x, y = velocity
-            x -= under[part, :, 0]
-            y -= under[part, :, 1]
-            cosine, sine = np.cos(heading[part])[:, None], np.sin(heading[part])[:, None]
-            np.add(cosine * x, sine * y, out=out[part, :count])
-            np.subtract(sine * x, cosine * y, out=out[part, count:])
+        out = np.empty((len(xy), 2 * SAMPLES**2)) if out is None else out
+        self._maps(_velocity_maps, xy, heading, rows, out)
         return out
 
-    def _chunks(self, rows: Rows, count: int) -> Sequence[tuple[slice, Rows]]:
-        parts = [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
-        if isinstance(rows, slice):
-            first = rows.indices(self.n)[0]  # rows of a slice are neighbours
-            return [(part, slice(first + part.start, first + part.stop)) for part in parts]
-        return [(part, rows[part]) for part in parts]
-
-    def _map(
-        self, xy: np.ndarray, heading: np.ndarray, rows: Rows, velocity: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Heights at the samples of maps, (rows, 1024); adds velocities, (2, rows, 1024)."""
-        count = len(xy)
-        cosine, sine = np.cos(heading)[:, None, None], np.sin(heading)[:, None, None]
-        x, y = xy[:, :1, None], xy[:, 1:, None]
-        points_x = ((x + cosine * _FORWARD) + sine * _RIGHT).reshape(count, -1)
-        points_y = ((y + sine * _FORWARD) - cosine * _RIGHT).reshape(count, -1)
-        heights, velocity = self._look(points_x, points_y, rows, velocity, movers=False)
-        if not self.capacity.movers:
-            return heights, velocity
-        # Where in the map the boxes are, in samples; of those in reach only the samples nearby.
-        centres, half = self.centres(rows), self.half_size[rows]
-        away = centres - xy[:, None]
-        u = (cosine[..., 0] * away[..., 0] + sine[..., 0] * away[..., 1] - AHEAD[0]) / _SPACING[0]
-        v = (sine[..., 0] * away[..., 0] - cosine[..., 0] * away[..., 1] + ASIDE) / _SPACING[1]
-        reach = np.hypot(half[..., 0], half[..., 1]) / min(_SPACING)
-        near = (np.abs(u - 0.5 * (SAMPLES - 1)) < 0.5 * SAMPLES + reach) & (half[..., 0] >= 0)
-        near &= np.abs(v - 0.5 * (SAMPLES - 1)) < 0.5 * SAMPLES + reach
-        row, box = np.nonzero(near)
-        if not len(row):
-            return heights, velocity
-        tops = self._mover_top[rows][row, box]
-        order = np.argsort(tops, kind='stable')  # of two boxes at a sample the higher is put last
-        row, box, tops = row[order], box[order], tops[order]
-        patch = np.arange(int(2 * reach[row, box].max()) + 2)
-        first_u = np.ceil(u[row, box] - reach[row, box]).astype(int)
-        first_v = np.ceil(v[row, box] - reach[row, box]).astype(int)
-        i = (first_u[:, None] + patch)[:, None, :]
-        j = (first_v[:, None] + patch)[:, :, None]
-        inside = (i >= 0) & (i < SAMPLES) & (j >= 0) & (j < SAMPLES)
-        sample = row[:, None, None] * SAMPLES**2 + np.where(inside, SAMPLES * j + i, 0)
-        middle, half = centres[row, box][:, None, None], half[row, box][:, None, None]
-        inside &= np.abs(points_x.ravel()[sample] - middle[..., 0]) <= half[..., 0]
-        inside &= np.abs(points_y.ravel()[sample] - middle[..., 1]) <= half[..., 1]
-        top = np.broadcast_to(tops[:, None, None], inside.shape)
-        inside &= top > heights.ravel()[sample]
-        hit = sample[inside]
-        heights.ravel()[hit] = top[inside]
-        if velocity is not None:
-            speed = (self.direction[rows] * self.speed[rows])[row, box]
-            for axis in (0, 1):
-                along = np.broadcast_to(
-                    (speed * self.axis[rows][row, box, axis])[:, None, None], inside.shape
-                )
-                velocity[axis].ravel()[hit] = along[inside]
-        return heights, velocity
-
-    def _look(
+    def _points(
         self,
-        x: np.ndarray,
-        y: np.ndarray,
+        query: Callable[..., None],
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
         rows: Rows,
-        velocity: np.ndarray | None = None,
-        movers: bool = True,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Heights at points (rows, k); puts velocities of what moves into (2, rows, k)."""
-        heights = np.empty(x.shape)
-        if self.capacity.grid:
-            self._on_grid(x, y, rows, heights)
-            if self.capacity.level:
-                np.maximum(heights, self._level[rows], out=heights)
-        else:
-            heights[...] = self._level[rows]
-        if self.capacity.boxes + self.capacity.belts:
-            self._index.cover(x, y, self._low[rows], self._row[rows], heights, velocity)
-        if movers and self.capacity.movers:
-            centres, half = self.centres(rows), self.half_size[rows]
-            inside = np.abs(x[..., None] - centres[:, None, :, 0]) <= half[:, None, :, 0]
-            inside &= np.abs(y[..., None] - centres[:, None, :, 1]) <= half[:, None, :, 1]
-            tops = np.where(inside, self._mover_top[rows][:, None], -np.inf)
-            best = tops.argmax(2)
-            top = np.take_along_axis(tops, best[..., None], 2)[..., 0]
-            above = top > heights
-            np.copyto(heights, top, where=above)
-            if velocity is not None:
-                speed = self.direction[rows] * self.speed[rows]
-                for axis in (0, 1):
-                    along = np.take_along_axis(speed * self.axis[rows][..., axis], best, 1)
-                    np.copyto(velocity[axis], along, where=above)
-        return heights, velocity
+        out: np.ndarray,
+    ) -> None:
+        """Asks a compiled loop about points."""
+        env_ids = self._numbers[rows]
+        x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
+        if x.ndim != 2 or x.shape != y.shape or len(x) != len(env_ids):
+            raise ValueError(
+                f'x and y have shapes {x.shape} and {y.shape}; expected ({len(env_ids)}, k)'
+            )
+        query(env_ids, x, y, self.arrays, out)
 
-    def _on_grid(self, x: np.ndarray, y: np.ndarray, rows: Rows, heights: np.ndarray) -> None:
-        """Writes heights of the grid at points (rows, k); see `ground.triangles`."""
-        corner = self._low[rows]
-        u, v = x - corner[:, :1], y - corner[:, 1:]
-        u *= _CELLS_PER_METRE
-        v *= _CELLS_PER_METRE
-        np.clip(u, 0, _LAST, out=u)
-        np.clip(v, 0, _LAST, out=v)
-        i, j = u.astype(np.int32), v.astype(np.int32)
-        u -= i
-        v -= j
-        i *= VERTICES
-        i += j
-        if self.n > 1:
-            i += (self._row[rows] * VERTICES**2).astype(np.int32)
-        # A plane through three vertices and, beyond the diagonal, what the fourth is off it.
-        grid = self._grid.reshape(-1)
-        base, along, aside, far = (
-            grid[offset:].take(i, mode='clip').astype(float) for offset in _CORNERS
-        )
-        far += base
-        far -= along
-        far -= aside
-        along -= base
-        aside -= base
-        beyond = u + v
-        beyond -= 1
-        np.maximum(beyond, 0, out=beyond)
-        u *= along
-        v *= aside
-        beyond *= far
-        np.add(base, u, out=heights)
-        heights += v
-        heights += beyond
+    def _maps(
+        self,
+        query: Callable[..., None],
+        xy: npt.ArrayLike,
+        heading: npt.ArrayLike,
+        rows: Rows,
+        out: np.ndarray,
+    ) -> None:
+        """Asks a compiled loop for maps."""
+        env_ids = self._numbers[rows]
+        xy, heading = np.ascontiguousarray(xy, float), np.ascontiguousarray(heading, float)
+        count = len(env_ids)
+        if xy.shape != (count, 2) or heading.shape != (count,) or len(out) != count:
+            raise ValueError(
+                f'xy, heading and out have shapes {xy.shape}, {heading.shape} and {out.shape}; '
+                f'expected ({count}, 2), ({count},) and ({count}, k)'
+            )
+        query(env_ids, xy, heading, self.arrays, out)
 
     # State.
 
@@ -429,15 +309,15 @@ class Surroundings:
         ground = self.grounds[row]
         assert ground is not None
         layout = ground.layout
-        self.centre[row] = centre
+        arrays = self.arrays
+        arrays.centre[row] = centre
         low, high = centre - HALF, centre + HALF
-        self._low[row] = low
         if self.capacity.grid:
             if layout.grid is None:
-                self._grid[row] = self._level[row]
+                arrays.grid[row] = arrays.level[row]
             else:
                 i, j = (np.arange(VERTICES) + round(edge / GRID) for edge in low.tolist())
-                self._grid[row] = layout.vertices(i, j).reshape(-1)
+                arrays.grid[row] = layout.vertices(i, j).reshape(-1)
         if not self.capacity.boxes + self.capacity.belts:
             return
         boxes = layout.boxes_in(low, high)
@@ -446,4 +326,53 @@ class Surroundings:
             nearest = np.argsort(gap.max(1), kind='stable')[: self.capacity.boxes]
             boxes = boxes.select(nearest)
         self.boxes[row] = boxes = boxes.select(np.argsort(boxes.position[:, 0], kind='stable'))
-        self._index.fill(row, low, boxes, layout.belts)
+        index.fill(row, boxes, layout.belts, arrays)
+
+
+@compiled
+def _turn_all(env_ids: np.ndarray, xy: np.ndarray, ground: SpatialGround) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.turn_movers(env_ids[k], xy[k, 0], xy[k, 1], ground)
+
+
+@compiled
+def _heights(
+    env_ids: np.ndarray, x: np.ndarray, y: np.ndarray, ground: SpatialGround, out: np.ndarray
+) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            out[k, p] = spatial_ground.height(env_ids[k], x[k, p], y[k, p], ground)
+
+
+@compiled
+def _velocities(
+    env_ids: np.ndarray, x: np.ndarray, y: np.ndarray, ground: SpatialGround, out: np.ndarray
+) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            east, north = spatial_ground.velocity(env_ids[k], x[k, p], y[k, p], ground)
+            out[k, p, 0], out[k, p, 1] = east, north
+
+
+@compiled
+def _height_maps(
+    env_ids: np.ndarray,
+    xy: np.ndarray,
+    heading: np.ndarray,
+    ground: SpatialGround,
+    out: np.ndarray,
+) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.height_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])
+
+
+@compiled
+def _velocity_maps(
+    env_ids: np.ndarray,
+    xy: np.ndarray,
+    heading: np.ndarray,
+    ground: SpatialGround,
+    out: np.ndarray,
+) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.velocity_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])

@@ -7,10 +7,15 @@
                 return True
         return False
 
-A compiled function takes numbers, arrays and (named) tuples of them; a large tuple that Python passes
-again and again goes as a pack, see `packed`. It may call other compiled
-functions and `math`, allocates nothing in a loop, and never raises: a division by zero gives infinity
-or NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
+A compiled function takes numbers, arrays and (named) tuples of them, and returns numbers or tuples of
+numbers. It may call other compiled functions and `math`, allocates nothing (Numba refuses to compile
+one that does, since arrays are not reference-counted: counting costs more than most functions do, and
+threads would wait for each other's counts), and never raises: a division by zero gives infinity or
+NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
+
+A call with tuples of many arrays costs some 50 ns. A small function that is called in an inner loop is
+decorated with `compiled_inline`: its code takes the place of every call. Loops over simulations, which
+Python calls, are decorated with `compiled_loop`; they take large tuples as a pack, see `packed`.
 
 Numba is imported and the function is compiled when it is first called; the result is kept on disk.
 The folder is `$NUMBA_CACHE_DIR`, or else the user's cache folder, and in it one folder for each state
@@ -49,16 +54,23 @@ class Compiled:
     """
 
     def __init__(
-        self, function: Callable[..., Any], native: Callable[[], Callable[..., Any]] | None = None
+        self,
+        function: Callable[..., Any],
+        native: Callable[[], Callable[..., Any]] | None = None,
+        inline: bool = False,
+        counted: bool = False,
     ) -> None:
         """Wraps a function.
 
         Args:
           function: what runs if compiling is switched off, and what is compiled otherwise.
           native: returns what is compiled in its place: for what only Numba can express.
+          inline: whether its code takes the place of calls.
+          counted: whether arrays are reference-counted, as reading a pack needs.
         """
         functools.update_wrapper(self, function)
         self.function, self._native = function, native
+        self._inline, self._counted = inline, counted
         self._lock = threading.Lock()
         self._dispatcher: Callable[..., Any] | None = None
 
@@ -75,9 +87,10 @@ class Compiled:
         numba = _numba()
         if numba.config.DISABLE_JIT:
             return self.function
-        options = {'nogil': True, 'error_model': 'numpy'}
+        options = {'nogil': True, 'error_model': 'numpy', 'forceinline': self._inline}
         if self._native is not None:  # a line or two; what calls it is kept on disk
-            return numba.njit(self._native(), **options)
+            return numba.njit(self._native(), _nrt=True, **options)
+        options['_nrt'] = self._counted
         folder = cache_folder()
         if folder is None:
             return numba.njit(self.function, **options)
@@ -96,6 +109,16 @@ class Compiled:
 def compiled(function: Callable[..., Any]) -> Compiled:
     """Decorates a function of one simulation, or a loop over simulations."""
     return Compiled(function)
+
+
+def compiled_inline(function: Callable[..., Any]) -> Compiled:
+    """Decorates a small function that other compiled functions call in inner loops."""
+    return Compiled(function, inline=True)
+
+
+def compiled_loop(function: Callable[..., Any]) -> Compiled:
+    """Decorates a loop over simulations that takes packs, see `packed`."""
+    return Compiled(function, counted=True)
 
 
 class Unpacked(NamedTuple):

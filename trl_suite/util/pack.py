@@ -11,7 +11,7 @@ from typing import Any
 from numba import types
 from numba.experimental import structref
 
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled_loop
 
 
 @structref.register
@@ -29,7 +29,7 @@ class Pack(structref.StructRefProxy):
 structref.define_proxy(Pack, PackType, ['value'])
 
 
-@compiled
+@compiled_loop
 def pack(value: Any) -> Pack:
     """Returns a pack of a value."""
     return Pack(value)
