@@ -218,7 +218,8 @@ class ObservationTest(parameterized.TestCase):
 
 
 def observed_terms(environment):
-    """Reward terms of the last observation, which a start has as well."""
+    """Reward terms of the present state, which a start has as well."""
+    environment.task.observe()
     return dict(
         zip(rewards.IMITATION_TERMS, environment.task.reward_terms[0].tolist(), strict=True)
     )

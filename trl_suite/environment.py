@@ -203,14 +203,8 @@ class Environment(composer.Environment):
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in the last step beyond the time step: see the task's `info`."""
-
-        def only_row(value: Any) -> Any:
-            if isinstance(value, dict):
-                return {name: only_row(part) for name, part in value.items()}
-            return value[0].item()
-
-        return only_row(self._task.info())
+        """What happened in the last step beyond the time step: see the task's `info_arrays`."""
+        return self._task.info_of(0)
 
     # State.
 

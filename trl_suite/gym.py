@@ -126,6 +126,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
 
     def _observation(self, blocks: Mapping[str, np.ndarray]) -> Any:
         if self._flat:
+            if len(blocks) == 1:
+                return next(iter(blocks.values())).astype(self._dtype)
             return np.concatenate([part.ravel() for part in blocks.values()], dtype=self._dtype)
         return {name: part.astype(self._dtype) for name, part in blocks.items()}
 

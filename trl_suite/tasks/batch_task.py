@@ -41,6 +41,14 @@ class BatchTask(Task):
     def info(self) -> dict[str, Any]:
         return self.infos()
 
+    def info_of(self, env_id: int) -> dict[str, Any]:
+        def one(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: one(part) for name, part in value.items()}
+            return value[env_id].item()
+
+        return one(self.infos())
+
     def simulate(self, rows: np.ndarray | None = None) -> None:
         ids = self.world.all_ids if rows is None else rows
         self.world.share(lambda part: self.world.step(self._substeps, part), ids)

@@ -182,8 +182,14 @@ class Composed(Task):
 
     def info(self) -> dict[str, Any]:
         """As of the other task; the terms are of both."""
-        found = self.task.info()
-        terms = {name: term.copy() for name, term in zip(self._rewards, self._terms, strict=True)}
+        return self._added(self.task.info(), lambda term: term.copy())
+
+    def info_of(self, env_id: int) -> dict[str, Any]:
+        """As of the other task; the terms are of both."""
+        return self._added(self.task.info_of(env_id), lambda term: term.item(env_id))
+
+    def _added(self, found: dict[str, Any], read: Callable[[np.ndarray], Any]) -> dict[str, Any]:
+        terms = {name: read(term) for name, term in zip(self._rewards, self._terms, strict=True)}
         return {**found, 'reward_terms': {**found.get('reward_terms', {}), **terms}}
 
     def get_state(self, env_id: int) -> dict[str, Any]:

@@ -333,6 +333,11 @@ class PlanarFootsteps(Imitation):
             np.zeros((n, 2)), self._streams.state,
         )  # fmt: skip
         self.saved = (*self.saved, self.plan)
+        self.info_arrays |= {
+            'landed': self.plan.landed,
+            'landing_error': self.plan.landing_error,
+            'heading_error': np.zeros(n),  # it cannot turn
+        }
         plans = self.plans
         options = Options(
             plans.length[0], plans.length[1], plans.change, np.inf if self.miss is None else float(self.miss),
@@ -352,18 +357,6 @@ class PlanarFootsteps(Imitation):
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
         if observe_all(env_ids, fresh, self._plan_pack):
             observe_all(self._widened(env_ids), fresh, self._plan_pack)
-
-    def info(self) -> dict[str, Any]:
-        """As for `Imitation`; and of the last foot that landed, whether it did so in this step.
-
-        `landed` (n,) bool; `landing_error` (n,) m, 0 before any landing; `heading_error` (n,), 0.
-        """
-        return {
-            **super().info(),
-            'landed': self.plan.landed.copy(),
-            'landing_error': self.plan.landing_error.copy(),
-            'heading_error': np.zeros_like(self.plan.landing_error),
-        }
 
     def markers(self, row: int) -> list[Marker]:
         """Where the feet are to land."""

@@ -393,6 +393,12 @@ class Imitation(Task):
         self.state = ImitationState(*np.zeros((3, n)))
         self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), len(self.TERMS))
         self.saved = (self.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': dict(zip(self.TERMS, self.reward_terms.T, strict=True)),
+            'fell': self.outcome.fell,
+            'diverged': self.outcome.diverged,
+            'distance': world.qpos[:, figure.pose_qpos[0]],
+        }
         self._found = figure.measurement()
         terms = np.array(list(self.TERMS.values()))
         self.rules = Rules(
@@ -463,15 +469,6 @@ class Imitation(Task):
         for i in waiting.tolist():
             self.arena.widen(i)
         return waiting
-
-    def info(self) -> dict[str, Any]:
-        """Reward terms, fall and divergence flags, and the distance travelled in m."""
-        return {
-            'reward_terms': dict(zip(self.TERMS, self.reward_terms.T.copy(), strict=True)),
-            'fell': self.failed > self.diverged,
-            'diverged': self.diverged.copy(),
-            'distance': self.world.qpos[:, self.figure.pose_qpos[0]].copy(),
-        }
 
     def clip_action(self, row: int) -> np.ndarray:
         """Action that drives joints along the clip, without feedback on balance.

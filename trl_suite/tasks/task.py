@@ -48,6 +48,7 @@ class Outcome(NamedTuple):
       reward_terms: its parts, weighted, (n, terms); 0 after a reset.
       failed: whether the episode has ended with discount 0, (n,) bool.
       diverged: whether that was since the physics broke down, (n,) bool.
+      fell: whether that was for another reason, (n,) bool.
     """
 
     observation: np.ndarray
@@ -55,20 +56,21 @@ class Outcome(NamedTuple):
     reward_terms: np.ndarray
     failed: np.ndarray
     diverged: np.ndarray
+    fell: np.ndarray
 
 
 def outcome(n: int, size: int, terms: int = 0) -> Outcome:
     """Makes room for n simulations, an observation of some size, and some reward terms."""
     return Outcome(
-        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), np.zeros(n, bool), np.zeros(n, bool)
-    )
+        np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
+    )  # fmt: skip
 
 
 @compiled
 def begin(i: int, outcome: Outcome) -> None:
     """Clears what the last episode of a simulation came to, but for its observation."""
     outcome.reward[i] = 0.0
-    outcome.failed[i] = outcome.diverged[i] = False
+    outcome.failed[i] = outcome.diverged[i] = outcome.fell[i] = False
     for k in range(outcome.reward_terms.shape[1]):
         outcome.reward_terms[i, k] = 0.0
 
@@ -77,6 +79,7 @@ def begin(i: int, outcome: Outcome) -> None:
 def conclude(i: int, failed: bool, outcome: Outcome) -> None:
     """Sums the reward terms up, or drops them where the episode has failed."""
     outcome.failed[i] = failed
+    outcome.fell[i] = failed and not outcome.diverged[i]
     reward = 0.0
     for k in range(outcome.reward_terms.shape[1]):
         if failed:
@@ -113,6 +116,7 @@ class Task(composer.Task):
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
       saved: tuples of arrays with n rows that make up the state of the task, `outcome` among them.
+      info_arrays: what `info` tells, arrays of n rows by name, or dicts of such; kept up to date.
     """
 
     world: World
@@ -120,6 +124,7 @@ class Task(composer.Task):
     blocks: dict[str, slice]
     outcome: Outcome
     saved: tuple[NamedTuple, ...]
+    info_arrays: dict[str, Any]
     fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
     _begun = False  # whether no step was taken since composer's reset
 
@@ -145,10 +150,6 @@ class Task(composer.Task):
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         """Writes the observations of some simulations, or of all, from the state of the world."""
 
-    @abc.abstractmethod
-    def info(self) -> dict[str, Any]:
-        """Returns what happened beyond observation and reward: arrays of n rows, or dicts of such."""
-
     # The step and the state, for all families.
 
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
@@ -169,6 +170,14 @@ class Task(composer.Task):
     def simulate(self, env_ids: np.ndarray) -> None:
         """Advances the physics of some simulations by one control step."""
         self.world.step(self._substeps, env_ids)
+
+    def info(self) -> dict[str, Any]:
+        """Returns what happened beyond observation and reward: arrays of n rows, or dicts of such."""
+        return _each(self.info_arrays, np.copy)
+
+    def info_of(self, env_id: int) -> dict[str, Any]:
+        """Returns the same of one simulation, as numbers."""
+        return _each(self.info_arrays, lambda array: array.item(env_id))
 
     def get_state(self, env_id: int) -> dict[str, Any]:
         """Returns everything about one simulation that the world's state does not hold."""
@@ -267,6 +276,13 @@ class Task(composer.Task):
                 (name, block(part)) for name, part in self.blocks.items()
             )
         return self._task_observables
+
+
+def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dict[str, Any]:
+    return {
+        name: _each(entry, function) if isinstance(entry, dict) else function(entry)
+        for name, entry in entries.items()
+    }
 
 
 def check_simulated(lasted: np.ndarray) -> None:
