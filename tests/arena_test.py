@@ -8,6 +8,7 @@ from dm_control import mjcf
 from trl_suite import catalogue, suite, terrain
 from trl_suite.arenas import PlanarTerrain, boxes
 from trl_suite.engine import PhysicsWorld
+from trl_suite.terrain import planar_ground
 
 TIMESTEP = 1 / 300  # s
 GRAVITY = 9.8  # m/s^2; the original's
@@ -55,11 +56,11 @@ class Ground:
         self.arena.bind(self.world)
         self.strip = terrain.Strip(self.arena.terrain, seed, **strip)
         self.arena.begin_episode(0, terrain.Strip(self.arena.terrain, seed, **strip))
-        self.world.forward(0)
+        self.world.forward(np.zeros(1, int))
 
     def follow(self, x):
         self.arena.follow(np.array([[float(x)]]))
-        self.world.forward(0)
+        self.world.forward(np.zeros(1, int))
 
     def ray(self, start, direction):
         """Where a ray meets the ground first: distance, normal, and whether it is the ground."""
@@ -200,6 +201,44 @@ class QueryTest(parameterized.TestCase):
         heights, _ = ground.strip.window(-100, 400)
         xs = np.arange(-100, 300)[None] * CELL
         np.testing.assert_allclose(ground.arena.height(xs)[0], heights, atol=1e-10)
+
+    def test_far_heights(self):
+        ground = Ground('slopes_mixed_humanoid', 4)
+        ground.follow(9.0)
+        arrays = ground.arena.ground
+        xs = np.linspace(-35, 45, 999)[None]
+        self.assertFalse(arrays.is_wide[0])
+        heights = ground.arena.height(xs)
+        ground.arena.look_far(xs, heights)
+        self.assertTrue(arrays.is_wide[0])
+        near = xs >= 12 - 6 - 24  # the window begins 6 m before 12 m
+        np.testing.assert_array_equal(heights[near], ground.strip.height(xs[near]))
+        far = [planar_ground.far_height(0, x, arrays) for x in xs[0]]
+        np.testing.assert_array_equal(far, heights[0])
+        self.assertEqual(planar_ground.far_height(0, -1e300, arrays), arrays.wide[0, 0])
+        self.assertEqual(planar_ground.far_height(0, 1e300, arrays), arrays.wide[0, -1])
+        ground.follow(18.0)
+        self.assertFalse(arrays.is_wide[0])
+
+    def test_functions_of_one_simulation(self):
+        ground = Ground('slopes_humanoid', 4)
+        arrays = ground.arena.ground
+        for x in (-5.9, 0.0, 0.3, 3.0, 17.9):
+            at = np.array([[x]])
+            self.assertEqual(planar_ground.height(0, x, arrays), ground.arena.height(at)[0, 0])
+            self.assertEqual(planar_ground.slope(0, x, arrays), ground.arena.slope(at)[0, 0])
+            self.assertFalse(planar_ground.is_outside(0, x, arrays))
+            self.assertEqual(planar_ground.has_left(0, x, arrays), abs(x) > 3.1)
+        for x in (-6.1, 18.1, 1e300, -1e300):
+            self.assertTrue(planar_ground.is_outside(0, x, arrays))
+            self.assertTrue(np.isfinite(planar_ground.height(0, x, arrays)))
+        self.assertTrue(np.isnan(planar_ground.height(0, np.nan, arrays)))
+        self.assertFalse(planar_ground.has_left(0, np.nan, arrays))
+
+    def test_wrong_shapes_are_refused(self):
+        ground = Ground('flat')
+        with self.assertRaisesRegex(ValueError, r'shape \(2, 1\); expected \(1, k\)'):
+            ground.arena.height(np.zeros((2, 1)))
 
 
 class PoolTest(parameterized.TestCase):

@@ -11,7 +11,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain import noise, spatial
+from trl_suite.terrain import noise, spatial, spatial_ground
 
 GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
 BOXED = ('blocks3d', 'pillars3d', 'path3d', 'path3d_wide', 'ramp3d', 'stairs3d')
@@ -889,6 +889,52 @@ class SurroundingsTest(parameterized.TestCase):
             found = around(source, [0])
             heights = found.height(np.array([[1e12, -1e12, 1e300]]), np.zeros((1, 3)))
             self.assertTrue(np.isfinite(heights).all())
+
+    @parameterized.parameters('hills3d', 'pillars3d', 'conveyor3d', 'dynamic_obstacles3d', 'plane')
+    def test_functions_of_one_simulation(self, source):
+        xy, heading = np.array([(3.0, 1.0), (-2.0, 4.0)]), np.array([0.3, -2.0])
+        found = around(source, [0, 1], xy)
+        heights, velocities = (
+            found.height(xy[:, :1], xy[:, 1:]),
+            found.velocity(xy[:, :1], xy[:, 1:]),
+        )
+        height_maps, velocity_maps = found.height_map(xy, heading), found.velocity_map(xy, heading)
+        out = np.zeros(2048)
+        for i, (x, y) in enumerate(xy.tolist()):
+            self.assertEqual(spatial_ground.height(i, x, y, found.arrays), heights[i, 0])
+            velocity = spatial_ground.velocity(i, x, y, found.arrays)
+            self.assertEqual(velocity, tuple(velocities[i, 0]))
+            spatial_ground.height_map(i, x, y, heading[i], found.arrays, out[:1024])
+            np.testing.assert_array_equal(out[:1024], height_maps[i])
+            spatial_ground.velocity_map(i, x, y, heading[i], found.arrays, out)
+            np.testing.assert_array_equal(out, velocity_maps[i])
+            for step, left in ((3.9, False), (4.1, found.windowed), (np.nan, False)):
+                x, y = found.centre[i] + (0, step)
+                self.assertEqual(spatial_ground.has_left(i, x, y, found.arrays), left)
+        spatial_ground.height(0, np.nan, np.inf, found.arrays)
+
+    def test_crowds_of_large_boxes(self):
+        @terrain.register3d('crowd3d', replace=True)
+        def crowd(parameters, rng):
+            middle, half = rng.uniform(-12, 12, (90, 2)), rng.uniform(3, 9, (90, 2))
+            blocks = terrain.boxes(
+                middle, half, rng.uniform(0.1, 1, 90), yaw=rng.uniform(-3, 3, 90)
+            )
+            return terrain.Layout(boxes=blocks)
+
+        self.addCleanup(spatial._generators.pop, 'crowd3d')
+        found = around({'Type': 'crowd3d'}, range(2))
+        self.assertEqual(found.arrays.bins[0, 3, 5].tolist(), [0, 90])  # they do not fit into bins
+        x, y = np.random.default_rng(0).uniform(-15, 15, (2, 2, 500))
+        for row, ground in enumerate(found.grounds):
+            np.testing.assert_array_equal(found.height(x, y)[row], ground.height(x[row], y[row]))
+
+    def test_wrong_shapes_are_refused(self):
+        found = around('plane', [0, 1])
+        with self.assertRaisesRegex(ValueError, r'expected \(2, k\)'):
+            found.height(np.zeros((3, 1)), np.zeros((3, 1)))
+        with self.assertRaisesRegex(ValueError, r'expected \(1, 2\), \(1,\)'):
+            found.height_map(np.zeros((2, 2)), np.zeros(2), np.array([1]))
 
     @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d', 'trail3d2')
     def test_state(self, source):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from dm_control import composer, mjcf
 from trl_suite.arenas import boxes, stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World
-from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain
+from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain, planar_ground
 from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.util.compiled import compiled
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
@@ -66,17 +68,8 @@ class PlanarTerrain(composer.Arena):
             for model in world.models
         ]
         self.strips: list[Strip | None] = [None] * world.n
-        # Of every cell its first height and the rise to the next, m.
-        heights, rises = np.zeros((2, world.n, _WINDOW))
-        self.ground = PlanarGround(
-            np.full(world.n, np.nan), np.zeros(world.n), _REACH, heights, rises,
-            np.zeros((world.n, _WINDOW), bool), np.zeros((world.n, 3 * _WINDOW + 1)),
-            np.zeros(world.n, bool),
-        )  # fmt: skip
-        self._offset = np.arange(world.n)[:, None] * _WINDOW
-        self._start, self._centre = self.ground.start[:, None], self.ground.centre[:, None]
-        self._heights, self._rises = heights, rises
-        self._vertical = self.ground.vertical
+        self.ground = planar_ground.empty(world.n, _WINDOW, _REACH)
+        self._numbers = np.arange(world.n)
 
     def begin_episode(self, row: int, strip: Strip) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
@@ -90,32 +83,25 @@ class PlanarTerrain(composer.Arena):
           x: where their roots are, m, (n, 1), or of the given rows only, (m, 1).
           rows: sorted numbers of simulations; None for all.
         """
-        moved = x - (self._centre if rows is None else self._centre[rows])
-        if np.vdot(moved, moved) > _REACH**2:  # the cheap test; by rows only if it may be so
-            far = (np.abs(moved) > _REACH).nonzero()[0]
-            if not len(far):
-                return
-            leaving = far if rows is None else rows[far]
-            for row, root in zip(leaving.tolist(), x[far, 0].tolist(), strict=True):
-                # The window starts at multiples of the advance, however far a row has jumped.
-                self._lay(row, round(root / ADVANCE) * _ADVANCE)
-            # Contacts of the open step name boxes that now lie elsewhere.
-            self._world.forward(leaving)
+        env_ids = self._numbers if rows is None else rows
+        far = np.abs(x[:, 0] - self.ground.centre[env_ids]) > self.ground.reach
+        if far.any():
+            self.follow_all(env_ids[far], x[far, 0])
+
+    def follow_all(self, env_ids: np.ndarray, x: np.ndarray) -> None:
+        """Lays the windows of some simulations anew, whose roots are at x, m, (m,)."""
+        for env_id, root in zip(env_ids.tolist(), x.tolist(), strict=True):
+            # The window starts at multiples of the advance, however far a character has jumped.
+            self._lay(env_id, round(root / ADVANCE) * _ADVANCE)
+        # Contacts of the open step name boxes that now lie elsewhere.
+        self._world.forward(env_ids)
 
     def height(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices."""
-        u = x * _CELLS_PER_METRE
-        u -= self._start[rows]
-        whole = np.floor(u)
-        u -= whole
-        cell = whole.astype(np.int64)
-        if self._world.n > 1:
-            cell += self._offset[rows]
-        # Clipping only guards rows whose physics broke down; `follow` keeps the others inside, but
-        # for what lies far behind them: see `look_far`.
-        u *= self._rises.take(cell, mode='clip')
-        u += self._heights.take(cell, mode='clip')
-        return u
+        """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices.
+
+        `follow` keeps characters inside their windows; of what lies beyond see `look_far`.
+        """
+        return self._ask(_heights, x, rows)
 
     def look_far(self, x: np.ndarray, heights: np.ndarray) -> None:
         """Puts right what `height` gave where rows ask beyond their boxes.
@@ -126,41 +112,44 @@ class PlanarTerrain(composer.Arena):
             further away is only who has broken down.
         """
         u = x * _CELLS_PER_METRE
-        u -= self._start
+        u -= self.ground.start[:, None]
         if u.min() >= 0 and u.max() < _WINDOW - 1:
             return
-        for row in np.flatnonzero((u.min(1) < 0) | (u.max(1) >= _WINDOW - 1)).tolist():
-            strip, start = self.strips[row], self._start[row, 0]
-            assert strip is not None
-            low, high = (start - _WINDOW) * SPACING, (start + 2 * _WINDOW) * SPACING
-            heights[row] = strip.height(np.clip(x[row], low, high))
-
-    def follow_all(self, env_ids: np.ndarray, x: np.ndarray) -> None:
-        """Lays the windows anew of some simulations, whose roots are at x (m,), m."""
-        for env_id, root in zip(env_ids.tolist(), x.tolist(), strict=True):
-            # The window starts at multiples of the advance, however far a character has jumped.
-            self._lay(env_id, round(root / ADVANCE) * _ADVANCE)
-        # Contacts of the open step name boxes that now lie elsewhere.
-        self._world.forward(env_ids)
+        far = np.flatnonzero((u.min(1) < 0) | (u.max(1) >= _WINDOW - 1))
+        for env_id in far.tolist():
+            self.widen(env_id)
+        heights[far] = self._ask(_far_heights, x[far], far)
 
     def widen(self, env_id: int) -> None:
-        """Draws the ground up to the length of a window beyond the window of one simulation."""
-        strip, start = self.strips[env_id], int(self.ground.start[env_id])
-        assert strip is not None
-        heights, _ = strip.window(start - _WINDOW, 3 * _WINDOW + 1)
-        self.ground.wide[env_id], self.ground.is_wide[env_id] = heights, True
+        """Draws ground up to the length of a window beyond the window of one simulation."""
+        strip, ground = self.strips[env_id], self.ground
+        if strip is None or ground.is_wide[env_id]:
+            return
+        start = int(ground.start[env_id]) - _WINDOW
+        ground.wide[env_id] = strip.window(start, 3 * _WINDOW + 1)[0]
+        ground.is_wide[env_id] = True
 
     def slope(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Slopes dh/dx of the ground at x (rows, k) m."""
-        cell = np.floor(x * _CELLS_PER_METRE - self._start[rows]).astype(np.int64)
-        return self._rises.take(cell + self._offset[rows], mode='clip') / SPACING
+        return self._ask(_slopes, x, rows)
+
+    def _ask(
+        self, query: Callable[..., None], x: np.ndarray, rows: slice | np.ndarray
+    ) -> np.ndarray:
+        """Asks a compiled loop about points (rows, k)."""
+        env_ids, x = self._numbers[rows], np.ascontiguousarray(x, float)
+        if x.ndim != 2 or len(x) != len(env_ids):
+            raise ValueError(f'x has shape {x.shape}; expected ({len(env_ids)}, k)')
+        found = np.empty(x.shape)
+        query(env_ids, x, self.ground, found)
+        return found
 
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
         strip = self.strips[row]
         if strip is None:
             return {'strip': None}
-        return {'strip': strip.state(), 'centre': int(self._start[row, 0]) + _BEHIND}
+        return {'strip': strip.state(), 'centre': int(self.ground.start[row]) + _BEHIND}
 
     def restore(self, row: int, state: dict[str, Any]) -> None:
         """Restores the ground of one simulation; the caller forwards the world afterwards."""
@@ -172,14 +161,14 @@ class PlanarTerrain(composer.Arena):
         """Realises the strip around a vertex as boxes."""
         strip = self.strips[row]
         assert strip is not None
-        self.ground.is_wide[row] = False
-        start = centre - _BEHIND
+        start, ground = centre - _BEHIND, self.ground
         heights, vertical = strip.window(start, _WINDOW)
-        self._centre[row] = centre * SPACING
+        ground.centre[row] = centre * SPACING
+        ground.is_wide[row] = False
         if (
-            self._start[row, 0] == start
-            and (self._heights[row] == heights).all()
-            and (self._vertical[row] == vertical).all()
+            ground.start[row] == start
+            and (ground.heights[row] == heights).all()
+            and (ground.vertical[row] == vertical).all()
         ):
             return  # as on flat ground: the boxes lie already
         tolerance = boxes.TOLERANCE
@@ -193,9 +182,9 @@ class PlanarTerrain(composer.Arena):
                     f'{len(self.boxes)}: its features must be spread more evenly'
                 )
             pieces = boxes.from_profile(start, heights, vertical, tolerance)
-        self._start[row], self._vertical[row] = start, vertical
-        self._heights[row] = heights
-        np.subtract(heights[1:], heights[:-1], out=self._rises[row, :-1])
+        ground.start[row], ground.vertical[row] = start, vertical
+        ground.heights[row] = heights
+        np.subtract(heights[1:], heights[:-1], out=ground.rises[row, :-1])
         count = len(pieces.position)
         position, half_size, quaternion = self._placed[row]
         position[:count], position[count:] = (
@@ -204,6 +193,27 @@ class PlanarTerrain(composer.Arena):
         half_size[:count], half_size[count:] = pieces.half_size, 0.1
         quaternion[:count] = pieces.quaternion
         self._world.set_const(row)
+
+
+@compiled
+def _heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            out[k, p] = planar_ground.height(env_ids[k], x[k, p], ground)
+
+
+@compiled
+def _far_heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            out[k, p] = planar_ground.far_height(env_ids[k], x[k, p], ground)
+
+
+@compiled
+def _slopes(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            out[k, p] = planar_ground.slope(env_ids[k], x[k, p], ground)
 
 
 def _pool_size(terrain: Terrain) -> int:

@@ -1,30 +1,29 @@
-"""Planar ground under n characters as arrays, and what compiled functions ask of it."""
+"""Windows of the planar grounds of n simulations, as arrays, and functions of one of them."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from trl_suite.terrain.generators import SPACING
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled_inline
 
 _CELLS_PER_METRE = 1 / SPACING
 
 
 class PlanarGround(NamedTuple):
-    """Windows of W vertices, SPACING apart, on the ground of each simulation.
+    """Windows of W vertices, SPACING apart, of n grounds. The arrays are never replaced.
 
     Attributes:
       start: number of the first vertex of a window, (n,); NaN before the first episode.
-      centre: middle of the stretch that a window serves, (n,) m.
-      reach: how far from there it has to be laid anew, m.
+      centre: middle of the stretch that a window is good for, (n,) m.
+      reach: how far from there it is laid anew, m.
       heights: of the vertices, (n, W) m.
-      rises: from each vertex to the next, (n, W) m.
-      vertical: whether the cell before a vertex is a vertical face, (n, W).
-      wide: heights of the vertices from one window behind on, (n, 3 W) m; only where `is_wide`.
-      is_wide: whether `wide` belongs to the window, (n,).
+      rises: from each vertex to the next, (n, W) m; the last is 0.
+      vertical: whether the cell before a vertex is a vertical face, (n, W) bool.
+      wide: heights of the vertices from W before the window on, (n, 3 W + 1) m.
+      is_wide: whether `wide` was drawn for this window, (n,) bool.
     """
 
     start: np.ndarray
@@ -37,46 +36,75 @@ class PlanarGround(NamedTuple):
     is_wide: np.ndarray
 
 
-@compiled
+def empty(n: int, vertices: int, reach: float) -> PlanarGround:
+    """Returns room for n windows."""
+    heights, rises = np.zeros((2, n, vertices))
+    return PlanarGround(
+        start=np.full(n, np.nan),
+        centre=np.zeros(n),
+        reach=reach,
+        heights=heights,
+        rises=rises,
+        vertical=np.zeros((n, vertices), bool),
+        wide=np.zeros((n, 3 * vertices + 1)),  # memory is taken where it is written
+        is_wide=np.zeros(n, bool),
+    )
+
+
+@compiled_inline
 def height(i: int, x: float, ground: PlanarGround) -> float:
-    """Returns the height of the ground at x, m; beyond the window that of its ends."""
-    last = ground.heights.shape[1] - 1
+    """Returns the height in m of the ground of simulation i at x, m.
+
+    Beyond the window it has no meaning, but is finite where x is: see `far_height`.
+    """
     u = x * _CELLS_PER_METRE - ground.start[i]
-    whole = math.floor(u) if u > -1e9 and u < 1e9 else -1.0
-    cell = int(min(max(whole, 0.0), float(last)))
+    whole = np.floor(u)
+    cell = _within(whole, ground.heights.shape[1])
     return (u - whole) * ground.rises[i, cell] + ground.heights[i, cell]
 
 
-@compiled
+@compiled_inline
+def slope(i: int, x: float, ground: PlanarGround) -> float:
+    """Returns the slope dh/dx of the ground of simulation i at x, m."""
+    whole = np.floor(x * _CELLS_PER_METRE - ground.start[i])
+    return ground.rises[i, _within(whole, ground.heights.shape[1])] / SPACING
+
+
+@compiled_inline
 def is_outside(i: int, x: float, ground: PlanarGround) -> bool:
-    """Whether x lies beyond the window."""
+    """Returns whether x, m, lies beyond the window of simulation i."""
     u = x * _CELLS_PER_METRE - ground.start[i]
-    return not (u >= 0.0 and u < ground.heights.shape[1] - 1)
+    return u < 0.0 or u >= ground.heights.shape[1] - 1
 
 
-@compiled
+@compiled_inline
 def far_height(i: int, x: float, ground: PlanarGround) -> float:
-    """Returns the height at x up to the length of a window beyond the window, m."""
-    window = ground.heights.shape[1]
-    low = (ground.start[i] - window) * SPACING
-    high = (ground.start[i] + 2 * window) * SPACING
-    position = min(max(x, low), high) / SPACING
-    whole = math.floor(position)
-    cell = int(min(max(whole - ground.start[i] + window, 0.0), 3.0 * window - 1.0))
+    """Returns the height in m at x, m, up to the length of a window beyond the window.
+
+    Only where `is_wide`; further away the ends go on. The last bit is that of `Strip.height`, not of
+    `height`: of a character that looks beyond its window all heights are taken from here.
+    """
+    position = x / SPACING
+    whole = np.floor(position)
+    first, last = ground.start[i] - ground.heights.shape[1], ground.wide.shape[1] - 1
+    if whole < first:
+        return ground.wide[i, 0]
+    if whole >= first + last:
+        return ground.wide[i, last]
+    cell = _within(whole - first, last)
     left = ground.wide[i, cell]
     return left + (position - whole) * (ground.wide[i, cell + 1] - left)
 
 
-@compiled
-def slope(i: int, x: float, ground: PlanarGround) -> float:
-    """Returns the slope of the cell that x lies in."""
-    last = ground.heights.shape[1] - 1
-    u = x * _CELLS_PER_METRE - ground.start[i]
-    whole = math.floor(u) if u > -1e9 and u < 1e9 else 0.0
-    return ground.rises[i, int(min(max(whole, 0.0), float(last)))] / SPACING
-
-
-@compiled
+@compiled_inline
 def has_left(i: int, x: float, ground: PlanarGround) -> bool:
-    """Whether a character at x has come so far that its window must be laid anew."""
+    """Returns whether a character at x, m, is so far that its window must be laid anew."""
     return abs(x - ground.centre[i]) > ground.reach
+
+
+@compiled_inline
+def _within(number: float, count: int) -> int:
+    """The nearest of the numbers 0, 1, ..., count - 1; 0 for what is no number."""
+    if not number > 0.0:
+        return 0
+    return int(number) if number < count - 1 else count - 1

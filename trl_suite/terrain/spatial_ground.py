@@ -55,23 +55,40 @@ class SpatialGround(NamedTuple):
 
     An array of what a terrain does not have has length 0 along its second axis. The arrays are
     changed in place and never replaced.
+
+    Attributes:
+      level: of the plane, (n,) m; -inf if there is none.
+      centre: middles of the windows, (n, 2) m.
+      grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
+      boxes: numbers by the columns above, (n, B, 8); HALF_X is -1 where there is no box.
+      box_velocity: of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
+      bins: which part of bin_boxes is of a bin, begin and end, (n, bins along x, along y, 2) int32.
+      bin_boxes: for every bin the numbers of the boxes that touch it, (n, k) int32.
+      mover_start: where the path of a moving box starts, (n, M, 2) m.
+      mover_axis: unit vector along the path, (n, M, 2).
+      mover_length: of the path, (n, M) m.
+      mover_half_size: (n, M, 2) m; -1 where there is no box.
+      mover_top: (n, M) m.
+      mover_speed: (n, M) m/s.
+      mover_distance: from the start of the path, (n, M) m; changes as boxes move.
+      mover_direction: 1 towards the end of the path, -1 towards its start, (n, M).
     """
 
-    level: np.ndarray  # (n,) m, of the plane; -inf if there is none
-    centre: np.ndarray  # (n, 2) m, middles of the windows
-    grid: np.ndarray  # (n, VERTICES**2) m, float32; along x, then along y
-    boxes: np.ndarray  # (n, B, 8) by the columns above; HALF_X is -1 where there is no box
-    box_velocity: np.ndarray  # (n, B, 2) m/s; (n, 0, 2) if there are no belts
-    bins: np.ndarray  # (n, bins along x, along y, 2) int32; which part of bin_boxes, begin and end
-    bin_boxes: np.ndarray  # (n, k) int32; for every bin the numbers of the boxes that touch it
-    mover_start: np.ndarray  # (n, M, 2) m; where the path of a moving box starts
-    mover_axis: np.ndarray  # (n, M, 2) unit vector along the path
-    mover_length: np.ndarray  # (n, M) m, of the path
-    mover_half_size: np.ndarray  # (n, M, 2) m; -1 where there is no box
-    mover_top: np.ndarray  # (n, M) m
-    mover_speed: np.ndarray  # (n, M) m/s
-    mover_distance: np.ndarray  # (n, M) m from the start of the path; changes as boxes move
-    mover_direction: np.ndarray  # (n, M) 1 towards the end of the path, -1 towards its start
+    level: np.ndarray
+    centre: np.ndarray
+    grid: np.ndarray
+    boxes: np.ndarray
+    box_velocity: np.ndarray
+    bins: np.ndarray
+    bin_boxes: np.ndarray
+    mover_start: np.ndarray
+    mover_axis: np.ndarray
+    mover_length: np.ndarray
+    mover_half_size: np.ndarray
+    mover_top: np.ndarray
+    mover_speed: np.ndarray
+    mover_distance: np.ndarray
+    mover_direction: np.ndarray
 
 
 def empty(n: int, capacity: Capacity) -> SpatialGround:
