@@ -306,6 +306,8 @@ class RewardTest(parameterized.TestCase):
         environment = suite.make(id_, {'random': 21})
         for _ in range(3):
             environment.reset()
+            # No reward is given for a reset.
+            self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
             start = observed_terms(environment)
             self.assertAlmostEqual(start['pose'], 0.5, delta=1e-3)
             self.assertAlmostEqual(start['velocity'], 0.05, delta=1e-3)
@@ -313,8 +315,6 @@ class RewardTest(parameterized.TestCase):
             # Lifted by a centimetre at most.
             self.assertGreater(start['root'], 0.1 * np.exp(-10 * 0.01**2) - 1e-6)
             self.assertGreater(start['end_effector'], 0.15 * np.exp(-40 * 0.01**2) - 1e-4)
-            # No reward is given for a reset.
-            self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
 
     def test_standing_still_in_the_pose_of_a_walk(self):
         environment = suite.make('PD_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
