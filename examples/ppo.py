@@ -36,7 +36,7 @@ from torch.optim import swa_utils
 from trl_suite import characters, evaluation, policies, suite
 from trl_suite.catalogue import Row
 from trl_suite.tasks import rewards
-from trl_suite.terrain import surroundings
+from trl_suite.terrain import spatial_ground
 from trl_suite.vector import VectorEnvironment
 
 TEACHERS = {**evaluation.BASELINES, 'guide': guide}
@@ -144,9 +144,9 @@ def visible(
     maps = [name for name in MAPS if name in blocks]
     if view is None or not maps:
         return None
-    lines, along = np.divmod(np.arange(surroundings.SAMPLES**2), surroundings.SAMPLES)
-    forward = np.linspace(*surroundings.AHEAD, surroundings.SAMPLES)[along]
-    aside = np.linspace(-surroundings.ASIDE, surroundings.ASIDE, surroundings.SAMPLES)[lines]
+    lines, along = np.divmod(np.arange(spatial_ground.SAMPLES**2), spatial_ground.SAMPLES)
+    forward = np.linspace(*spatial_ground.AHEAD, spatial_ground.SAMPLES)[along]
+    aside = np.linspace(-spatial_ground.ASIDE, spatial_ground.ASIDE, spatial_ground.SAMPLES)[lines]
     near = (forward <= view[0]) & (np.abs(aside) <= view[1])
     seen = np.ones(inputs, bool)
     for name in maps:

@@ -507,11 +507,18 @@ class RolloutTest(CommandTest):
         self.assert_only()
 
     def test_how_an_episode_of_a_gait_ends(self):
+        finish_step = GaitTask.finish_step
+
+        def fail(task, *args):
+            finish_step(task, *args)
+            task.failed[...] = True
+
         for end in ('fell', 'stuck'):
             info = {'fell': end == 'fell', 'stuck': end == 'stuck', 'diverged': False}
-            with mock.patch.object(
-                GaitTask, 'infos', lambda task, info=info: {k: np.array([v]) for k, v in info.items()}
-            ), mock.patch.object(GaitTask, 'should_terminate_episode', lambda *_: True):  # fmt: skip
+            with (
+                mock.patch.object(GaitTask, 'info_of', lambda task, env_id, info=info: info),
+                mock.patch.object(GaitTask, 'finish_step', fail),
+            ):
                 out = self.output('rollout', 'terrainrl/hopper_steps', '--steps', '1')
             self.assertRegex(out, rf'\n +1 +1 +\S+ +0.00  {end}\n')
 

@@ -175,7 +175,7 @@ class TerrainIsCurrentTest(parameterized.TestCase):
         world = environment.task.world
         world.qpos[0, 0] += 40.0
         world.qpos[0, 1] += 3.0
-        world.forward(0)
+        world.forward(world.all_ids)
         environment.step(np.zeros(11))
         self.assert_drawn_around(environment, 40)
 
