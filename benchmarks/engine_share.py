@@ -42,9 +42,7 @@ _signature = numba.types.void(numba.types.intp, numba.types.intp)
 def timed(function: int) -> Any:
     """Returns a C function of (model, data) that calls another and adds up the time it takes."""
     libc = ctypes.CDLL(None)
-    clock = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_void_p)(
-        ('clock_gettime', libc)
-    )
+    clock = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_void_p)(('clock_gettime', libc))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(function)
     spent = _spent.ctypes.data
     begin = _moment.ctypes.data
@@ -65,6 +63,7 @@ def timed(function: int) -> Any:
 @numba.extending.intrinsic
 def numba_pointer(typing: Any, address: Any) -> Any:
     """Turns an address into a pointer."""
+
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from trl_suite import catalogue, errors, files, policies, resources
 from trl_suite.scripted import scripted
-from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP
+from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
@@ -57,7 +57,7 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
     task, limit = environments.task, environments.step_limit
     assert limit is not None
     duration = np.full(episodes, CONTROL_TIMESTEP)  # s; of a step without hierarchy
-    root = task.figure.kinematics.links[0]
+    root = task.figure.links[0]
 
     def places() -> np.ndarray:
         return task.world.xpos[:, root, :2].copy()

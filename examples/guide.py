@@ -19,7 +19,6 @@ from trl_suite import scripted
 from trl_suite.scripted import CAUTIOUS
 from trl_suite.tasks import rewards
 from trl_suite.tasks.high_level import HighLevel
-from trl_suite.tasks.soccer import Soccer
 from trl_suite.terrain.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
@@ -115,7 +114,7 @@ def guide(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]
       ValueError: a task whose steps are no plans, or whose way is that of a ball.
     """
     task = environments.task
-    if not isinstance(task, HighLevel) or isinstance(task, Soccer) or task.interface != 'plan':
+    if not isinstance(task, HighLevel) or task.ball or task.interface != 'plan':
         raise ValueError(
             f'the guide knows no way for the task {type(task).__name__}; it does for high-level '
             "tasks with the interface 'plan' and without a ball"

@@ -139,7 +139,9 @@ class PlanTest(parameterized.TestCase):
             right = step.observation['phase'][0] < 0.5
             slots, expected = step.observation['plan'][:12].reshape(2, 2, 3), np.zeros((2, 2, 3))
             for which, foot in ((0, LEFT if right else RIGHT), (1, RIGHT if right else LEFT)):
-                expected[which, foot, 0] = task.plan.landing[0, which, 0] - ankles(environment)[foot, 0]
+                expected[which, foot, 0] = (
+                    task.plan.landing[0, which, 0] - ankles(environment)[foot, 0]
+                )
             np.testing.assert_allclose(slots, expected, atol=1e-12)
             self.assertEqual(step.observation['plan'][12], 0)
             step = environment.step(task.clip_action(0))
@@ -182,7 +184,9 @@ class PlanTest(parameterized.TestCase):
                 slots = environment.observation()['plan'][:12].reshape(2, 2, 3)
                 used = slots[[0, 1], [1 - task.plan.stance[0], task.plan.stance[0]], 2]
                 root = body(environment, 'xpos', 'root')[:1]
-                np.testing.assert_allclose(used, z - task.figure.ground_heights(0, root), atol=1e-12)
+                np.testing.assert_allclose(
+                    used, z - task.figure.ground_heights(0, root), atol=1e-12
+                )
 
 
 class RewardTest(parameterized.TestCase):

@@ -303,7 +303,7 @@ class FallTest(parameterized.TestCase):
         height = environment.physics.data.qpos[task.figure.pose_qpos[2]]
 
         def place():
-            number = task._count[0] // 3
+            number = task.clock.steps[0] // 3
             touch = number < len(samples) and samples[number] == '1'
             task.world.qpos[0, task.figure.pose_qpos[2]] = height - 1.0 if touch else 5.0
 
@@ -315,7 +315,7 @@ class FallTest(parameterized.TestCase):
         self.assertEqual(step.last(), fall is not None)
         self.assertEqual(environment.info['fell'], fall is not None)
         if fall is not None:
-            self.assertEqual(task._count[0], 3 * fall)
+            self.assertEqual(task.clock.steps[0], 3 * fall)
 
     def test_a_touch_of_the_feet_is_none(self):
         environment, _ = started(PLANE)
@@ -381,7 +381,8 @@ class GoalTest(parameterized.TestCase):
         with moved(task), mock.patch.object(task.arena, 'goal', lambda *_: next(far)):
             far = (np.array([100.0 + i, 0, 0]) for i in range(1000))
             for row in range(n):
-                task._begin_goal(row, task.figure.measure())
+                task.figure.measure()
+                task.begin_goal(row)
             before = task.goal.copy()
             for i in range(1, steps + 1):
                 rows.step(np.zeros((n, 5)))
@@ -392,7 +393,7 @@ class GoalTest(parameterized.TestCase):
         self.assertGreaterEqual(len(lasted), 2 * n)
         # 50 to 100 s, looked at every half second.
         assert_uniform(lasted, 50.0, 100.5)
-        self.assertEqual(task.goals_reached.max(), 0)
+        self.assertEqual(task.goals.reached.max(), 0)
 
     @parameterized.parameters(*IDS)
     def test_goals_of_all_grounds(self, id_):
@@ -535,7 +536,7 @@ class BallTest(parameterized.TestCase):
         rows = VectorEnvironment(SOCCER, 300, 1, seed=0)
         rows.reset()
         task = rows.task
-        root = task.world.xpos[:, task.figure.kinematics.links[0], :2]
+        root = task.world.xpos[:, task.figure.links[0], :2]
         ball = task.world.qpos[:, task.ball.qpos]
         away, shot = ball[:, :2] - root, task.goal[:, :2] - ball[:, :2]
         assert_uniform(np.hypot(*away.T), 0.7, 10)
@@ -978,9 +979,9 @@ class SaveTest(parameterized.TestCase):
 
         def draw_soon(each):
             # The ball is put elsewhere, and a goal drawn, from the stream that was saved.
-            each.task._due[0] = each.task._count[0] + 2
+            each.task.goals.due[0] = each.task.clock.steps[0] + 2
             if 'Soccer' in id_:
-                each.task._ball_due[0] = each.task._count[0] + 2
+                each.task.ball.state.due[0] = each.task.clock.steps[0] + 2
 
         def go(each, seed):
             found = self.advance(each, seed, 5 if seed == 1 else 3)

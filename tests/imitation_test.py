@@ -236,8 +236,10 @@ class RewardTest(parameterized.TestCase):
         ((0, 0, 0, 0, 0.01), 'root', 0.905), ((0, 0, 0, 0.1, 0), 'com', 0.368),
     )  # fmt: skip
     def test_worked_values(self, errors, term, factor):
-        terms = rewards.imitation(np.array([errors], float))[0]
-        terms = dict(zip(rewards.IMITATION_TERMS, terms, strict=True))
+        terms = {
+            name: rewards.term(float(error), *rewards.IMITATION_TERMS[name])
+            for name, error in zip(rewards.IMITATION_TERMS, errors, strict=True)
+        }
         self.assertAlmostEqual(terms[term] / WEIGHTS[term], factor, delta=5e-4)
         for other in set(terms) - {term}:
             self.assertAlmostEqual(terms[other], WEIGHTS[other], delta=1e-12)
@@ -245,13 +247,14 @@ class RewardTest(parameterized.TestCase):
     def test_weights_and_scales(self):
         self.assertEqual({k: w for k, (w, _) in rewards.IMITATION_TERMS.items()}, WEIGHTS)
         self.assertEqual({k: s for k, (_, s) in rewards.IMITATION_TERMS.items()}, SCALES)
-        perfect = rewards.imitation(np.zeros((3, 5)))
-        np.testing.assert_allclose(perfect.sum(1), 1)
+        self.assertAlmostEqual(sum(WEIGHTS.values()), 1, delta=1e-12)
 
     def test_wrap(self):
         angles = np.array([0.3, -3.0, 2 * np.pi + 0.3, -7.0, 3 * np.pi + 0.1])
         expected = np.angle(np.exp(1j * angles))
         np.testing.assert_allclose(rewards.wrap(angles), expected, atol=1e-12)
+        for angle, found in zip(angles, rewards.wrap(angles), strict=True):
+            self.assertEqual(rewards.wrapped(angle), found)
 
     def by_hand(self, environment):
         task = environment.task

@@ -511,9 +511,9 @@ PARTS = {
 class Rise(Walk):
     """A task of a user's."""
 
-    def finish_step(self, stepped=None):
-        super().finish_step(stepped)
-        self.reward[:] = parts.height(self)
+    def finish_step(self, env_ids):
+        super().finish_step(env_ids)
+        self.reward[env_ids] = parts.height(self)[env_ids]
 
 
 class TaskTest(parameterized.TestCase):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, compiled_inline
 
 AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
 # The original's axis lies behind the angle: forward, up, right.
@@ -50,6 +51,14 @@ class ActionMap:
         control += centre
         return control if np.ndim(action) > 1 else control[0]
 
+    def drive(self, first: int) -> Drive:
+        """Returns the map for compiled functions; `first` is the address of the first control."""
+        vectors, none = np.zeros((0, 3), int), np.zeros(0, int)
+        return Drive(
+            self.centre, self.half_range, first, vectors, np.zeros(0), none, vectors,
+            np.zeros((2, 0), int),
+        )  # fmt: skip
+
     @functools.cached_property
     def _rows(self) -> tuple[np.ndarray, ...]:
         ones = np.ones((1, len(self)))
@@ -84,24 +93,69 @@ class ActionMap:
 
 
 class Drive(NamedTuple):
-    """A plain `ActionMap` for compiled functions: what drives k actuators, one after the other.
+    """An action map for compiled functions; its actuators lie one after the other.
 
     Attributes:
-      offset: control at action 0, (k,).
-      scale: change of control per unit action, (k,).
+      offset: what action 0 means, (k,).
+      scale: change per unit action, (k,).
       first: address of the first control.
+      torque_balls, torque_limits: of a `TorqueMap` where the torques of ball joints are, (B, 3), and
+        the largest norm of each, (B,); otherwise empty.
+      angles, angle_balls, hinges: of an `AngleAxisMap`, (B,), (B, 3) and (2, H); otherwise empty.
     """
 
     offset: np.ndarray
     scale: np.ndarray
     first: int
+    torque_balls: np.ndarray
+    torque_limits: np.ndarray
+    angles: np.ndarray
+    angle_balls: np.ndarray
+    hinges: np.ndarray
+
+
+@compiled_inline
+def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
+    """What number k of an action means, in physical units."""
+    return min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
 
 
 @compiled
 def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
     """Writes the controls of simulation i that its action (of (n, k), clipped) means."""
+    if len(by.angles):
+        _drive_rotations(i, action, by, ctrl)
+        return
     for k in range(len(by.offset)):
-        ctrl[i, by.first + k] = min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
+        ctrl[i, by.first + k] = _meant(i, k, action, by)
+    for ball in range(len(by.torque_limits)):
+        square = 0.0
+        for k in by.torque_balls[ball]:
+            square += ctrl[i, by.first + k] * ctrl[i, by.first + k]
+        limit = by.torque_limits[ball]
+        share = limit / max(math.sqrt(square), limit)
+        for k in by.torque_balls[ball]:
+            ctrl[i, by.first + k] *= share
+
+
+@compiled
+def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
+    """Writes the rotation vectors of ball joints that angles and axes mean; see `AngleAxisMap`."""
+    for k in range(by.hinges.shape[1]):
+        ctrl[i, by.first + by.hinges[1, k]] = _meant(i, by.hinges[0, k], action, by)
+    for ball in range(len(by.angles)):
+        column = by.angles[ball]
+        angle = _meant(i, column, action, by)
+        x = _meant(i, column + 1, action, by)
+        y = -_meant(i, column + 3, action, by)
+        z = _meant(i, column + 2, action, by)
+        length = math.sqrt(x * x + y * y + z * z)
+        if length == 0.0:
+            x, y, z, length = 0.0, -1.0, 0.0, 1.0
+        share = angle / length
+        ctrl[i, by.first + by.angle_balls[ball, 0]] = x * share
+        ctrl[i, by.first + by.angle_balls[ball, 1]] = y * share
+        ctrl[i, by.first + by.angle_balls[ball, 2]] = z * share
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,6 +176,9 @@ class TorqueMap(ActionMap):
         torque *= (self.limits / np.maximum(_norm(torque), self.limits))[..., None]
         control[..., self.balls] = torque
         return control
+
+    def drive(self, first: int) -> Drive:
+        return super().drive(first)._replace(torque_balls=self.balls, torque_limits=self.limits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,6 +212,13 @@ class AngleAxisMap(ActionMap):
         control[..., self.hinges[1]] = value.take(self.hinges[0], -1)
         control[..., self.balls] = axis
         return control
+
+    def drive(self, first: int) -> Drive:
+        return (
+            super()
+            .drive(first)
+            ._replace(angles=self.angles, angle_balls=self.balls, hinges=np.asarray(self.hinges))
+        )
 
     @functools.cached_property
     def _axes(self) -> np.ndarray:

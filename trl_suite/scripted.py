@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from trl_suite.tasks.composed import Composed
-from trl_suite.tasks.footsteps import SIDE
+from trl_suite.tasks.footstep_plan import SIDE
 from trl_suite.tasks.high_level import PLAN_NAMES, HighLevel
-from trl_suite.tasks.soccer import Soccer
 from trl_suite.terrain.spatial_ground import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
@@ -61,7 +60,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
 
     def policy(observation: np.ndarray) -> np.ndarray:
         parts = {name: observation[:, part] for name, part in blocks.items()}
-        bearing, distance = towards_ball(parts) if isinstance(task, Soccer) else parts['target'].T
+        bearing, distance = towards_ball(parts) if task.ball else parts['target'].T
         way, room = free_way(parts, bearing, distance)
         length = task.step_length * lengths(way, distance, room)
         plan = steps(way, length, task.stance, task.step_length)

@@ -15,14 +15,14 @@ from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
 from trl_suite.tasks import composed
+from trl_suite.tasks.ball import Ball
 from trl_suite.tasks.footsteps import Footsteps
 from trl_suite.tasks.footsteps2d import PlanarFootsteps, check_feet
 from trl_suite.tasks.gait import GaitTask
 from trl_suite.tasks.high_level import HighLevel
 from trl_suite.tasks.imitation import Imitation
 from trl_suite.tasks.imitation3d import SpatialImitation
-from trl_suite.tasks.journey import BallJourney, journey
-from trl_suite.tasks.soccer import Soccer
+from trl_suite.tasks.journey import Journey, journey
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.walk import WALK, Walk
 
@@ -96,18 +96,19 @@ def _footsteps2d(row: Row, options: dict[str, Any]) -> Task:
     )  # fmt: skip
 
 
-def _high_level(cls: type[HighLevel]) -> Callable[[Row, dict[str, Any]], Task]:
-    def make(row: Row, options: dict[str, Any]) -> Task:
-        if row.actuation != 'position':
-            raise ValueError(
-                f'{row.task}: a footstep controller drives joints by position, not by {row.actuation}'
-            )
-        steps = (
-            row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
+def _hike(row: Row, options: dict[str, Any], with_ball: bool = False) -> Task:
+    if row.actuation != 'position':
+        raise ValueError(
+            f'{row.task}: a footstep controller drives joints by position, not by {row.actuation}'
         )
-        return cls(characters.make(row.character), _spatial(row), steps, **options)
+    steps = row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
+    arena = _spatial(row)
+    ball = Ball(arena) if with_ball else None
+    return HighLevel(characters.make(row.character), arena, steps, ball, **options)
 
-    return make
+
+def _soccer(row: Row, options: dict[str, Any]) -> Task:
+    return _hike(row, options, with_ball=True)
 
 
 def _journey(row: Row, options: dict[str, Any]) -> Task:
@@ -120,9 +121,10 @@ def _journey(row: Row, options: dict[str, Any]) -> Task:
 
 
 def _ball_journey(row: Row, options: dict[str, Any]) -> Task:
-    return BallJourney(
-        characters.make(row.character), _spatial(row), _clip(row), actuation_model=row.actuation,
-        **options,
+    arena = _spatial(row)
+    return Journey(
+        characters.make(row.character), arena, _clip(row), Ball(arena),
+        actuation_model=row.actuation, **options,
     )  # fmt: skip
 
 
@@ -154,10 +156,10 @@ _RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], Callable[..., Tas
     'imitation3d': (_imitation3d, SpatialImitation),
     'footsteps': (_footsteps, Footsteps),
     'footsteps2d': (_footsteps2d, PlanarFootsteps),
-    'hike': (_high_level(HighLevel), HighLevel),
-    'soccer': (_high_level(Soccer), Soccer),
+    'hike': (_hike, HighLevel),
+    'soccer': (_soccer, HighLevel),
     'journey': (_journey, journey),
-    'ball_journey': (_ball_journey, BallJourney),
+    'ball_journey': (_ball_journey, Journey),
     'walk': (_walk, Walk),
 }
 # As `build` names rules.

@@ -15,15 +15,15 @@ from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
 from trl_suite.terrain.ground import Random
-from trl_suite.terrain.spatial_ground import HALF, VERTICES
+from trl_suite.terrain.spatial_ground import HALF, VERTICES, SpatialGround, keep_moving
 from trl_suite.terrain.surroundings import ALL, Rows
+from trl_suite.util.compiled import compiled_loop
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
 BASE = 1.0  # m; of height fields, below their lowest point
 FOOT = 0.5  # m; how deep boxes are let into a plane
 THICKNESS = 2.0  # m; of boxes without a plane under them
 DRIVE = 1e6  # kg; inertia of moving boxes along their way: nothing that they meet stops them
-SPEED_ERROR = 0.005  # m/s; deviation after which moving boxes are given their speed again
 SIZE = 0.1  # m; half sides of unused boxes
 SHADES = np.array([[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]])  # of boxes, by turns of 0.5 m along x
 
@@ -124,8 +124,10 @@ class SpatialTerrain(composer.Arena):
         names = [body.full_identifier for body in self.movers]
         self._bodies, self._mover_geoms = world.body_ids(names), world.geom_ids(names)
         self._qpos, self._dof = world.joint_addresses(names)
+        ground = self.surroundings.arrays
+        ground.mover_qpos[:], ground.mover_dof[:] = self._qpos, self._dof
+        self._begin = ground.mover_begin
         self._joints = world.models[0].body_jntadr[self._bodies]
-        self._begin = np.zeros((world.n, len(names)))  # m; of the ways, where qpos is 0
         # The solver's tolerance is relative to the mean inertia, that of the drives left out.
         own = np.ones(world.models[0].nv, bool)
         own[self._dof] = False
@@ -163,15 +165,13 @@ class SpatialTerrain(composer.Arena):
         for row in changed:
             self._realise(row)
         if len(self._dof):
-            chosen = ALL if rows is None else rows
-            self._look()
-            self.surroundings.turn(xy, chosen)
-            speed = self.surroundings.direction[chosen] * self.surroundings.speed[chosen]
-            wrong = np.abs(self._world.qvel[chosen][:, self._dof] - speed).max(1) > SPEED_ERROR
-            if wrong.any():
-                numbers = np.flatnonzero(wrong) if rows is None else rows[wrong]
-                self._world.qvel[numbers[:, None], self._dof] = speed[wrong]
-                changed = sorted({*changed, *numbers.tolist()})
+            env_ids = self._world.all_ids if rows is None else rows
+            sped = np.zeros(len(env_ids), bool)
+            _keep_moving(
+                env_ids, np.ascontiguousarray(xy, float), self._world.qpos, self._world.qvel,
+                self.surroundings.arrays, sped,
+            )  # fmt: skip
+            changed = sorted({*changed, *env_ids[sped].tolist()})
         if changed:  # contacts of the open step name boxes that now lie elsewhere
             self._world.forward(np.array(changed))
 
@@ -325,6 +325,15 @@ class SpatialTerrain(composer.Arena):
                 gl.call(mujoco.mjr_uploadHField, model, contexts.mujoco.ptr, 0)
         except ReferenceError:  # the physics was freed
             self._physics = None
+
+
+@compiled_loop
+def _keep_moving(
+    env_ids: np.ndarray, xy: np.ndarray, qpos: np.ndarray, qvel: np.ndarray,
+    ground: SpatialGround, sped: np.ndarray,
+) -> None:  # fmt: skip
+    for k in range(len(env_ids)):
+        sped[k] = keep_moving(env_ids[k], xy[k, 0], xy[k, 1], qpos, qvel, ground)
 
 
 def _range(world: World, geoms: list[mjcf.Element]) -> slice:

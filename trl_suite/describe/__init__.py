@@ -53,10 +53,10 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
     from trl_suite.tasks.gait import GaitTask
     from trl_suite.tasks.high_level import HighLevel
     from trl_suite.tasks.imitation import Imitation
-    from trl_suite.tasks.tracking3d import Tracking
+    from trl_suite.tasks.spatial_task import SpatialTask
 
     families = (
-        (GaitTask, gait), (HighLevel, high_level), (Tracking, spatial), (Imitation, planar),
+        (GaitTask, gait), (HighLevel, high_level), (SpatialTask, spatial), (Imitation, planar),
     )  # fmt: skip
     task: Any = environment.task
     family: Any = next((family for kind, family in families if isinstance(task, kind)), None)

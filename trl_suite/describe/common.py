@@ -12,7 +12,7 @@ from trl_suite import catalogue, characters, terrain
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.environment import Environment
 from trl_suite.tasks import rewards
-from trl_suite.tasks.tracking3d import Tracking
+from trl_suite.tasks.spatial_task import SpatialTask
 
 Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks
 REWARD_WEIGHT = 'reward weight'  # title of a column of links
@@ -94,7 +94,7 @@ def observation(environment: Environment, meanings: Meanings) -> Section:
     """Returns the blocks of the observation."""
     blocks = environment.blocks
     size = max(part.stop for part in blocks.values())
-    spatial = isinstance(environment.task, Tracking)
+    spatial = isinstance(environment.task, SpatialTask)
     axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
     return section(
         f'Observation: {size} numbers, in this order{axes}',

@@ -12,7 +12,7 @@ from trl_suite.describe.gait import looks_until_fall, running_share
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.describe.spatial import after, before
 from trl_suite.environment import Environment
-from trl_suite.tasks import high_level, soccer
+from trl_suite.tasks import high_level
 
 __all__ = ['action', 'after', 'before', 'blocks', 'rules', 'time']
 
@@ -61,7 +61,7 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
         f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
     )
     yield spatial.start(row)
-    if isinstance(task, soccer.Soccer):
+    if task.ball:
         yield spatial.goal_and_ball(task._goal_distance)
         formulas, full = spatial.ball_terms(task._target_speed, task._goal_reached)
     else:

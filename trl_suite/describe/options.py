@@ -20,6 +20,7 @@ MEANINGS = {
     'half_range': 'rad per unit action; by default 1.5, about a clip in space 1',
     'heading_scale': 'times the squared error of the heading in the reward',
     'mirrored': 'observe and act as if the right foot always stood first',
+    'hidden_plan': "observe a goal instead of the plan, as the original's 'Hard' environments do",
     'miss': 'm; a foot that lands farther from its place ends the episode; by default it does not',
     'muscle_set': "'plain', or the motion that the muscles were optimised for",
     'plans': 'how footstep plans are drawn: a mapping, see trl_suite.tasks.plans; by default as told above',

@@ -10,7 +10,7 @@ import numpy as np
 from trl_suite import catalogue, terrain
 from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, Table, section
-from trl_suite.tasks import ball, high_level, journey
+from trl_suite.tasks import ball, goals, journey
 from trl_suite.terrain import Ground, ground
 from trl_suite.terrain.layout import Layout
 
@@ -76,7 +76,7 @@ _MIRRORED_PLAN = (
 def blocks(task: Any) -> Meanings:
     """Returns units and meanings of the observation blocks."""
     found = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
-    if isinstance(task, journey.Journey | journey.HiddenSteps):
+    if isinstance(task, journey.Journey) or getattr(task, 'hidden_plan', False):
         found['goal'] = TARGETS['ball' in task.blocks]
     return found
 
@@ -250,7 +250,7 @@ def goal(row: catalogue.Row, task: Any, rule: str) -> Section:
     return section(
         'Goal',
         f'drawn {where}; the next one when the walker is within {task._goal_reached:g} m of it, or after '
-        f'{_seconds(high_level.GOAL_LASTS)}',
+        f'{_seconds(goals.GOAL_LASTS)}',
     )
 
 
@@ -260,7 +260,7 @@ def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
         'Goal and ball',
         f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg is put {span(ball.BALL_AWAY)} from the walker, '
         f'the goal {span(away or ball.GOAL_AWAY)} from the ball, in any direction; the ball is put elsewhere '
-        f'after {_seconds(ball.BALL_LASTS)}, the next goal is drawn after {_seconds(high_level.GOAL_LASTS)}',
+        f'after {_seconds(ball.BALL_LASTS)}, the next goal is drawn after {_seconds(goals.GOAL_LASTS)}',
     )
 
 

@@ -228,45 +228,40 @@ def diverged(i: int, engine: Engine) -> bool:
     return False
 
 
-# Loops over simulations; the pack holds an Engine.
+# Loops over simulations; they take packs.
 
 
 @compiled_loop
-def step_all(env_ids: np.ndarray, nstep: int, pack: Any) -> None:
+def step_all(env_ids: np.ndarray, nstep: int, engine: Engine) -> None:
     """Advances simulations by `nstep` physics steps each."""
-    engine = pack.value
     for i in env_ids:
         step(i, nstep, engine)
 
 
 @compiled_loop
-def forward_all(env_ids: np.ndarray, pack: Any) -> None:
+def forward_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Recomputes what depends on the written states of simulations."""
-    engine = pack.value
     for i in env_ids:
         forward(i, engine)
 
 
 @compiled_loop
-def reset_all(env_ids: np.ndarray, pack: Any) -> None:
+def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Puts simulations into the initial state."""
-    engine = pack.value
     for i in env_ids:
         reset(i, engine)
 
 
 @compiled_loop
-def read_all(env_ids: np.ndarray, pack: Any) -> None:
+def read_all(env_ids: np.ndarray, engine: Engine) -> None:
     """Brings the arrays up to date for some simulations."""
-    engine = pack.value
     for i in env_ids:
         read(i, engine)
 
 
 @compiled_loop
-def diverged_all(pack: Any, out: np.ndarray) -> bool:
+def diverged_all(engine: Engine, out: np.ndarray) -> bool:
     """Writes which simulations have diverged; returns whether any has."""
-    engine = pack.value
     found = False
     for i in range(len(out)):
         out[i] = diverged(i, engine)

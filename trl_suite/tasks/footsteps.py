@@ -6,42 +6,235 @@ deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.kinematics.spatial import SpatialMeasurement, polar
+from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
 from trl_suite.motion import Steps, quaternion, step_features
 from trl_suite.tasks import rewards
-from trl_suite.tasks.figure3d import turn
-from trl_suite.tasks.plans import (
-    ROOT_TURN_LIMIT,
-    Plans,
-    Pushes,
-    options,
+from trl_suite.tasks.comparison import (
+    Comparison,
+    com_error,
+    comparison,
+    height_error,
+    pose_error,
+    rate_error,
+    term,
 )
-from trl_suite.tasks.reference3d import SpatialReference
+from trl_suite.tasks.footstep_plan import (
+    CONTACT_SIZE,
+    LEFT,
+    PLAN_SIZE,
+    RIGHT,
+    SIDE,
+    FootstepPlan,
+    footstep_plan,
+    observe_plan,
+    plan_markers,
+    plan_mirror,
+    switches,
+)
+from trl_suite.tasks.goals import GOAL_COLOUR, flag
+from trl_suite.tasks.plans import ROOT_TURN_LIMIT, Plans, Pushes, options
 from trl_suite.tasks.reflection3d import Reflection
-from trl_suite.tasks.task import Marker
-from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS, Tracking
+from trl_suite.tasks.spatial_task import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    SpatialRules,
+    SpatialTask,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    publish,
+    tick,
+)
+from trl_suite.tasks.task import Marker, conclude, consecutive
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
-RIGHT, LEFT = 0, 1  # of the end effectors, in link order
-SIDE = np.array([-1.0, 1.0])  # of each foot: to the right, to the left
 NEAR_GOAL = 0.1  # m; nearer a goal gives no direction
 GOAL_REACHED = 1.0  # m; a goal is drawn anew there
 TYPICAL_POSES = 31  # of a step, whose mean is the middle of position control
-SOLE, SOLE_AHEAD = (0.0885, 0.045, 0.004), 0.052  # m; of the markers, and how far before the ankle
-SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)  # who lands there
-GOAL_COLOUR = (0.85, 0.15, 0.2, 0.8)
+HIDDEN = ('contact', 'plan')  # blocks of a hidden plan
 
-_END = list(rewards.STEP_TERMS).index('end_effector')
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING = range(len(rewards.STEP_TERMS))
 
 
-class Footsteps(Tracking):
+class FootstepState(NamedTuple):
+    """What the task knows beside the plan, (n, ...).
+
+    Attributes:
+      length, width: of the current steps, m.
+      track: of the reference.
+      turned: by which the reference is turned, rad.
+      shift: where the origin of its track is, (n, 2) m.
+      goal: (n, 3) m.
+      push: force on the torso, (n, 3) N.
+      push_end, push_begin: control steps of an episode at which the push ends and the next begins.
+      excused: control step of an episode until which no foot misses.
+      missed: whether a foot landed too far from its place in the last step.
+    """
+
+    length: np.ndarray
+    width: np.ndarray
+    track: np.ndarray
+    turned: np.ndarray
+    shift: np.ndarray
+    goal: np.ndarray
+    push: np.ndarray
+    push_end: np.ndarray
+    push_begin: np.ndarray
+    excused: np.ndarray
+    missed: np.ndarray
+
+
+class FootstepRules(NamedTuple):
+    """All that the rules of footsteps work on.
+
+    Attributes:
+      contact, plan_block: where these blocks begin in the full observation.
+      goal_block: where the goal is seen; -1: it is not.
+      footstep_scales, heading_scale: of errors in the reward.
+      largest_miss: of a foot that lands, m.
+    """
+
+    common: SpatialRules
+    comparison: Comparison
+    plan: FootstepPlan
+    state: FootstepState
+    contact: int
+    plan_block: int
+    goal_block: int
+    footstep_scales: np.ndarray
+    heading_scale: float
+    largest_miss: float
+
+
+# A step of simulation i: `land`, the next plan where stance switches, `finish`.
+
+
+@compiled
+def land(i: int, rules: FootstepRules) -> bool:
+    """Measures the body and looks at what has landed; returns whether it wants another plan."""
+    common, plan, state = rules.common, rules.plan, rules.state
+    tick(i, common)
+    plan.landed[i] = state.missed[i] = False
+    if breaks_down(i, common):
+        return False
+    measure(i, common)
+    plan.landed[i] = switches(i, common.clock.phase[i], common.found, plan)
+    if plan.landed[i] and plan.landing_error[i] > rules.largest_miss:
+        state.missed[i] = common.clock.steps[i] > state.excused[i]
+    return plan.landed[i]
+
+
+@compiled
+def finish(i: int, rules: FootstepRules) -> None:
+    """Reward, failure and observation."""
+    outcome = rules.common.outcome
+    if outcome.diverged[i]:  # the last finite observation stands
+        conclude(i, True, outcome)
+        return
+    compare(i, rules)
+    conclude(i, rules.common.found.fallen[i] or rules.state.missed[i], outcome)
+    observe(i, rules)
+
+
+@compiled
+def step_phase(phase: float) -> float:
+    """Share of the single step that has passed, of the phase of two."""
+    return 2 * phase - np.floor(2 * phase)
+
+
+@compiled
+def compare(i: int, rules: FootstepRules) -> None:
+    """Writes the reward terms: the reference's pose and motion, and where and how feet land."""
+    common, plan, by = rules.common, rules.plan, rules.comparison
+    found, terms, state = common.found, common.outcome.reward_terms, rules.state
+    share = step_phase(common.clock.phase[i])
+    row, rest = moment(share, state.track[i], by.tracks)
+    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
+    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    # The reference heads where the character did when it was put there.
+    terms[i, COM] = term(COM, com_error(i, row, rest, state.turned[i], by, found), by)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+
+    swing, late = 1 - plan.stance[i], share > 0.5
+    feet = step = 0.0
+    for foot in range(2):
+        for k in range(3):
+            # In the second half the plan takes the place of the reference.
+            if not (late and foot == swing and k < 2):
+                column = by.effectors + 3 * foot + k
+                off = found.features[i, column] - feature(row, rest, column, by.tracks)
+                feet += off * off
+    if late:
+        for k in range(3):
+            off = plan.landing[i, 0, k] - found.feet[i, swing, k]
+            if k == 2:
+                off += feature(row, rest, by.effectors + 3 * swing + 2, by.tracks)
+            step += off * off
+    end = 0.0
+    for scale in rules.footstep_scales:
+        end += term(END_EFFECTOR, feet + scale * step, by)
+    terms[i, END_EFFECTOR] = end / len(rules.footstep_scales)
+    off = abs(rewards.wrapped(plan.heading[i] - found.heading[i]))
+    facing = rewards.facing(min(rules.heading_scale * off, math.pi))
+    terms[i, HEADING] = by.term_weights[HEADING] * facing
+
+
+@compiled
+def observe(i: int, rules: FootstepRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observe_body(i, common)
+    observe_plan(i, rules.contact, rules.plan_block, found, rules.plan, common.full)
+    if rules.goal_block >= 0:
+        x = rules.state.goal[i, 0] - found.root[i, 0]
+        y = rules.state.goal[i, 1] - found.root[i, 1]
+        bearing, distance = polar(i, x, y, found)
+        common.full[i, rules.goal_block] = bearing
+        common.full[i, rules.goal_block + 1] = distance
+    publish(i, common)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def land_all(env_ids: np.ndarray, rules: FootstepRules) -> int:
+    """Looks at what has landed; returns how many want another plan."""
+    switched = 0
+    for i in env_ids:
+        switched += land(i, rules)
+    return switched
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+    """Observes, and compares as if a step had been taken."""
+    for i in env_ids:
+        measure(i, rules.common)
+        compare(i, rules)
+        observe(i, rules)
+
+
+class Footsteps(SpatialTask):
     """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
@@ -83,6 +276,7 @@ class Footsteps(Tracking):
         half_range: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
         blend: float = 0.0,
+        hidden_plan: bool = False,
     ) -> None:
         """Composes the task.
 
@@ -103,6 +297,9 @@ class Footsteps(Tracking):
           heading_scale: the same of the error of the heading.
           terrain_map, mirrored, substeps, centre, half_range, start_phase, blend: as for
             `SpatialImitation`; the middle of position control is the mean pose of a straight step.
+          hidden_plan: observe bearing (rad) and distance (m) of a goal that stays where it is, in a
+            block goal, instead of contact and plan, which the reward is still about: what the
+            original's 'Hard' environments do.
 
         Raises:
           ValueError: options out of range, or steps that do not fit the character.
@@ -117,55 +314,91 @@ class Footsteps(Tracking):
             scales = np.atleast_1d(given)
             if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
                 raise ValueError(f'{name} is {given}; expected 0 or more')
-        self._footstep_scales = np.atleast_1d(footstep_scale).tolist()
-        self._heading_scale = heading_scale
+        self._footstep_scales = np.atleast_1d(footstep_scale).astype(float)
+        self._heading_scale = float(heading_scale)
         self.plans = options(Plans, 'plans', {} if plans is None else plans)
         self.pushes = None if pushes is None else options(Pushes, 'pushes', pushes)
-        if self.pushes:
-            self.fields = (*self.fields, 'xfrc_applied')
         self.steps, self.period = steps, 2 * steps.duration
-        self.goal_given, self.miss, self._grace = goal, miss, round(grace / CONTROL_TIMESTEP)
-        mean = np.mean(self.plans.length)
+        self.goal_given, self.hidden_plan = goal, hidden_plan
+        self.miss = miss
+        self._largest_miss = np.inf if miss is None else float(miss)
+        self._grace = round(grace / CONTROL_TIMESTEP)
         # The straight step of about the planned length, from which episodes start.
-        straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
-        self._first = int(np.lexsort((np.abs(steps.labels[:, 0] - mean), straight))[0])
+        self._first = straight_step(steps, float(np.mean(self.plans.length)))
+        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * hidden_plan}
         super().__init__(
             character, arena, steps, actuation_model=actuation_model, substeps=substeps,
             centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
-            mirrored=mirrored, blend=blend, phase=True, extras=self._extra_blocks(),
+            mirrored=mirrored, blend=blend, extras=extras,
         )  # fmt: skip
+        if hidden_plan:
+            if mirrored:
+                raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+            self._hide_plan()
 
-    def _extra_blocks(self) -> dict[str, int]:
-        """Blocks, with their sizes, of what is touched and planned."""
-        return {'contact': 2, 'plan': 13}
+    def _hide_plan(self) -> None:
+        """Leaves the plan out of what is observed."""
+        names = [name for name in self._full if name not in HIDDEN]
+        self.blocks = consecutive({
+            name: self._full[name].stop - self._full[name].start for name in names
+        })  # fmt: skip
+        kept = self._kept = np.concatenate([np.r_[self._full[name]] for name in names])
+        if self.mirror is None:
+            return
+        place = np.zeros(len(self.mirror.observation_sign), int)
+        place[kept] = np.arange(len(kept))
+        self.mirror = dataclasses.replace(
+            self.mirror,
+            observation_index=place[self.mirror.observation_index[kept]],
+            observation_sign=self.mirror.observation_sign[kept],
+        )
 
     def _typical_poses(self) -> np.ndarray:
         return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
 
     def bind(self, world: World) -> None:
-        super().bind(world)
-        n, kinematics = world.n, self.figure.kinematics
-        self.reference = SpatialReference.of_steps(self.steps, kinematics, world.models[0])
-        weights = np.array(list(self.TERMS.values()))
-        self._term_weights, self._term_scales = weights[None, :-1, 0], -weights[None, :-1, 1]
-        self._heading_weight = weights[-1, 0]
-        self.stance = np.zeros(n, int)  # foot that stands
-        self.landing = np.zeros((n, 2, 3))  # m; where the swing foot lands, then the stance foot
-        self.heading = np.zeros(n)  # rad; planned
-        self._length, self._width = np.zeros(n), np.zeros(n)  # m; of the steps of now
-        self._track = np.zeros(n, int)  # of the reference
-        self._turned = np.zeros(n)  # rad; by which the reference is turned
-        self._shift = np.zeros((n, 2))  # m; where the origin of its track is
-        self.goal = np.zeros((n, 3))  # m
-        self.landing_error = np.zeros(n)  # m; of the last foot that landed
-        self.heading_error = np.zeros(n)  # rad; at that moment
-        self.landed = np.zeros(n, bool)  # whether one did in this step
+        common, n = self._bind_rules(world), world.n
+        self.reference = SpatialReference.of_steps(self.steps, common.body, world.models[0])
+        self.plan = footstep_plan(n)
+        self.state = FootstepState(
+            np.zeros(n), np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros((n, 2)),
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, int), np.zeros(n, int), np.zeros(n, int),
+            np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.state)
+        self.info_arrays |= {
+            name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
+        }
+        starts = {name: part.start for name, part in self._full.items()}
+        rules = FootstepRules(
+            common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
+            starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
+            self._heading_scale, self._largest_miss,
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
-        self._push = np.zeros((n, 3))  # N
-        # Control steps of an episode at which the push ends and the next one begins.
-        self._push_end, self._push_begin = np.zeros((2, n), int)
-        self._missed: np.ndarray | bool = False  # who ends so
-        self._excused = np.zeros(n, int)  # control step of an episode until which no foot misses
+
+    # The plan, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, `RIGHT` or `LEFT`, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, (n, 3) m."""
+        return self.state.goal
 
     @property
     def step_phase(self) -> np.ndarray:
@@ -176,72 +409,70 @@ class Footsteps(Tracking):
     # Episodes and plans.
 
     def _start(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = self._begin_grounds(rows, random_states)
-        return self._pose_of_start(rows, spawns)
+        spawns = self._begin_grounds(env_ids, random_states)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
 
-    def _pose_of_start(
-        self, rows: np.ndarray, spawns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns what `_start` does, for the phases that have been drawn."""
-        stance = (self.phase[rows] >= 0.5).astype(int)
-        self.stance[rows] = stance
-        times = self.step_phase[rows] * self.steps.duration
-        poses = self.steps.pose(self._first, times, stance == LEFT)
-        poses[:, :2] = 0.0
-        rates = self.steps.velocity(self._first, times, stance == LEFT)
-        return poses, rates, spawns
-
-    def _begun_on_ground(self, rows: np.ndarray) -> None:
-        found = self.figure.measure()
-        self.landing_error[rows] = self.heading_error[rows] = 0.0
-        self.landed[rows] = False
-        self._push_end[rows] = self._excused[rows] = 0
-        aside, sizes = np.zeros(len(rows)), np.zeros((len(rows), 2, 2))
-        for i, row in enumerate(rows.tolist()):
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        found, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
+        plan.landed[env_ids] = state.missed[env_ids] = False
+        state.push_end[env_ids] = state.excused[env_ids] = 0
+        aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
+        for k, i in enumerate(env_ids.tolist()):
             if self.pushes:
-                self._push_begin[row] = self._steps_within(row, self.pushes.interval)
-            self._redraw_step(row, always=True)
-            aside[i] = self._width[row]
+                state.push_begin[i] = self._steps_within(i, self.pushes.interval)
+            self._redraw_step(i, always=True)
+            aside[k] = state.width[i]
             if self.goal_given:
-                place = self._origin[row, :2]
-                self.goal[row] = self.arena.goal(row, self._random[row], place, 'step')
-            sizes[i] = self._next_size(row), self._next_size(row)
-        places, angles = self._origin[rows, :2], self._origin[rows, 2]
-        self.heading[rows] = angles
-        stance = self.stance[rows]
-        anchors = found.feet[rows, stance, :2]
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
+            sizes[k] = self._next_size(i), self._next_size(i)
+        places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
+        plan.heading[env_ids] = angles
+        stance = plan.stance[env_ids]
+        anchors = found.feet[env_ids, stance, :2]
         if self.goal_given:
-            self._head_for_goals(rows, found.root[rows, :2])
+            self._head_for_goals(env_ids, found.root[env_ids, :2])
         else:
             # The line of the plan goes through the start, half a width beside each foot.
             line = quaternion.turned(anchors - places, -angles)
             line[:, 1] = 0.5 * SIDE[stance] * aside
             anchors = places + quaternion.turned(line, angles)
         for which, foot in enumerate((1 - stance, stance)):
-            anchors = self._lay(rows, which, foot, anchors, sizes[:, which])
-        self._put_reference(rows, found, np.full(len(rows), self._first))
+            anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
+        self._put_reference(env_ids, found, np.full(len(env_ids), self._first))
+        if self.hidden_plan:
+            for i in env_ids.tolist():
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
 
-    def _redraw_step(self, row: int, always: bool = False) -> None:
+    def _redraw_step(self, i: int, always: bool = False) -> None:
         """Draws length and width of the steps to come, perhaps."""
-        plans, random = self.plans, self._random[row]
+        plans, random = self.plans, self._random[i]
         if always or random.uniform() < plans.change:
-            self._length[row] = random.uniform(*plans.length)
-            self._width[row] = random.uniform(*plans.width)
+            self.state.length[i] = random.uniform(*plans.length)
+            self.state.width[i] = random.uniform(*plans.width)
 
-    def _next_size(self, row: int) -> tuple[float, float]:
+    def _next_size(self, i: int) -> tuple[float, float]:
         """Returns length and width of the next step, which perhaps are drawn anew, m."""
-        self._redraw_step(row)
-        return float(self._length[row]), float(self._width[row])
+        self._redraw_step(i)
+        return float(self.state.length[i]), float(self.state.width[i])
 
     def _lay(
-        self, rows: np.ndarray, which: int, feet: np.ndarray, places: np.ndarray, sizes: np.ndarray
+        self,
+        env_ids: np.ndarray,
+        which: int,
+        feet: np.ndarray,
+        places: np.ndarray,
+        sizes: np.ndarray,
     ) -> np.ndarray:
         """Enters into the plans where feet land while the other ones stand at places, on the ground.
 
         Args:
-          rows: which simulations, (m,).
+          env_ids: which simulations, (m,).
           which: of the plan's two steps.
           feet: which ones step, (m,).
           places: (m, 2) m.
@@ -252,180 +483,122 @@ class Footsteps(Tracking):
         """
         steps = sizes.copy()
         steps[:, 1] *= SIDE[feet]
-        places = places + quaternion.turned(steps, self.heading[rows])
-        self.landing[rows, which, :2] = places
-        heights = self.arena.height(places[:, :1], places[:, 1:], rows)
-        self.landing[rows, which, 2] = heights[:, 0]
+        places = places + quaternion.turned(steps, self.heading[env_ids])
+        self.landing[env_ids, which, :2] = places
+        heights = self.arena.height(places[:, :1], places[:, 1:], env_ids)
+        self.landing[env_ids, which, 2] = heights[:, 0]
         return places
 
-    def _head_for_goals(self, rows: np.ndarray, places: np.ndarray) -> None:
+    def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
         """Plans to head from places (m, 2) for the goals, where these are not too near."""
-        way = self.goal[rows, :2] - places
+        way = self.goal[env_ids, :2] - places
         headings = np.arctan2(way[:, 1], way[:, 0])
         far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
-        self.heading[rows[far]] = headings[far]
+        self.heading[env_ids[far]] = headings[far]
 
-    def _steps_within(self, row: int, seconds: tuple[float, float]) -> int:
-        return round(self._random[row].uniform(*seconds) / self.control_timestep)
+    def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
+        return round(self._random[i].uniform(*seconds) / self.control_timestep)
 
-    def act(self, action: np.ndarray) -> None:
-        super().act(action)
-        pushes = self.pushes
-        if not pushes:
-            return
-        for row in np.flatnonzero(self._count >= self._push_begin).tolist():
-            angle = self._random[row].uniform(-np.pi, np.pi)
-            force = self._random[row].uniform(*pushes.force)
-            self._push[row] = force * np.cos(angle), force * np.sin(angle), 0.0
-            self._push_end[row] = self._count[row] + self._steps_within(row, pushes.duration)
-            self._push_begin[row] = self._push_end[row] + self._steps_within(row, pushes.interval)
-            self._excused[row] = self._push_end[row] + self._grace
-        pushing = (self._count < self._push_end)[:, None]
-        self.world.xfrc_applied[:, self._torso, :3] = self._push * pushing
+    # A step.
 
-    def _step(self, found: SimpleNamespace) -> None:
-        stance = (self.phase >= 0.5).astype(int)
-        switched = (stance != self.stance) & ~self.diverged  # what breaks down lands nowhere
-        self.landed = switched
-        self._missed = False
-        if not switched.any():
-            return
-        rows = np.flatnonzero(switched)
-        self.stance[rows] = stance[rows]  # the foot that has just landed
-        gap = found.feet[rows, stance[rows], :2] - self.landing[rows, 0, :2]
-        self.landing_error[rows] = np.hypot(gap[:, 0], gap[:, 1])
-        self.heading_error[rows] = np.abs(rewards.wrap(self.heading[rows] - found.heading[rows]))
-        if self.miss is not None:  # by the plan that was to be met
-            self._missed = switched & (self.landing_error > self.miss)
-            self._missed &= self._count > self._excused
-        self._replan(rows, found)
-        self._put_reference(rows, found, self._choose(rows, found))
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+        if self.pushes:
+            self._push(env_ids, self.pushes)
 
-    def _replan(self, rows: np.ndarray, found: SimpleNamespace) -> None:
+    def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
+        """Applies the forces of pushes, and draws those that begin."""
+        state, count = self.state, self.clock.steps
+        for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
+            angle = self._random[i].uniform(-np.pi, np.pi)
+            force = self._random[i].uniform(*pushes.force)
+            state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
+            state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
+            state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
+            state.excused[i] = state.push_end[i] + self._grace
+        pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
+        self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if land_all(env_ids, self._pack):
+            switched = env_ids[self.plan.landed[env_ids]]
+            found = self.figure.found
+            self._replan(switched, found)
+            self._put_reference(switched, found, self._choose(switched, found))
+        finish_all(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def _replan(self, env_ids: np.ndarray, found: SpatialMeasurement) -> None:
         """Makes the next plans of some simulations, at a switch of stance."""
-        plans, count = self.plans, len(rows)
+        plans, count = self.plans, len(env_ids)
         by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
-        for i, row in enumerate(rows.tolist()):
-            random = self._random[row]
+        for k, i in enumerate(env_ids.tolist()):
+            random = self._random[i]
             if plans.from_root and random.uniform() < plans.from_root:
-                by_root[i] = True
-                turns[i] = random.normal(0, plans.root_turn)
+                by_root[k] = True
+                turns[k] = random.normal(0, plans.root_turn)
                 for which in (0, 1):
                     ahead = random.uniform(*plans.root_length)
-                    sizes[i, which] = ahead, random.uniform(*plans.root_width)
+                    sizes[k, which] = ahead, random.uniform(*plans.root_width)
                 continue
             if self.goal_given:
-                root = found.root[row, :2]
-                if np.hypot(*(root - self.goal[row, :2])) < GOAL_REACHED:
-                    self.goal[row] = self.arena.goal(row, random, root, 'step')
+                root = found.root[i, :2]
+                if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
+                    self.goal[i] = self.arena.goal(i, random, root, 'step')
             elif plans.sharp and random.uniform() < plans.sharp:
-                turns[i] = random.uniform(-np.pi, np.pi)
-                self._excused[row] = self._count[row] + self._grace
+                turns[k] = random.uniform(-np.pi, np.pi)
+                self.state.excused[i] = self.clock.steps[i] + self._grace
             elif plans.turn:
-                turns[i] = random.normal(0, plans.turn)
-            sizes[i, 1] = self._next_size(row)
-        stance = self.stance[rows]
+                turns[k] = random.normal(0, plans.turn)
+            sizes[k, 1] = self._next_size(i)
+        stance = self.stance[env_ids]
         on = ~by_root
         if on.any():
-            going = rows[on]
+            going = env_ids[on]
             if self.goal_given:
                 self._head_for_goals(going, self.landing[going, :, :2].mean(1))
             self.heading[going] += turns[on]
             self.landing[going, 0] = self.landing[going, 1]
             self._lay(going, 1, stance[on], self.landing[going, 0, :2], sizes[on, 1])
         if by_root.any():
-            going, foot = rows[by_root], stance[by_root]
+            going, foot = env_ids[by_root], stance[by_root]
             off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
             self.heading[going] = found.heading[going] + off
             places = found.feet[going, foot, :2]
             for which, feet in enumerate((1 - foot, foot)):
                 places = self._lay(going, which, feet, places, sizes[by_root, which])
 
-    def _choose(self, rows: np.ndarray, found: SimpleNamespace) -> np.ndarray:
+    def _choose(self, env_ids: np.ndarray, found: SpatialMeasurement) -> np.ndarray:
         """Returns the steps nearest to the plans of some simulations."""
-        feet = found.feet[rows]
+        feet = found.feet[env_ids]
         query = step_features(
-            found.root[rows, :2], found.heading[rows], feet[:, RIGHT, :2], feet[:, LEFT, :2],
-            self.landing[rows, 0, :2], self.heading[rows], self.stance[rows] == RIGHT,
+            found.root[env_ids, :2], found.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
+            self.landing[env_ids, 0, :2], self.heading[env_ids], self.stance[env_ids] == RIGHT,
         )  # fmt: skip
         return self.steps.select(query)
 
-    def _put_reference(self, rows: np.ndarray, found: SimpleNamespace, chosen: np.ndarray) -> None:
+    def _put_reference(
+        self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
+    ) -> None:
         """Has the chosen steps begin where the characters are and as they head."""
-        self._track[rows] = chosen + len(self.steps) * (self.stance[rows] == LEFT)
+        self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
         columns = self.reference.columns
-        now = self.reference.features(self.step_phase[rows], self._track[rows])
-        turned = found.heading[rows] - now[:, columns['heading'].start]
-        self._turned[rows] = turned
-        self._shift[rows] = found.root[rows, :2] - quaternion.turned(
+        now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
+        turned = found.heading[env_ids] - now[:, columns['heading'].start]
+        self.state.turned[env_ids] = turned
+        self.state.shift[env_ids] = found.root[env_ids, :2] - quaternion.turned(
             now[:, columns['root']], turned
         )
 
-    # Reward and observation.
-
-    def _gone(self) -> np.ndarray | bool:
-        return self._missed
-
-    def _compare(self, found: SimpleNamespace) -> None:
-        n, kinematics = len(found.features), self.figure.kinematics
-        rows = np.arange(n)
-        columns = kinematics.columns
-        share = self.step_phase
-        reference = self.reference.features(share, self._track)
-        # The reference heads where the character did when it was put there.
-        velocity = reference[:, columns['com_velocity']]
-        reference[:, columns['com_velocity']][:, :2] = quaternion.turned(
-            velocity[:, :2], self._turned
-        )
-        error = kinematics.compare(found.features, reference[:, : found.features.shape[1]])
-        feet = error[:, self._effector_columns].reshape(n, 2, 3)
-        late = share > 0.5
-        swing = 1 - self.stance
-        away = feet[rows, swing]
-        away[late, :2] = 0.0  # in the second half the plan takes the place of the reference
-        feet[rows, swing] = away
-        raised = reference[:, columns['effectors']].reshape(n, 2, 3)[rows, swing, 2]
-        step = self.landing[:, 0] - found.feet[rows, swing]
-        step[:, 2] += raised
-        step *= late[:, None]
-        feet, step = (feet * feet).reshape(n, 6).sum(1), (step * step).sum(1)
-        end = feet + self._footstep_scales[0] * step
-        error *= error
-        # Row by row, so that a row's sums do not depend on how many rows there are.
-        pose, velocity, com, root = np.matmul(error[:, None], self._weights)[:, 0].T
-        errors = np.stack([pose, velocity, end, com, root], axis=1)
-        terms = self.reward_terms
-        terms[:, :-1] = rewards.exponentials(errors, self._term_weights, self._term_scales)
-        for scale in self._footstep_scales[1:]:
-            end = feet + scale * step
-            terms[:, _END] += self._term_weights[:, _END] * np.exp(self._term_scales[:, _END] * end)
-        terms[:, _END] /= len(self._footstep_scales)
-        self._off = rewards.wrap(self.heading - found.heading)
-        error = np.minimum(self._heading_scale * np.abs(self._off), np.pi)
-        terms[:, -1] = self._heading_weight * rewards.heading(error)
-
-    def _write_extras(self, found: SimpleNamespace) -> None:
-        n = len(found.features)
-        rows = np.arange(n)
-        self._observation[:, self._full['contact']] = found.contact
-        plan = self._observation[:, self._full['plan']]
-        feet = np.stack([1 - self.stance, self.stance], axis=1)  # which of them lands where
-        way = self.landing - found.feet[rows[:, None], feet]
-        way[..., 2] = self.landing[..., 2] - found.under
-        way = turn(way, found.cosine, found.sine)
-        slots = np.zeros((n, 2, 2, 3))  # first and second step; as seen from right and left foot
-        slots[rows[:, None], np.arange(2), feet] = way
-        plan[:, :12] = slots.reshape(n, 12)
-        plan[:, 12] = self._off
+    # Left and right, and pictures.
 
     def _extra_mirror(self, name: str) -> Reflection:
-        if name == 'contact':
-            return np.array([1, 0]), np.ones(2)
-        index = np.arange(13)
-        index[:12] = np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel()
-        return index, np.append(np.tile([1.0, -1.0, 1.0], 4), -1.0)
+        return (np.arange(2), np.array([-1.0, 1.0])) if name == 'goal' else plan_mirror(name)
 
-    def _canonical_extras(self, extras: dict[str, int]) -> dict[str, int]:
+    def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
         return {**extras, 'plan': 7}
 
     def _canonical_extra_columns(self, name: str) -> np.ndarray:
@@ -435,44 +608,41 @@ class Footsteps(Tracking):
         # Heading; the first step as seen from the left foot, the second from the right one.
         return columns[[12, 3, 4, 5, 6, 7, 8]]
 
-    def infos(self) -> dict[str, Any]:
-        """As for every task; and of the last foot that landed, whether it did so in this step.
-
-        `landed` (n,) bool; `landing_error` m and `heading_error` rad, (n,), 0 before any landing.
-        """
-        return {
-            **super().infos(),
-            'landed': self.landed.copy(),
-            'landing_error': self.landing_error.copy(),
-            'heading_error': self.heading_error.copy(),
-        }
-
-    def markers(self, row: int) -> list[Marker]:
+    def markers(self, env_id: int) -> list[Marker]:
         """Where the feet are to land, which way the body is to head, and the goal."""
-        yaw = float(self.heading[row])
-        ahead = SOLE_AHEAD * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        found = [
-            Marker('box', place + ahead + (0, 0, SOLE[2]), SOLE, colour, yaw)
-            for place, colour in zip(self.landing[row], (SWING_COLOUR, STANCE_COLOUR), strict=True)
-        ]
-        root = self.world.xpos[row, self.figure.kinematics.links[0]]
-        found.append(Marker('arrow', root, (0.012, 0.012, 0.5), SWING_COLOUR, yaw))
+        root = self.world.xpos[env_id, self.figure.links[0]]
+        found = plan_markers(env_id, root, self.plan)
         if self.goal_given:
-            found.append(Marker('cylinder', self.goal[row], (0.15, 0.2, 0.0), GOAL_COLOUR))
+            found.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
+        if self.hidden_plan:
+            found.append(flag(self.goal[env_id]))
         return found
 
-    def reference_pose(self, row: int) -> np.ndarray:
+    def reference_pose(self, env_id: int) -> np.ndarray:
         """Pose of the reference where it was put: root, then joints."""
-        mirrored, index = divmod(int(self._track[row]), len(self.steps))
-        time = self.step_phase[row] * self.steps.duration
+        state = self.state
+        mirrored, index = divmod(int(state.track[env_id]), len(self.steps))
+        time = self.step_phase[env_id] * self.steps.duration
         pose = self.steps.pose(index, time, bool(mirrored))
-        pose[:2] = self._shift[row] + quaternion.turned(pose[:2], self._turned[row])
-        pose[3:7] = quaternion.multiply(quaternion.about_z(self._turned[row]), pose[3:7])
-        rows = np.array([row])
-        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], rows)[0, 0]
+        turned = state.turned[env_id]
+        pose[:2] = state.shift[env_id] + quaternion.turned(pose[:2], turned)
+        pose[3:7] = quaternion.multiply(quaternion.about_z(turned), pose[3:7])
+        env_ids = np.array([env_id])
+        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]
         return pose
 
-    _KEPT: tuple[str, ...] = (
-        'stance', 'landing', 'heading', '_length', '_width', '_track', '_turned', '_shift', 'goal',
-        'landing_error', 'heading_error', 'landed', '_push', '_push_end', '_push_begin', '_excused',
+
+def straight_step(steps: Steps, length: float) -> int:
+    """Returns the step of a library that is straight on and of about this length, m."""
+    straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
+    return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
+
+
+def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses over the origin, and rates, at phases (m,) of two steps like this one."""
+    times = (2 * phase - np.floor(2 * phase)) * steps.duration
+    poses, rates = (
+        part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)
     )  # fmt: skip
+    poses[:, :2] = 0.0
+    return poses, rates

@@ -20,7 +20,7 @@ from trl_suite.kinematics.planar import has_fallen, measure, must_wait
 from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
 from trl_suite.tasks import imitation, rewards
-from trl_suite.tasks.footsteps import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
+from trl_suite.tasks.footstep_plan import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
 from trl_suite.tasks.imitation import SUBSTEPS, Imitation
 from trl_suite.tasks.plans import StraightPlans
 from trl_suite.tasks.plans import options as plans_from
@@ -161,8 +161,8 @@ def compare(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> Non
         z = plan.landing[i, 0, 2] - rules.physics.xpos[i, foot, 2] + raised
         end_effector += options.footstep_scale * (x * x + z * z)
     weights, scales = rules.term_weights, rules.term_scales
-    terms[i, _END_EFFECTOR] = weights[_END_EFFECTOR] * math.exp(
-        -scales[_END_EFFECTOR] * end_effector
+    terms[i, _END_EFFECTOR] = rewards.term(
+        end_effector, weights[_END_EFFECTOR], scales[_END_EFFECTOR]
     )
     terms[i, _HEADING] = weights[_HEADING] if found.facing[i] > 0.0 else 0.0
 
@@ -197,25 +197,19 @@ def draw_plan(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> N
     put_on_ground(i, rules, plan)
 
 
-# Loops over simulations; the pack holds Rules, Plan and Options.
+# Loops over simulations; they take packs.
 
 
 @compiled_loop
-def draw_plans(
-    env_ids: np.ndarray, pack: Any
-) -> None:  # fmt: skip
+def draw_plans(env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options) -> None:
     """Draws the first plans of some simulations."""
-    rules, plan, options = pack.value
     for i in env_ids:
         draw_plan(i, rules, plan, options)
 
 
 @compiled_loop
-def finish_steps(
-    env_ids: np.ndarray, pack: Any
-) -> int:  # fmt: skip
+def finish_steps(env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options) -> int:
     """Finishes the steps of all that can be measured; returns how many have to wait."""
-    rules, plan, options = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -227,9 +221,10 @@ def finish_steps(
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, fresh: bool, pack: Any) -> int:
+def observe_all(
+    env_ids: np.ndarray, fresh: bool, rules: imitation.Rules, plan: Plan, options: Options
+) -> int:
     """Observes all that can be measured, at their starts if they are; returns how many wait."""
-    rules, plan, options = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -343,20 +338,20 @@ class PlanarFootsteps(Imitation):
             plans.length[0], plans.length[1], plans.change, np.inf if self.miss is None else float(self.miss),
             float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
         )  # fmt: skip
-        self._plan_pack = packed((self.rules, self.plan, options))
+        self._packs = self._pack, packed(self.plan), packed(options)
 
     def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
             self._streams.seed(i, drawn_seed(random_state))
-        draw_plans(env_ids, self._plan_pack)
+        draw_plans(env_ids, *self._packs)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
-        if finish_steps(env_ids, self._plan_pack):
-            finish_steps(self._widened(env_ids), self._plan_pack)
+        if finish_steps(env_ids, *self._packs):
+            finish_steps(self._widened(env_ids), *self._packs)
 
     def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
-        if observe_all(env_ids, fresh, self._plan_pack):
-            observe_all(self._widened(env_ids), fresh, self._plan_pack)
+        if observe_all(env_ids, fresh, *self._packs):
+            observe_all(self._widened(env_ids), fresh, *self._packs)
 
     def markers(self, row: int) -> list[Marker]:
         """Where the feet are to land."""

@@ -6,9 +6,9 @@ deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from types import MappingProxyType, SimpleNamespace
-from typing import Any
+import math
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,24 +18,59 @@ from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import llc
 from trl_suite.engine import World
-from trl_suite.motion import Steps, quaternion
+from trl_suite.kinematics.spatial import polar, write_body, write_terrain
+from trl_suite.motion import Steps
 from trl_suite.symmetry import Mirror
-from trl_suite.tasks import reflection3d, rewards
-from trl_suite.tasks.figure3d import polar
-from trl_suite.tasks.footsteps import GOAL_COLOUR, GOAL_REACHED, Footsteps
-from trl_suite.tasks.plans import span
+from trl_suite.tasks import reflection3d
+from trl_suite.tasks.ball import (
+    AT_GOAL,
+    GOAL_AWAY,
+    MIRRORED,
+    SOCCER_TERMS,
+    Ball,
+    BallRules,
+    dribble,
+    goal_disc,
+    no_ball,
+    observe_ball,
+    remember,
+)
+from trl_suite.tasks.footstep_plan import (
+    CONTACT_SIZE,
+    PLAN_SIZE,
+    FootstepPlan,
+    footstep_plan,
+    observe_plan,
+    plan_markers,
+    plan_mirror,
+    switches,
+)
+from trl_suite.tasks.footsteps import TYPICAL_POSES, pose_of_step, straight_step
+from trl_suite.tasks.goals import Goals, flag, goals, set_goal
+from trl_suite.tasks.plans import Plans, span
+from trl_suite.tasks.spatial_task import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    SpatialRules,
+    SpatialTask,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    tick,
+)
 from trl_suite.tasks.task import (
-    MAX_JOINT_SPEED,
     Marker,
     check_simulated,
+    conclude,
     consecutive,
     drawn_seed,
     drawn_way,
 )
-from trl_suite.tasks.trace import Trace
-from trl_suite.tasks.tracking3d import CONTROL_TIMESTEP, SUBSTEPS
-from trl_suite.terrain import Ground
-from trl_suite.terrain.surroundings import SAMPLES
+from trl_suite.tasks.trace import Trace, follow, trace, trace_markers
+from trl_suite.terrain import Ground, spatial_ground
+from trl_suite.terrain.spatial_ground import SAMPLES
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 INTERFACES = ('plan', 'frame')
 SIGHTS = ('height', 'velocity')
@@ -46,45 +81,315 @@ PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
 PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
+GOAL_REACHED = 1.0  # m; by default
+GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # reward for being on one's feet
-GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is drawn anew
 HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
 FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples that touch the ground
 SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
 FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
 LONGEST = 60  # control steps of a step; the clock switches stance long before
-FLAG = (0.1, 0.6, 0.0)  # m; marker of the goal: radius and half height
+
+SPEED, ON_FEET = range(len(HIKE_TERMS))
 
 
-class HighLevel(Footsteps):
-    """A spatial biped goes from goal to goal; an action is a plan of two footsteps and a heading.
+class PlanningState(NamedTuple):
+    """What the task knows beside plan and goal, (n, ...).
 
-    A step lasts from one switch of stance to the next, half a cycle of the footstep controller that
-    drives the joints inside; the first of an episode may be shorter. The plan is laid out from the
-    root's place on the ground and its heading at the beginning of the step: where the foot that
-    swings lands, where the other one lands after it, and the heading to have.
+    Attributes:
+      lasted: control steps of the last step.
+      duration: of the last step, s.
+      begin: centre of mass at its beginning, (n, 3) m.
+      down: running share of samples with a fall link on the ground.
+      speed: towards the goal in the last step, of walker or ball, m/s.
+      action: of the agent, clipped, (n, k).
+      over: whether the step is over.
+    """
+
+    lasted: np.ndarray
+    duration: np.ndarray
+    begin: np.ndarray
+    down: np.ndarray
+    speed: np.ndarray
+    action: np.ndarray
+    over: np.ndarray
+
+
+class PlanningRules(NamedTuple):
+    """All that the rules of planned footsteps work on.
+
+    The full observation of `common` is what the footstep controller observes.
+
+    Attributes:
+      contact, plan_block: where these blocks begin in the full observation.
+      by_plan: whether a step is a footstep, not a control step.
+      terrain, surface, pose, velocity, target, low_level: where these blocks begin in the
+        observation; -1: not observed.
+      plan_offset, plan_scale: what an action means.
+      target_speed, goal_reached: of the reward, m/s and m.
+      with_ball: whether the goal is that of a ball.
+    """
+
+    common: SpatialRules
+    plan: FootstepPlan
+    goals: Goals
+    state: PlanningState
+    trace: Trace
+    contact: int
+    plan_block: int
+    by_plan: bool
+    terrain: int
+    surface: int
+    pose: int
+    velocity: int
+    target: int
+    low_level: int
+    plan_offset: np.ndarray
+    plan_scale: np.ndarray
+    target_speed: float
+    goal_reached: float
+    with_ball: bool
+    ball: BallRules
+
+
+# A step of simulation i: `begin_step`, then for every control step inside of it actions of the
+# footstep controller, physics and `account`; then `score`, the next goal if one is wanted, `finish`.
+
+
+@compiled
+def begin_step(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan where a footstep begins, and shows it to the footstep controller."""
+    common, state = rules.common, rules.state
+    measure(i, common)
+    lay_plan(i, rules)
+    state.lasted[i] = 0
+    for k in range(3):
+        state.begin[i, k] = common.found.com[i, k]
+    if rules.with_ball:
+        remember(i, common.physics, common.found, rules.ball)
+    rules.plan.landed[i] = False
+    observe_low(i, rules)
+
+
+@compiled
+def lay_plan(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan that the action means, from the root and its heading, if a footstep begins."""
+    plan, found, ground = rules.plan, rules.common.found, rules.common.ground
+    if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
+        return
+    heading = found.heading[i]
+    cosine, sine = math.cos(heading), math.sin(heading)
+    for which in range(2):
+        ahead, left = meant(i, 2 * which, rules), meant(i, 2 * which + 1, rules)
+        x = found.root[i, 0] + (cosine * ahead - sine * left)
+        y = found.root[i, 1] + (sine * ahead + cosine * left)
+        plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
+        plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
+    plan.heading[i] = heading + meant(i, 4, rules)
+
+
+@compiled
+def meant(i: int, k: int, rules: PlanningRules) -> float:
+    """What number k of an action means, m or rad."""
+    return rules.state.action[i, k] * rules.plan_scale[k] + rules.plan_offset[k]
+
+
+@compiled
+def observe_low(i: int, rules: PlanningRules) -> None:
+    """Writes what the footstep controller observes."""
+    common = rules.common
+    observe_body(i, common)
+    observe_plan(i, rules.contact, rules.plan_block, common.found, rules.plan, common.full)
+
+
+@compiled
+def account(i: int, rules: PlanningRules) -> bool:
+    """Landings and falls after a control step; returns whether the step goes on."""
+    common, state, outcome = rules.common, rules.state, rules.common.outcome
+    tick(i, common)
+    state.lasted[i] += 1
+    breaks_down(i, common)
+    measure(i, common)
+    count, found = common.clock.steps[i], common.found
+    if count % SAMPLE_FRAMES == 0:
+        state.down[i] *= FADING
+        state.down[i] += SHARE * found.fallen[i]
+    outcome.failed[i] = state.down[i] > FALLEN or outcome.diverged[i]
+    if not outcome.diverged[i] and switches(i, common.clock.phase[i], found, rules.plan):
+        rules.plan.landed[i] = True
+    follow(i, count, found.com, rules.trace)
+    state.over[i] = (
+        rules.plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST
+        or not rules.by_plan
+    )  # fmt: skip
+    if not state.over[i]:
+        observe_low(i, rules)
+    return not state.over[i]
+
+
+@compiled
+def score(i: int, rules: PlanningRules) -> bool:
+    """Writes the reward terms; returns whether a goal or a place of the ball is to be drawn."""
+    common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
+    found, terms = common.found, common.outcome.reward_terms
+    measure(i, common)
+    seconds = CONTROL_TIMESTEP * max(state.lasted[i], 1)
+    state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
+    if rules.with_ball:
+        state.speed[i] = dribble(
+            i, 0, 1.0, seconds, goals.place, common.physics, found, rules.ball, terms
+        )
+    else:
+        x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
+        distance = math.hypot(x, y)
+        moved_x, moved_y = found.com[i, 0] - state.begin[i, 0], found.com[i, 1] - state.begin[i, 1]
+        speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
+        lack = min(speed - rules.target_speed, 0.0)
+        full = distance < rules.goal_reached
+        worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
+        terms[i, SPEED], terms[i, ON_FEET] = (1 - UPRIGHT) * worth, UPRIGHT
+        state.speed[i] = speed
+    goals.wanted[i] = ball.wanted[i] = False
+    if common.outcome.failed[i]:
+        return False
+    count = common.clock.steps[i]
+    late = count >= goals.due[i]
+    if rules.with_ball:  # reaching it does not end it
+        goals.reached[i] += ball.at_goal[i]
+        ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
+    else:
+        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        reached = math.hypot(x, y) < rules.goal_reached
+        goals.reached[i] += reached
+        goals.wanted[i] = reached or late
+    return goals.wanted[i] or ball.wanted[i]
+
+
+@compiled
+def finish(i: int, rules: PlanningRules) -> None:
+    """Reward and observation."""
+    outcome = rules.common.outcome
+    conclude(i, outcome.failed[i], outcome)
+    if not outcome.diverged[i]:  # else the last finite observation stands
+        observe(i, rules)
+
+
+@compiled
+def observe(i: int, rules: PlanningRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observation = common.outcome.observation
+    write_terrain(i, rules.terrain, common.ground, found, observation)
+    if rules.surface >= 0:
+        block = observation[i, rules.surface : rules.surface + 2 * SAMPLES * SAMPLES]
+        x, y = found.root[i, 0], found.root[i, 1]
+        spatial_ground.velocity_map(i, x, y, found.heading[i], common.ground, block)
+    write_body(i, rules.pose, rules.velocity, found, observation)
+    place = rules.goals.place
+    if rules.with_ball:
+        observe_ball(i, rules.target, place, common.physics, found, rules.ball, observation)
+    else:
+        x, y = place[i, 0] - found.root[i, 0], place[i, 1] - found.root[i, 1]
+        bearing, distance = polar(i, x, y, found)
+        observation[i, rules.target], observation[i, rules.target + 1] = bearing, distance
+    if rules.low_level >= 0:
+        observe_low(i, rules)
+        for k in range(common.full.shape[1]):
+            observation[i, rules.low_level + k] = common.full[i, k]
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def take_all(env_ids: np.ndarray, action: np.ndarray, rules: PlanningRules) -> None:
+    """Takes in the actions of the agent, clipped."""
+    for i in env_ids:
+        for k in range(action.shape[1]):
+            rules.state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+
+
+@compiled_loop
+def begin_steps(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Begins steps."""
+    for i in env_ids:
+        begin_step(i, rules)
+
+
+@compiled_loop
+def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Lays out plans as `begin_steps` would, and writes what the footstep controller observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        lay_plan(i, rules)
+        observe(i, rules)
+
+
+@compiled_loop
+def account_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Accounts for a control step; returns how many steps go on."""
+    going = 0
+    for i in env_ids:
+        going += account(i, rules)
+    return going
+
+
+@compiled_loop
+def score_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Writes reward terms; returns for how many anything is to be drawn."""
+    wanted = 0
+    for i in env_ids:
+        wanted += score(i, rules)
+    return wanted
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        observe(i, rules)
+
+
+class HighLevel(SpatialTask):
+    """A spatial biped goes from goal to goal, or dribbles a ball to them, by planning footsteps.
+
+    An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
+    next, half a cycle of the footstep controller that drives the joints inside; the first of an
+    episode may be shorter. The plan is laid out from the root's place on the ground and its heading
+    at the beginning of the step: where the foot that swings lands, where the other one lands after
+    it, and the heading to have.
 
     Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
       terrain: the 32 x 32 map of `Surroundings.height_map`, m, if it sees heights.
       surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if it sees velocities.
       pose, velocity: as in `SpatialImitation`.
-      target: bearing of the goal, rad to the left, and its distance, m.
-      low_level: what the footstep controller observes, with interface 'frame' only.
+      target: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
+        the ball.
+      ball: with a ball, see `trl_suite.tasks.ball.observe_ball`; 9.
+      low_level: what the footstep controller observes, with interface 'frame' only; see `Footsteps`.
+
+    Attributes:
+      watch: called at every 1/30 s of the first simulation, within steps too; for pictures.
     """
 
-    TERMS = HIKE_TERMS
-    GOAL_REACHED = GOAL_REACHED  # m; by default
-    # Blocks that say where to go, with the sign that each number has in a mirror.
-    GOAL_BLOCKS: Mapping[str, tuple[float, ...]] = MappingProxyType({'target': (-1.0, 1.0)})
-
-    watch: Callable[[], None] | None = None  # called at every 1/30 s of the first simulation
+    ABOUT = 'root'
+    watch: Callable[[], None] | None = None
 
     def __init__(
         self,
         character: Character,
         arena: SpatialTerrain,
         steps: Steps,
+        ball: Ball | None = None,
         *,
         controller: Any = llc.DEFAULT,
         interface: str = 'plan',
@@ -103,14 +408,16 @@ class HighLevel(Footsteps):
           character: a spatial biped without actuators; it is attached to the arena.
           arena: where it walks.
           steps: library of single steps of this character, for the first pose and the clock.
+          ball: a ball of the arena that is to be dribbled; its ground must be level.
           controller: the footstep controller: what `trl_suite.controllers.llc.load` takes.
           interface: 'plan', or 'frame': a step is 1/30 s, and behind the plan, which counts when it
             begins a footstep, an action has that of the footstep controller.
           sight: which maps are observed, of 'height' and 'velocity'.
           step_length: of the steps that action 0 means, m.
-          target_speed: m/s towards the goal from which on the reward is full.
-          goal_reached: m; nearer, a goal is drawn anew. By default `GOAL_REACHED`.
-          goal_distance: m; the least and the most, up to 100, from the walker (in soccer: from the
+          target_speed: m/s towards the goal, of walker and ball, from which on the reward is full.
+          goal_reached: m; nearer, a goal is drawn anew, or the ball is at the goal. By default 1 m,
+            and 0.5 m of a ball.
+          goal_distance: m; the least and the most, up to 100, from the walker (with a ball: from the
             ball), in any direction, at which goals are drawn: for open ground. By default they are
             where the terrain has them.
           start_phases: of the clock, one of which every episode starts with.
@@ -126,7 +433,8 @@ class HighLevel(Footsteps):
         for each in sight:
             if each not in SIGHTS:
                 raise ValueError(errors.unknown('sight', each, SIGHTS))
-        goal_reached = self.GOAL_REACHED if goal_reached is None else goal_reached
+        if goal_reached is None:
+            goal_reached = AT_GOAL if ball else GOAL_REACHED
         for name, value in (
             ('step_length', step_length), ('target_speed', target_speed),
             ('goal_reached', goal_reached),
@@ -141,22 +449,30 @@ class HighLevel(Footsteps):
                 )
         if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
             raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
-        self._furnish(arena)
-        super().__init__(character, arena, steps, substeps=substeps, blend=blend)
+        if len(character.row.end_effectors) != 2:
+            raise ValueError(f'character {character.row.name!r} has no two feet to place')
+        self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
+        self._first = straight_step(steps, float(np.mean(Plans().length)))
+        self.TERMS = SOCCER_TERMS if ball else HIKE_TERMS
+        self._goal_signs = {'target': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        super().__init__(
+            character, arena, steps, substeps=substeps, blend=blend,
+            extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
+        )  # fmt: skip
         self.controller = llc.load(controller)
         self.controller.check(self)
         self.interface, self.sight, self.step_length = interface, sight, step_length
-        self._target_speed, self._goal_reached = target_speed, goal_reached
+        self._target_speed, self._goal_reached = float(target_speed), float(goal_reached)
         self._goal_distance = goal_distance
         self._start_phases = tuple(start_phases)
         self._frame = substeps
         low = max(part.stop for part in self._full.values())
         centre, half_range, names = step_length * PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
         if interface == 'frame':
-            drive = self._drive
-            names = (*names, *drive.names)
-            centre = np.concatenate([centre, np.zeros(len(drive))])
-            half_range = np.concatenate([half_range, np.ones(len(drive))])
+            joints = self.joint_map
+            names = (*names, *joints.names)
+            centre = np.concatenate([centre, np.zeros(len(joints))])
+            half_range = np.concatenate([half_range, np.ones(len(joints))])
         else:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / substeps)
         self.action_map = ActionMap(names, 'footstep plan', 'm (turn: rad)', centre, half_range)
@@ -165,14 +481,17 @@ class HighLevel(Footsteps):
             'terrain': SAMPLES**2 if 'height' in sight else 0,
             'surface': 2 * SAMPLES**2 if 'velocity' in sight else 0,
             **pose,
-            **{name: len(signs) for name, signs in self.GOAL_BLOCKS.items()},
+            **{name: len(signs) for name, signs in self._goal_signs.items()},
             'low_level': low if interface == 'frame' else 0,
         })  # fmt: skip
         mirrors = interface == 'plan' and self.character.row.mirror
         self.mirror = self._plan_mirror() if mirrors else None
 
-    def _furnish(self, arena: SpatialTerrain) -> None:
-        """Adds what is there beside the ground."""
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
+        return plan_mirror(name)
 
     def _plan_mirror(self) -> Mirror:
         """How observations and plans are reflected."""
@@ -180,7 +499,7 @@ class HighLevel(Footsteps):
         lines, _ = parts['terrain']
         ahead = np.ones(len(lines))
         parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
-        for name, signs in self.GOAL_BLOCKS.items():
+        for name, signs in self._goal_signs.items():
             parts[name] = np.arange(len(signs)), np.array(signs)
         index, sign = reflection3d.joined(self.blocks, parts)
         links = list(self.character.row.links)
@@ -191,106 +510,143 @@ class HighLevel(Footsteps):
         )
 
     def bind(self, world: World) -> None:
-        super().bind(world)
-        n = world.n
-        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
-        self._action = np.zeros((n, len(self.action_map)))
-        self._lasted = np.zeros(n, int)  # control steps of the last step
-        self._from = np.zeros((n, 3))  # m; centre of mass at its beginning
-        self._down = np.zeros(n)  # running share of samples with a fall link on the ground
-        self._due = np.zeros(n, int)  # control step of the episode at which the goal is drawn anew
-        self.goals_reached = np.zeros(n, int)  # in the episode
-        self.trace = Trace(n)  # of the centre of mass
-        self._places = self.trace.places
-        self._speed = np.zeros(n)  # m/s towards the goal, in the last step
+        common, n = self._bind_rules(world), world.n
+        self.plan, self.goals, self.trace = footstep_plan(n), goals(n), trace(n)
+        self.state = PlanningState(
+            np.zeros(n, int), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
+            np.zeros((n, len(self.action_map))), np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
+        self.info_arrays |= {
+            'landed': self.plan.landed,
+            'landing_error': self.plan.landing_error,
+            'heading_error': self.plan.heading_error,
+            'goals_reached': self.goals.reached,
+            'speed': self.state.speed,
+            'duration': self.state.duration,
+        }
+        starts = {name: part.start for name, part in self.blocks.items()}
+        balls = no_ball(n)
+        if self.ball:
+            self.ball.bind(world)
+            balls = self.ball.rules(starts['ball'], self._target_speed, self._goal_reached)
+            self.saved = (*self.saved, self.ball.state)
+            self.info_arrays['at_goal'] = self.ball.state.at_goal
+        low = self._full
+        places: Any = [starts.get(name, -1) for name in PlanningRules._fields[8:14]]
+        rules = PlanningRules(  # type: ignore[call-arg]
+            common, self.plan, self.goals, self.state, self.trace, low['contact'].start,
+            low['plan'].start, self.interface == 'plan',
+            *places,
+            self.action_map.centre, self.action_map.half_range, self._target_speed,
+            self._goal_reached, self.ball is not None, balls,
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._low_action = np.zeros((n, len(self.joint_map)))
+
+    # What is often asked for, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, 0 the right one, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, or where the ball is to go, (n, 3) m."""
+        return self.goals.place
 
     # Episodes.
 
     def _start(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        spawns = np.zeros((len(rows), 3))
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+        spawns = np.zeros((len(env_ids), 3))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
-            random = self._random[row] = np.random.default_rng(drawn_seed(random_state))
-            self._start_cycles[row] = random.choice(self._start_phases)
-            spawns[i] = ground.spawn(random)
-            self.arena.begin_episode(row, ground, spawns[i, :2])
-        return self._pose_of_start(rows, spawns)
+            random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
+            self.clock.start[i] = random.choice(self._start_phases)
+            spawns[k] = ground.spawn(random)
+            self.arena.begin_episode(i, ground, spawns[k, :2])
+        self._begin_clocks(env_ids)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
 
-    def _begun_on_ground(self, rows: np.ndarray) -> None:
-        self.landing_error[rows] = self.heading_error[rows] = self._down[rows] = 0.0
-        self.landed[rows] = False
-        self._lasted[rows] = self.goals_reached[rows] = 0
-        self._speed[rows] = 0.0
-        self.trace.begin(rows)
-        found = self.figure.measure()
-        for row in rows.tolist():
-            self._begin_goal(row, found)
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        plan, state = self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = state.down[env_ids] = 0.0
+        plan.landed[env_ids] = False
+        state.lasted[env_ids] = self.goals.reached[env_ids] = 0
+        state.speed[env_ids] = state.duration[env_ids] = 0.0
+        self.trace.places[env_ids] = np.nan
+        found = self.figure.measure(env_ids)
+        for i in env_ids.tolist():
+            self.begin_goal(i)
+        if self.ball:
+            self.ball.state.at_goal[env_ids] = False
+            self.world.forward(env_ids)
         # Until the first action there is no plan; the places under the feet stand for it.
-        self.heading[rows] = found.heading[rows]
-        swing = 1 - self.stance[rows]
-        self.landing[rows, 0] = found.feet[rows, swing]
-        self.landing[rows, 1] = found.feet[rows, self.stance[rows]]
+        plan.heading[env_ids] = found.heading[env_ids]
+        stance = plan.stance[env_ids]
+        plan.landing[env_ids, 0] = found.feet[env_ids, 1 - stance]
+        plan.landing[env_ids, 1] = found.feet[env_ids, stance]
 
-    def _begin_goal(self, row: int, found: SimpleNamespace) -> None:
-        """Draws what is to be reached in an episode."""
-        self._draw_goal(row, found.root[row, :2])
+    def begin_goal(self, i: int) -> None:
+        """Draws what is to be reached in an episode by a walker where it was last measured."""
+        place = self.figure.found.root[i, :2]
+        if self.ball:
+            self.ball.put(i, place, self.clock.steps[i], self._random[i])
+        self._draw_goal(i, place)
 
-    def _draw_goal(self, row: int, place: np.ndarray) -> None:
-        self.goal[row] = self._goal_drawn(row, place)
-        lasts = self._random[row].uniform(*GOAL_LASTS)
-        self._due[row] = self._count[row] + round(lasts / CONTROL_TIMESTEP)
-
-    def _goal_drawn(self, row: int, place: np.ndarray) -> np.ndarray:
-        """Returns a goal for a walker at a place, (3,) m."""
-        random = self._random[row]
-        if self._goal_distance is None:
-            return self.arena.goal(row, random, place)
-        x, y = place + drawn_way(random, *self._goal_distance)
-        height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([row]))
-        return np.array([x, y, height[0, 0]])
+    def _draw_goal(self, i: int, place: np.ndarray) -> None:
+        random, away = self._random[i], self._goal_distance
+        if self.ball:
+            goal = self.ball.goal(i, random, away or GOAL_AWAY)
+        elif away is None:
+            goal = self.arena.goal(i, random, place)
+        else:
+            x, y = place + drawn_way(random, *away)
+            height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
+            goal = np.array([x, y, height[0, 0]])
+        set_goal(i, goal, self.clock.steps[i], random, self.goals)
 
     # A step.
 
-    def act(self, action: np.ndarray) -> None:
-        self._action[...] = np.clip(action, -1, 1)
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        take_all(env_ids, action, self._pack)
 
-    def simulate(self, rows: np.ndarray | None = None) -> None:
-        """Runs each row to the next switch of stance, or for a frame."""
-        rows = np.arange(self.world.n) if rows is None else rows
-        if not len(rows):  # all have just begun an episode
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Runs each simulation to the next switch of stance, or for a control step."""
+        if not len(env_ids):
             return
-        found = self.figure.measure()
         by_plan = self.interface == 'plan'
-        new = rows if by_plan else self._beginning(rows)
-        if len(new):
-            self._lay_plans(new, found)
-        self._lasted[rows] = 0
-        self._from[rows] = found.com[rows]
-        self.landed[rows] = False
-        going = rows
-        while len(going):
+        begin_steps(env_ids, self._pack)
+        going = env_ids
+        while True:
             if by_plan:
-                self._write_low(found)
-                action = self.controller(self._observation[going])
+                self._low_action[going] = self.controller(self._common.full[going])
             else:
-                action = self._action[going, len(PLAN_NAMES) :]
-            self._ctrl[going] = self._drive.control(action)
-            self.arena.follow(found.root[going, :2], going)
-            self.world.step(self._frame, None if len(going) == self.world.n else going)
-            self._count[going] += 1
-            self._lasted[going] += 1
-            found = self.figure.measure()
-            over = self._account(going, found)
-            self.trace.follow(going, self._count[going], found.com[going])
+                self._low_action[going] = self.state.action[going, len(PLAN_NAMES) :]
+            if act_all(going, self._low_action, self._common_pack):
+                self._lay_ground(going, self._common)
+            self.world.step(self._frame, going)
+            count = account_all(going, self._pack)
             if self.watch is not None:
                 self.watch()
-            going = going[~over] if by_plan else going[:0]
-
-    def _beginning(self, rows: np.ndarray) -> np.ndarray:
-        """Which of some rows begin a footstep now."""
-        return rows[self.landed[rows] | (self._count[rows] == 0)]
+            if not count:
+                return
+            if count < len(going):
+                going = going[~self.state.over[going]]
 
     def lay(self, action: np.ndarray) -> np.ndarray:
         """Lays out plans where a footstep begins, as the step to come would with the same actions.
@@ -306,133 +662,35 @@ class HighLevel(Footsteps):
         Raises:
           ValueError: actions of another shape, or with NaN or infinity.
         """
-        action = self.action_map.checked(action, self.world.n)
-        found = self.figure.measure()
-        rows = self._beginning(np.arange(self.world.n))
-        self.act(action)
-        if len(rows):
-            self._lay_plans(rows, found)
-        self._write_low(found)
-        if 'low_level' in self.blocks:
-            self.observation[:, self.blocks['low_level']] = self._observation
-        return self._observation.copy()
+        everyone = self.world.all_ids
+        self.apply_action(self.action_map.checked(action, self.world.n), everyone)
+        show_plans(everyone, self._pack)
+        return self._common.full.copy()
 
-    def _lay_plans(self, rows: np.ndarray, found: SimpleNamespace) -> None:
-        """Lays out the plans of some rows from where they are."""
-        plan = self.action_map.control(self._action)[rows]
-        heading = found.heading[rows]
-        steps = plan[:, :4].reshape(-1, 2, 2)
-        places = found.root[rows, None, :2] + quaternion.turned(steps, heading[:, None])
-        self.landing[rows, :, :2] = places
-        self.landing[rows, :, 2] = self.arena.height(places[..., 0], places[..., 1], rows)
-        self.heading[rows] = heading + plan[:, 4]
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        check_simulated(self.state.lasted[env_ids])
+        if score_all(env_ids, self._pack):
+            self._draw(env_ids)
+        finish_all(env_ids, self._pack)
 
-    def _account(self, rows: np.ndarray, found: SimpleNamespace) -> np.ndarray:
-        """Landings and falls of rows after a control step; returns whose step is over, (m,) bool."""
-        rates = self.world.qvel[rows][:, self.figure.kinematics.joint_dof]
-        self.diverged[rows] = ~(np.abs(rates) < MAX_JOINT_SPEED).all(1)
-        self.diverged[rows] |= self.world.diverged()[rows]
-        sampled = rows[self._count[rows] % SAMPLE_FRAMES == 0]
-        self._down[sampled] *= FADING
-        self._down[sampled] += SHARE * found.fall[sampled].any(1)
-        self.failed[rows] = (self._down[rows] > FALLEN) | self.diverged[rows]
-        stance = (self.phase[rows] >= 0.5).astype(int)
-        switched = (stance != self.stance[rows]) & ~self.diverged[rows]
-        landed = rows[switched]
-        self.landed[landed] = True
-        self.stance[landed] = stance[switched]
-        gap = found.feet[landed, self.stance[landed], :2] - self.landing[landed, 0, :2]
-        self.landing_error[landed] = np.hypot(gap[:, 0], gap[:, 1])
-        off = rewards.wrap(self.heading[landed] - found.heading[landed])
-        self.heading_error[landed] = np.abs(off)
-        return switched | self.failed[rows] | (self._lasted[rows] >= LONGEST)
-
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        rows = np.arange(self.world.n) if stepped is None else np.flatnonzero(stepped)
-        check_simulated(self._lasted[rows])
-        found = self.figure.measure()
-        self._reward_terms(rows, found)
-        self.reward_terms[self.failed] = 0.0
-        for row in rows[~self.failed[rows]].tolist():
-            self._look_at_goal(row, found)
-        kept = self.observation[self.diverged]
-        with np.errstate(invalid='ignore'):
-            self._write(found)
-        self.observation[self.diverged] = kept  # the last finite one stands for what broke down
-        np.add.reduce(self.reward_terms, axis=1, out=self.reward)
-
-    def _reward_terms(self, rows: np.ndarray, found: SimpleNamespace) -> None:
-        """Writes the reward terms of rows for the step that they have taken."""
-        way = self.goal[rows, :2] - self._from[rows, :2]
-        distance = np.hypot(way[:, 0], way[:, 1])
-        moved = found.com[rows, :2] - self._from[rows, :2]
-        seconds = CONTROL_TIMESTEP * np.maximum(self._lasted[rows], 1)
-        along = (moved * way).sum(1) / np.maximum(distance, 1e-9)
-        self._speed[rows] = along / seconds
-        lack = np.minimum(self._speed[rows] - self._target_speed, 0.0)
-        full = distance < self._goal_reached
-        speed, _ = self.TERMS['speed']
-        self.reward_terms[rows, 0] = speed * np.where(full, 1.0, np.exp(-SPEED_SHARPNESS * lack**2))
-        self.reward_terms[rows, 1] = UPRIGHT
-
-    def _look_at_goal(self, row: int, found: SimpleNamespace) -> None:
-        """Draws the next goal where one was reached, or not in time."""
-        place = found.root[row, :2]
-        reached = np.hypot(*(self.goal[row, :2] - place)) < self._goal_reached
-        self.goals_reached[row] += reached
-        if reached or self._count[row] >= self._due[row]:
-            self._draw_goal(row, place)
+    def _draw(self, env_ids: np.ndarray) -> None:
+        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        root, count = self.figure.found.root, self.clock.steps
+        if self.ball:
+            wanted = env_ids[self.ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self.ball.put(i, root[i, :2], count[i], self._random[i])
+            self.world.forward(wanted)
+        for i in env_ids[self.goals.wanted[env_ids]].tolist():
+            self._draw_goal(i, root[i, :2])
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        self._write(self.figure.measure())
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
-    def _write(self, found: SimpleNamespace) -> None:
-        """Writes all blocks."""
-        blocks, place = self.blocks, found.root[:, :2]
-        if 'terrain' in blocks:
-            self.arena.height_map(place, found.heading, out=self.observation[:, blocks['terrain']])
-        if 'surface' in blocks:
-            self.arena.velocity_map(
-                place, found.heading, out=self.observation[:, blocks['surface']]
-            )
-        self.figure.write(found, self.observation, blocks)
-        self._write_goal(found)
-        if 'low_level' in blocks:
-            self._write_low(found)
-            self.observation[:, blocks['low_level']] = self._observation
-
-    def _write_goal(self, found: SimpleNamespace) -> None:
-        target = self.observation[:, self.blocks['target']]
-        target[...] = polar(self.goal[:, None, :2] - found.root[:, None, :2], found)
-
-    def _write_low(self, found: SimpleNamespace) -> None:
-        """Writes what the footstep controller observes."""
-        self.figure.write(found, self._observation, self._full)
-        self._write_phase()
-        self._off = rewards.wrap(self.heading - found.heading)
-        self._write_extras(found)
-
-    def infos(self) -> dict[str, Any]:
-        """As for footsteps; and goals reached, speed towards the goal (m/s), duration (s)."""
-        return {
-            **super().infos(),
-            'goals_reached': self.goals_reached.copy(),
-            'speed': self._speed.copy(),
-            'duration': CONTROL_TIMESTEP * self._lasted,
-        }
-
-    reference_pose = None  # type: ignore[assignment]  # nothing is tracked
-
-    def markers(self, row: int) -> list[Marker]:
-        """The plan, the way of the centre of mass, and the goal."""
-        return [*super().markers(row), *self.trace.markers(row), flag(self.goal[row])]
-
-    _KEPT = (
-        *Footsteps._KEPT, '_lasted', '_from', '_down', '_due', 'goals_reached', '_speed', '_action',
-        '_places',
-    )  # fmt: skip
-
-
-def flag(goal: Any) -> Marker:
-    """Returns what stands at a goal (3,), m."""
-    return Marker('cylinder', np.add(goal, (0, 0, FLAG[1])), FLAG, GOAL_COLOUR)
+    def markers(self, env_id: int) -> list[Marker]:
+        """The plan, where the centre of mass has been, and the goal: of a ball as a disc."""
+        root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
+        there = goal_disc(goal, self._goal_reached) if self.ball else flag(goal)
+        return [
+            *plan_markers(env_id, root, self.plan), *trace_markers(env_id, self.trace), there,
+        ]  # fmt: skip

@@ -7,7 +7,6 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -184,12 +183,12 @@ def compare(i: int, rules: Rules) -> None:
     height = found.height[i] - feature(phase, layout.height, clip)
 
     weights, scales = rules.term_weights, rules.term_scales
-    terms[i, POSE] = weights[POSE] * math.exp(-scales[POSE] * pose)
-    terms[i, VELOCITY] = weights[VELOCITY] * math.exp(-scales[VELOCITY] * velocity)
+    terms[i, POSE] = rewards.term(pose, weights[POSE], scales[POSE])
+    terms[i, VELOCITY] = rewards.term(velocity, weights[VELOCITY], scales[VELOCITY])
     end_effector /= count // 2
-    terms[i, END_EFFECTOR] = weights[END_EFFECTOR] * math.exp(-scales[END_EFFECTOR] * end_effector)
-    terms[i, COM] = weights[COM] * math.exp(-scales[COM] * com)
-    terms[i, ROOT] = weights[ROOT] * math.exp(-scales[ROOT] * (height * height))
+    terms[i, END_EFFECTOR] = rewards.term(end_effector, weights[END_EFFECTOR], scales[END_EFFECTOR])
+    terms[i, COM] = rewards.term(com, weights[COM], scales[COM])
+    terms[i, ROOT] = rewards.term(height * height, weights[ROOT], scales[ROOT])
 
 
 @compiled
@@ -207,13 +206,12 @@ def observe(i: int, rules: Rules) -> None:
         observation[i, layout.target_block + k] = feature(phase, layout.height + k, clip)
 
 
-# Loops over simulations; the pack holds Rules.
+# Loops over simulations; they take packs.
 
 
 @compiled_loop
-def apply_actions(env_ids: np.ndarray, action: np.ndarray, pack: Any) -> int:
+def apply_actions(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> int:
     """Takes actions; returns how many windows of ground must be laid anew."""
-    rules = pack.value
     leaving = 0
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
@@ -222,9 +220,8 @@ def apply_actions(env_ids: np.ndarray, action: np.ndarray, pack: Any) -> int:
 
 
 @compiled_loop
-def finish_steps(env_ids: np.ndarray, pack: Any) -> int:
+def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
     """Finishes the steps of all that can be measured; returns how many have to wait."""
-    rules = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -236,9 +233,8 @@ def finish_steps(env_ids: np.ndarray, pack: Any) -> int:
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, fresh: bool, pack: Any) -> int:
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
     """Observes all that can be measured, at their starts if they are; returns how many wait."""
-    rules = pack.value
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -385,7 +381,7 @@ class Imitation(Task):
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
         # They were added one after the other.
-        by = Drive(self.action_map.centre, self.action_map.half_range, int(controls[0]))
+        by = self.action_map.drive(int(controls[0]))
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,

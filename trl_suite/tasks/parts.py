@@ -62,8 +62,7 @@ def effort(task: Any) -> np.ndarray:
 
 def root(task: Any) -> np.ndarray:
     """Where the root is, m, (n, 3)."""
-    figure = task.figure.kinematics if _spatial(task) else task.figure
-    return task.world.xpos[:, figure.links[0]].copy()
+    return task.world.xpos[:, task.figure.links[0]].copy()
 
 
 def _spatial(task: Any) -> bool:

@@ -43,38 +43,18 @@ JOURNEY_TERMS: dict[str, tuple[float, float]] = {
 }
 COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
-_WEIGHTS = np.array([[weight for weight, _ in IMITATION_TERMS.values()]])
-_SCALES = np.array([[-scale for _, scale in IMITATION_TERMS.values()]])
+
+@compiled
+def term(error: float, weight: float, scale: float) -> float:
+    """Returns what an error is worth: weight * exp(-scale * error)."""
+    return weight * math.exp(-scale * error)
 
 
-def imitation(errors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """Terms of the imitation reward, each already weighted.
-
-    Args:
-      errors: squared errors, shape (n, 5), in the order of `IMITATION_TERMS`: normalised-weight
-        sums over joints (and root) of rad^2 and of rad^2/s^2; mean over end effectors of m^2; 0.1
-        times the centre-of-mass velocity error in m^2/s^2; root height in m^2.
-      out: where to write the result.
-
-    Returns:
-      Shape (n, 5); their sum is the reward, at most 1.
-    """
-    return exponentials(errors, _WEIGHTS, _SCALES, out)
-
-
-def exponentials(
-    errors: np.ndarray, weights: np.ndarray, scales: np.ndarray, out: np.ndarray | None = None
-) -> np.ndarray:
-    """Returns weights * exp(scales * errors), all (n, k) or (1, k); scales are negative."""
-    terms = np.multiply(errors, scales, out=out)
-    np.exp(terms, out=terms)
-    terms *= weights
-    return terms
-
-
-def heading(error: np.ndarray) -> np.ndarray:
-    """Returns ((1 + cos error) / 2)^4 of errors in rad: 1 where they are 0, 0 where opposite."""
-    return (0.5 + 0.5 * np.cos(error)) ** 4
+@compiled
+def facing(error: float) -> float:
+    """Returns ((1 + cos error) / 2)^4 of an error in rad: 1 where it is 0, 0 where opposite."""
+    half = 0.5 + 0.5 * math.cos(error)
+    return half * half * half * half
 
 
 @compiled

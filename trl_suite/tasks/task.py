@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
@@ -33,7 +34,7 @@ class Marker(NamedTuple):
     """
 
     shape: str
-    position: Sequence[float]
+    position: npt.ArrayLike
     size: Sequence[float]
     colour: tuple[float, float, float, float]
     yaw: float = 0.0

@@ -2,32 +2,211 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from trl_suite import actuation
+from trl_suite.action_map import Drive, drive
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.characters import Character
-from trl_suite.engine import World
+from trl_suite.engine import World, native
+from trl_suite.kinematics import planar, spatial
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarFigure,
+    PlanarMeasurement,
+    PlanarState,
+    has_fallen,
+    leaves,
+    must_wait,
+)
 from trl_suite.kinematics.planar_reference import link_extents
+from trl_suite.kinematics.spatial import (
+    SpatialBody,
+    SpatialFigure,
+    SpatialMeasurement,
+    SpatialState,
+    write_body,
+    write_terrain,
+)
 from trl_suite.tasks import parts
-from trl_suite.tasks.batch_task import BatchTask
-from trl_suite.tasks.figure import PlanarFigure
-from trl_suite.tasks.figure3d import SpatialFigure
 from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
-from trl_suite.tasks.task import MAX_JOINT_SPEED, consecutive, drawn_seed
-from trl_suite.terrain import Ground, Strip
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Outcome,
+    Task,
+    conclude,
+    consecutive,
+    drawn_seed,
+    outcome,
+    too_fast,
+)
+from trl_suite.terrain import Ground, Strip, spatial_ground
+from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain.spatial_ground import SpatialGround
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 SAMPLES = 50  # heights on the line that a planar character sees
 FROUDE = 0.25  # speed^2 / (gravity * height of the root) of a full reward
 GRAVITY = 9.8  # m/s^2
 
 
-class Walk(BatchTask):
+class WalkState(NamedTuple):
+    """What the task knows of each walker.
+
+    Attributes:
+      origin: x, y of the start, (n, 2) m.
+      course: direction in which it is to go, rad to the left of +x, (n,).
+      distance: travelled along the course, (n,) m.
+    """
+
+    origin: np.ndarray
+    course: np.ndarray
+    distance: np.ndarray
+
+
+class PlanarRules(NamedTuple):
+    """What the rules of a planar walk work on; `ctrl` are the controls of the physics."""
+
+    engine: native.Engine
+    body: PlanarBody
+    physics: PlanarState
+    ground: PlanarGround
+    drive: Drive
+    ctrl: np.ndarray
+    found: PlanarMeasurement
+    state: WalkState
+    outcome: Outcome
+
+
+class SpatialRules(NamedTuple):
+    """What the rules of a walk in space work on.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      terrain, pose, velocity, course: where these blocks begin; -1: not observed.
+      leaving: whether the window of ground has to be laid anew, (n,).
+    """
+
+    engine: native.Engine
+    body: SpatialBody
+    physics: SpatialState
+    ground: SpatialGround
+    drive: Drive
+    ctrl: np.ndarray
+    terrain: int
+    pose: int
+    velocity: int
+    course: int
+    found: SpatialMeasurement
+    state: WalkState
+    leaving: np.ndarray
+    outcome: Outcome
+
+
+# In the plane, of simulation i and of all.
+
+
+@compiled
+def look_planar(i: int, rules: PlanarRules) -> None:
+    """Measures and observes."""
+    observation = rules.outcome.observation
+    planar.measure(i, rules.body, rules.physics, rules.ground, observation, rules.found)
+    x = rules.physics.qpos[i, rules.body.qpos[0]]
+    rules.state.distance[i] = x - rules.state.origin[i, 0]
+
+
+@compiled_loop
+def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> int:
+    """Takes actions; returns how many windows of ground must be laid anew."""
+    leaving = 0
+    for i in env_ids:
+        drive(i, action, rules.drive, rules.ctrl)
+        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.found)
+    return leaving
+
+
+@compiled_loop
+def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int:
+    """Finishes steps, or only observes; returns how many have to wait for ground to be drawn."""
+    waiting = 0
+    for i in env_ids:
+        outcome = rules.outcome
+        if stepped:
+            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
+                i, rules.body.dof[3:], MAX_JOINT_SPEED, rules.physics.qvel
+            )
+            if outcome.diverged[i]:  # the last finite observation stands
+                conclude(i, True, outcome)
+                continue
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        look_planar(i, rules)
+        if stepped:
+            conclude(i, has_fallen(i, rules.body, rules.physics), outcome)
+    return waiting
+
+
+# In space.
+
+
+@compiled
+def look_spatial(i: int, rules: SpatialRules) -> None:
+    """Measures and observes."""
+    found, state, observation = rules.found, rules.state, rules.outcome.observation
+    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
+    spatial.measure(i, rules.body, rules.physics, rules.ground, found)
+    write_terrain(i, rules.terrain, rules.ground, found, observation)
+    write_body(i, rules.pose, rules.velocity, found, observation)
+    bearing = state.course[i] - found.heading[i]
+    observation[i, rules.course] = math.cos(bearing)
+    observation[i, rules.course + 1] = math.sin(bearing)
+    x, y = found.root[i, 0] - state.origin[i, 0], found.root[i, 1] - state.origin[i, 1]
+    state.distance[i] = math.cos(state.course[i]) * x + math.sin(state.course[i]) * y
+
+
+@compiled_loop
+def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
+    """Takes actions and keeps boxes moving; returns how many windows of ground must be laid."""
+    leaving, root = 0, rules.body.links[0]
+    for i in env_ids:
+        drive(i, action, rules.drive, rules.ctrl)
+        x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
+        rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
+        if rules.leaving[i]:
+            leaving += 1
+        elif spatial_ground.keep_moving(
+            i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
+        ):
+            native.forward(i, rules.engine)
+    return leaving
+
+
+@compiled_loop
+def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> int:
+    """Finishes steps, or only observes; none has to wait."""
+    for i in env_ids:
+        outcome = rules.outcome
+        if stepped:
+            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
+                i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
+            )
+            if outcome.diverged[i]:  # the last finite observation stands
+                conclude(i, True, outcome)
+                continue
+        look_spatial(i, rules)
+        if stepped:
+            conclude(i, rules.found.fallen[i], outcome)
+    return 0
+
+
+class Walk(Task):
     """A character, planar or spatial, stands in its working posture on random terrain.
 
     It fails when a fall link touches the ground. It has no reward of its own: `suite.build` adds
@@ -38,7 +217,6 @@ class Walk(BatchTask):
       course: cosine and sine of the bearing of the way it is to go, that of its start; 2.
 
     Attributes:
-      course: that way, rad to the left of +x, (n,).
       pace: speed of a full reward, m/s.
     """
 
@@ -101,28 +279,56 @@ class Walk(BatchTask):
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure = self.figure
-        if self._spatial:
-            figure.bind(world, 'com')
-        else:
+        if isinstance(self.arena, SpatialTerrain):
             figure.bind(world)
-        scope = f'{self.character.mjcf_model.model}/'
-        first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
-        self._ctrl = world.ctrl[:, first : first + len(self.action_map)]  # one after the other
-        self._root = int(world.body_ids([self.character.root_body.full_identifier])[0])
-        self._dof = figure.pose_dof[6 if self._spatial else 3 :]
+        else:
+            figure.bind(world, self.blocks)
         self._pose, self._extents = self._posture(world)
         # In m; of the root over the ground, in the working posture.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.pace = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
-        self.course = np.zeros(n)
-        self._origin = np.zeros((n, 2))
-        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
-        self.reward, self.failed, self.diverged = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
-        if not self._spatial:
-            self._view = figure.views(
-                self.observation, self.blocks, np.zeros((n, 2 * len(figure.effectors))),
-                np.zeros((n, 2)),
+        self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
+        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), 0)
+        self.saved = (self.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': {},
+            'fell': self.outcome.fell,
+            'diverged': self.outcome.diverged,
+            'distance': self.state.distance,
+        }
+        scope = f'{self.character.mjcf_model.model}/'
+        # Actuators were added one after the other.
+        first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
+        common: Any = (
+            world.engine,
+            figure.body,
+            figure.state,
+            figure.ground,
+            self.action_map.drive(first),
+        )
+        starts = {name: part.start for name, part in self.blocks.items()}
+        rules: SpatialRules | PlanarRules
+        if self._spatial:
+            rules = SpatialRules(  # type: ignore[call-arg]
+                *common, world.ctrl,
+                *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'course')),
+                figure.found, self.state, np.zeros(n, bool), self.outcome,
             )  # fmt: skip
+            self._leaving, self._waiting = rules.leaving, np.zeros(n, bool)
+            self._act, self._finish = act_spatial, finish_spatial
+        else:
+            found = figure.measurement()
+            rules = PlanarRules(  # type: ignore[call-arg]
+                *common, world.ctrl, found, self.state, self.outcome
+            )
+            self._leaving, self._waiting = found.leaving, found.waiting
+            self._act, self._finish = act_planar, finish_planar
+        self._pack = packed(rules)
+
+    @property
+    def course(self) -> np.ndarray:
+        """Direction in which each walker is to go, rad to the left of +x, (n,)."""
+        return self.state.course
 
     def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
         """Returns the pose of the start about the origin, and the extents of its geoms."""
@@ -146,92 +352,58 @@ class Walk(BatchTask):
         geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
         return pose, link_extents(model, data, geoms, np.zeros(2))
 
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
-        terrain, count = self.arena.terrain, len(rows)
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        terrain, count = self.arena.terrain, len(env_ids)
         poses = np.tile(self._pose, (count, 1))
         rates = np.zeros((count, len(self.figure.pose_dof)))
-        self.world.reset(rows)
+        self.world.reset(env_ids)
         spawns = np.zeros((count, 3))
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             seed = drawn_seed(random_state)
             if isinstance(self.arena, SpatialTerrain):
                 ground = Ground(terrain, seed, blend=self._blend)
-                spawns[i] = ground.spawn(random_state)
-                self.arena.begin_episode(row, ground, spawns[i, :2])
+                spawns[k] = ground.spawn(random_state)
+                self.arena.begin_episode(i, ground, spawns[k, :2])
             else:
-                self.arena.begin_episode(row, Strip(terrain, seed, blend=self._blend))
+                self.arena.begin_episode(i, Strip(terrain, seed, blend=self._blend))
         if self._spatial:
-            self.figure.place(rows, poses, rates, spawns)
+            self.figure.place(env_ids, poses, rates, spawns)
         else:
-            self.figure.place(rows, poses, rates, np.tile(self._extents, (count, 1, 1)))
-        self._origin[rows], self.course[rows] = spawns[:, :2], spawns[:, 2]
-        self.failed[rows] = self.diverged[rows] = False
-        self.reward[rows] = 0.0
+            self.figure.place(env_ids, poses, rates, np.tile(self._extents, (count, 1, 1)))
+        self.state.origin[env_ids], self.course[env_ids] = spawns[:, :2], spawns[:, 2]
+        for array in self.outcome[1:]:  # all but the observation
+            array[env_ids] = 0
+        self.observe(env_ids)
 
-    def act(self, action: np.ndarray) -> None:
-        self._ctrl[...] = self.action_map.control(action)
-        # Ground ahead is laid before the physics, so that its pictures are current after it.
-        place = self.world.xpos[:, self._root]
-        self.arena.follow(place[:, :2] if self._spatial else place[:, :1])
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if self._act(env_ids, action, self._pack):
+            # Ground ahead is laid before the physics, so that its pictures are current after it.
+            leaving = env_ids[self._leaving[env_ids]]
+            if isinstance(self.arena, SpatialTerrain):
+                self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
+            else:
+                self.figure.follow(leaving)
 
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        rates = self.world.qvel.take(self._dof, 1)
-        self.diverged[:] = False
-        if np.vdot(rates, rates) > MAX_JOINT_SPEED**2 or self.world.any_diverged():
-            too_fast = np.abs(rates).max(1) > MAX_JOINT_SPEED
-            np.logical_or(self.world.diverged(), too_fast, out=self.diverged)
-        kept = self.observation[self.diverged]
-        with np.errstate(invalid='ignore' if len(kept) else 'warn'):
-            found = self._measure()
-        self.observation[self.diverged] = kept  # the last finite one stands for what broke down
-        np.logical_or(found.fall.any(1), self.diverged, out=self.failed)
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if self._finish(env_ids, True, self._pack):
+            self._finish(self._widened(env_ids), True, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        self._measure()
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        if self._finish(env_ids, False, self._pack):
+            self._finish(self._widened(env_ids), False, self._pack)
 
-    def _measure(self) -> SimpleNamespace:
-        if not self._spatial:
-            self.figure.measure(self._view)
-            return self._view
-        found = self.figure.measure()
-        self.figure.write(found, self.observation, self.blocks)
-        bearing = self.course - found.heading
-        course = self.observation[:, self.blocks['course']]
-        course[:, 0], course[:, 1] = np.cos(bearing), np.sin(bearing)
-        return found
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self._waiting[env_ids]]
+        assert isinstance(self.arena, PlanarTerrain)
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the parts of horizontal vectors (n, 2) that go along the course, (n,)."""
         return np.cos(self.course) * vectors[:, 0] + np.sin(self.course) * vectors[:, 1]
-
-    def infos(self) -> dict[str, Any]:
-        """Fall and divergence flags, and the distance travelled along the course in m."""
-        way = self.world.xpos[:, self._root, :2] - self._origin
-        return {
-            'reward_terms': {},
-            'fell': self.failed & ~self.diverged,
-            'diverged': self.diverged.copy(),
-            'distance': self.along(way),
-        }
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            'arena': self.arena.state(row),
-            'origin': self._origin[row].copy(),
-            'course': float(self.course[row]),
-            'observation': self.observation[row].copy(),
-            'reward': float(self.reward[row]),
-            'failed': bool(self.failed[row]),
-            'diverged': bool(self.diverged[row]),
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        self.arena.restore(row, state['arena'])
-        self._origin[row], self.course[row] = state['origin'], state['course']
-        self.observation[row], self.reward[row] = state['observation'], state['reward']
-        self.failed[row], self.diverged[row] = state['failed'], state['diverged']
 
 
 def pace(task: Any) -> np.ndarray:

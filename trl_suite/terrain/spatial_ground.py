@@ -23,6 +23,7 @@ ROOM = 8  # times as many entries as there are bins and boxes
 SAMPLES = 32  # of a map, along each axis
 AHEAD = (-1.0, 10.0)  # m; along the heading, from where to where a map reaches
 ASIDE = 5.5  # m; to each side
+SPEED_ERROR = 0.005  # m/s; deviation after which moving boxes are given their speed again
 
 _FORWARD = np.linspace(*AHEAD, SAMPLES)
 _RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
@@ -72,6 +73,8 @@ class SpatialGround(NamedTuple):
       mover_speed: (n, M) m/s.
       mover_distance: from the start of the path, (n, M) m; changes as boxes move.
       mover_direction: 1 towards the end of the path, -1 towards its start, (n, M).
+      mover_begin: where on its path a moving box is when its joint is at 0, (n, M) m.
+      mover_qpos, mover_dof: addresses of these joints in the physics, (M,).
     """
 
     level: np.ndarray
@@ -89,6 +92,9 @@ class SpatialGround(NamedTuple):
     mover_speed: np.ndarray
     mover_distance: np.ndarray
     mover_direction: np.ndarray
+    mover_begin: np.ndarray
+    mover_qpos: np.ndarray
+    mover_dof: np.ndarray
 
 
 def empty(n: int, capacity: Capacity) -> SpatialGround:
@@ -111,6 +117,9 @@ def empty(n: int, capacity: Capacity) -> SpatialGround:
         mover_speed=np.zeros((n, movers)),
         mover_distance=np.zeros((n, movers)),
         mover_direction=np.ones((n, movers)),
+        mover_begin=np.zeros((n, movers)),
+        mover_qpos=np.zeros(movers, int),
+        mover_dof=np.zeros(movers, int),
     )
     ground.boxes[:, :, HALF_X] = -1.0
     return ground
@@ -119,13 +128,13 @@ def empty(n: int, capacity: Capacity) -> SpatialGround:
 # Queries.
 
 
-@compiled_inline
+@compiled
 def height(i: int, x: float, y: float, ground: SpatialGround) -> float:
     """Returns the height in m of the surface of simulation i at a point, m."""
     return _highest(i, x, y, ground)[0]
 
 
-@compiled_inline
+@compiled
 def velocity(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, float]:
     """Returns the horizontal velocity in m/s of the surface of simulation i at a point, m."""
     return _velocity_of(i, _highest(i, x, y, ground)[1], ground)
@@ -217,6 +226,42 @@ def turn_movers(i: int, x: float, y: float, ground: SpatialGround) -> None:
                 ground.mover_direction[i, k] = -1.0
             elif distance <= 0:
                 ground.mover_direction[i, k] = 1.0
+
+
+@compiled
+def see_movers(i: int, qpos: np.ndarray, ground: SpatialGround) -> None:
+    """Notes where the physics has taken moving boxes; qpos is of all simulations."""
+    for k in range(ground.mover_top.shape[1]):
+        moved = qpos[i, ground.mover_qpos[k]]
+        ground.mover_distance[i, k] = ground.mover_begin[i, k] + moved
+
+
+@compiled
+def keep_moving(
+    i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialGround
+) -> bool:
+    """Turns moving boxes round, and gives all of a simulation their speed again where one lacks it.
+
+    Args:
+      i: which simulation.
+      x, y: where its character is, m.
+      qpos, qvel: of all simulations; qvel is written.
+      ground: of all simulations.
+
+    Returns:
+      Whether qvel was written; then the physics wants to be forwarded.
+    """
+    see_movers(i, qpos, ground)
+    turn_movers(i, x, y, ground)
+    wrong = False
+    for k in range(ground.mover_top.shape[1]):
+        speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+        wrong |= abs(qvel[i, ground.mover_dof[k]] - speed) > SPEED_ERROR
+    if wrong:
+        for k in range(ground.mover_top.shape[1]):
+            speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+            qvel[i, ground.mover_dof[k]] = speed
+    return wrong
 
 
 # What queries are made of.

@@ -13,9 +13,9 @@ one that does, since arrays are not reference-counted: counting costs more than 
 threads would wait for each other's counts), and never raises: a division by zero gives infinity or
 NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
 
-A call with tuples of many arrays costs some 50 ns. A small function that is called in an inner loop is
-decorated with `compiled_inline`: its code takes the place of every call. Loops over simulations, which
-Python calls, are decorated with `compiled_loop`; they take large tuples as a pack, see `packed`.
+A small function that is called in an inner loop is decorated with `compiled_inline`: its code takes the
+place of every call. Loops over simulations, which Python calls, are decorated with `compiled_loop`.
+Tuples of arrays enter them as packs, see `packed`.
 
 Numba is imported and the function is compiled when it is first called; the result is kept on disk.
 The folder is `$NUMBA_CACHE_DIR`, or else the user's cache folder, and in it one folder for each state
@@ -38,7 +38,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 PATIENCE = 2.0  # s; compiling that takes longer is announced on a terminal
 UNUSED = 30 * 86400.0  # s; folders of other sources that nobody used for so long are removed
@@ -58,7 +58,6 @@ class Compiled:
         function: Callable[..., Any],
         native: Callable[[], Callable[..., Any]] | None = None,
         inline: bool = False,
-        counted: bool = False,
     ) -> None:
         """Wraps a function.
 
@@ -66,44 +65,56 @@ class Compiled:
           function: what runs if compiling is switched off, and what is compiled otherwise.
           native: returns what is compiled in its place: for what only Numba can express.
           inline: whether its code takes the place of calls.
-          counted: whether arrays are reference-counted, as reading a pack needs.
         """
         functools.update_wrapper(self, function)
         self.function, self._native = function, native
-        self._inline, self._counted = inline, counted
+        self._inline = inline
         self._lock = threading.Lock()
-        self._dispatcher: Callable[..., Any] | None = None
+        self._made: dict[bool, Callable[..., Any]] = {}
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
-        """What Numba made of the function; the function itself if compiling is switched off."""
-        if self._dispatcher is None:
-            with self._lock:
-                if self._dispatcher is None:
-                    self._dispatcher = self._compile()
-        return self._dispatcher
+        """What Numba made of the function for compiled callers; the function itself without Numba."""
+        return self._made.get(False) or self._make(False)
 
-    def _compile(self) -> Callable[..., Any]:
+    @property
+    def entry(self) -> Callable[..., Any]:
+        """What Python calls."""
+        return self._made.get(True) or self._make(True)
+
+    def _make(self, entry: bool) -> Callable[..., Any]:
+        with self._lock:
+            if entry not in self._made:
+                self._made[entry] = self._compile(entry)
+            return self._made[entry]
+
+    def _compile(self, entry: bool) -> Callable[..., Any]:
         numba = _numba()
         if numba.config.DISABLE_JIT:
             return self.function
         options = {'nogil': True, 'error_model': 'numpy', 'forceinline': self._inline}
+        if not entry:  # what takes arguments from Python is half of the time that compiling takes
+            options['no_cpython_wrapper'] = options['no_cfunc_wrapper'] = True
         if self._native is not None:  # a line or two; what calls it is kept on disk
             return numba.njit(self._native(), _nrt=True, **options)
-        options['_nrt'] = self._counted
+        options['_nrt'] = False
         folder = cache_folder()
         if folder is None:
             return numba.njit(self.function, **options)
         # Numba looks at its setting when a function is decorated; it is the user's otherwise.
         with _setting:
+            # Apart, since Numba takes the one with and the one without an entry for the same.
+            folder = folder / ('entries' if entry else 'rows')
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
             try:
                 return numba.njit(self.function, cache=True, **options)
+            except RuntimeError:  # no file: a function that was typed in
+                return numba.njit(self.function, **options)
             finally:
                 numba.config.CACHE_DIR = before
 
     def __call__(self, *args: Any) -> Any:
-        return self.dispatcher(*args)
+        return self.entry(*args)
 
 
 def compiled(function: Callable[..., Any]) -> Compiled:
@@ -117,26 +128,24 @@ def compiled_inline(function: Callable[..., Any]) -> Compiled:
 
 
 def compiled_loop(function: Callable[..., Any]) -> Compiled:
-    """Decorates a loop over simulations that takes packs, see `packed`."""
-    return Compiled(function, counted=True)
-
-
-class Unpacked(NamedTuple):
-    """What stands for a pack where functions run as Python."""
-
-    value: Any
+    """Decorates a loop over simulations, which Python calls; it takes packs, see `packed`."""
+    return Compiled(function)
 
 
 def packed(value: Any) -> Any:
-    """Returns a tuple of arrays as one argument; loops over simulations read its `value`.
+    """Returns a named tuple of arrays and numbers as one argument; see `trl_suite.util.pack`.
 
-    The arrays stay alive as long as the pack.
+    Compiled functions read its fields by name, as they would of the tuple, which stands for itself
+    where functions run as Python. The arrays stay alive as long as the pack.
+
+    Raises:
+      TypeError: a field is neither an array, nor a number, nor such a tuple.
     """
     if _numba().config.DISABLE_JIT:
-        return Unpacked(value)
-    from trl_suite.util.pack import pack
+        return value
+    from trl_suite.util.pack import Pack
 
-    return pack(value)
+    return Pack(value)
 
 
 _setting = threading.Lock()

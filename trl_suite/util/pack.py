@@ -1,35 +1,152 @@
-"""A tuple of arrays that enters compiled functions as one pointer.
+"""Named tuples of arrays and numbers that enter compiled functions as one pointer.
 
-Numba takes a tuple apart whenever it is passed from Python, about half a microsecond for each array:
-for a single environment that is more than the rules themselves take. A pack is taken apart once.
+Numba takes a tuple apart wherever it is passed: sixty arrays are four hundred arguments, which takes
+seconds to compile for every function, and 30 us for every call from Python. A pack is the address of a
+block of memory that describes the arrays as Numba does; compiled functions read from it what they ask
+for, by the names of the tuple. A pack is read-only, but the arrays that it refers to need not be.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import struct
+from typing import Any, NamedTuple
 
-from numba import types
-from numba.experimental import structref
+import numpy as np
+from llvmlite import ir
+from numba import typeof, types
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    NativeValue,
+    infer_getattr,
+    lower_getattr_generic,
+    models,
+    register_model,
+    typeof_impl,
+    unbox,
+)
 
-from trl_suite.util.compiled import compiled_loop
-
-
-@structref.register
-class PackType(types.StructRef):
-    """Numba's type of a pack."""
-
-
-class Pack(structref.StructRefProxy):
-    """A value for compiled functions, which read `pack.value`."""
-
-    def __new__(cls, value: Any) -> Pack:
-        return structref.StructRefProxy.__new__(cls, value)
-
-
-structref.define_proxy(Pack, PackType, ['value'])
+_WORD = 8  # bytes; of everything that a block is made of
 
 
-@compiled_loop
-def pack(value: Any) -> Pack:
-    """Returns a pack of a value."""
-    return Pack(value)
+class Field(NamedTuple):
+    """A field of a pack: its name and type, and where it begins in the block, in words."""
+
+    name: str
+    type: types.Type
+    word: int
+
+
+class PackType(types.Type):
+    """Numba's type of a pack: names, types and places of its fields."""
+
+    def __init__(self, name: str, fields: tuple[Field, ...]) -> None:
+        self.fields = {field.name: field for field in fields}
+        inside = ', '.join(f'{field.name}: {field.type}' for field in fields)
+        super().__init__(name=f'Pack {name}({inside})')
+
+
+class Pack:
+    """The values of a named tuple at one address; keeps them alive.
+
+    Attributes:
+      address: of the block of memory.
+      numba_type: see `PackType`.
+    """
+
+    __slots__ = ('_block', '_value', 'address', 'numba_type')
+
+    def __init__(self, value: Any) -> None:
+        """Packs a named tuple.
+
+        Args:
+          value: a named tuple of arrays, numbers, and such tuples.
+
+        Raises:
+          TypeError: a field is anything else; the message has its name.
+        """
+        words: list[bytes] = []
+        self.numba_type = _describe(value, type(value).__name__, words)
+        self._block = np.frombuffer(b''.join(words), np.uint64).copy()
+        self._value, self.address = value, self._block.ctypes.data
+
+
+def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
+    """Appends the block of a named tuple to `words`; returns its type, relative to its beginning."""
+    begin, fields = len(words), []
+    for name, entry in zip(value._fields, value, strict=True):
+        word = len(words) - begin
+        found: types.Type
+        if isinstance(entry, np.ndarray):
+            found = typeof(entry)
+            # No owner and no reference count: the pack keeps the array alive.
+            numbers = (
+                0, 0, entry.size, entry.itemsize, entry.ctypes.data, *entry.shape, *entry.strides,
+            )  # fmt: skip
+            words += [struct.pack('=q', number) for number in numbers]
+        elif isinstance(entry, bool | int | np.bool_ | np.integer):
+            found = types.int64
+            words.append(struct.pack('=q', int(entry)))
+        elif isinstance(entry, float | np.floating):
+            found = types.float64
+            words.append(struct.pack('=d', float(entry)))
+        elif isinstance(entry, tuple) and hasattr(entry, '_fields'):
+            found = _describe(entry, f'{path}.{name}', words)
+        else:
+            raise TypeError(
+                f'{path}.{name} is {type(entry).__name__}; expected an array, a number, or a named '
+                'tuple of such'
+            )
+        fields.append(Field(name, found, word))
+    return PackType(type(value).__name__, tuple(fields))
+
+
+register_model(PackType)(models.OpaqueModel)
+
+
+@typeof_impl.register(Pack)
+def _type_of(value: Pack, context: Any) -> PackType:
+    return value.numba_type
+
+
+@unbox(PackType)
+def _unbox(type_: PackType, value: Any, c: Any) -> NativeValue:
+    attribute = c.pyapi.object_getattr_string(value, 'address')
+    address = c.pyapi.long_as_ulonglong(attribute)
+    c.pyapi.decref(attribute)
+    return NativeValue(c.builder.inttoptr(address, c.context.get_value_type(type_)))
+
+
+@infer_getattr
+class _Attributes(AttributeTemplate):
+    key = PackType
+
+    def generic_resolve(self, type_: PackType, name: str) -> Any:  # type: ignore[override]
+        field = type_.fields.get(name)
+        return None if field is None else field.type
+
+
+@lower_getattr_generic(PackType)
+def _read(context: Any, builder: Any, type_: PackType, pack: Any, name: str) -> Any:
+    field = type_.fields[name]
+    place = builder.gep(pack, [ir.IntType(64)(_WORD * field.word)])
+    if isinstance(field.type, PackType):
+        return place
+    return _load(builder, place, context.get_value_type(field.type))
+
+
+def _load(builder: Any, place: Any, kind: Any) -> Any:
+    """Loads words one by one, so that only those that are used are loaded in the end."""
+    if isinstance(kind, ir.LiteralStructType | ir.ArrayType):
+        elements = (
+            kind.elements if isinstance(kind, ir.LiteralStructType) else [kind.element] * kind.count
+        )
+        value = ir.Constant(kind, ir.Undefined)
+        for k, element in enumerate(elements):
+            words = element.count if isinstance(element, ir.ArrayType) else 1
+            value = builder.insert_value(value, _load(builder, place, element), k)
+            place = builder.gep(place, [ir.IntType(64)(_WORD * words)])
+        return value
+    found = builder.load(builder.bitcast(place, kind.as_pointer()))
+    # Blocks never change; so a store into an array does not make the compiler read them again.
+    found.set_metadata('invariant.load', builder.module.add_metadata([]))
+    return found

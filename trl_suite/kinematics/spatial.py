@@ -1,0 +1,445 @@
+"""A character in three dimensions: what every spatial task measures, and how it is placed.
+
+The heading frame of a character has its origin on the ground under the root, x along the root's
+heading, y to the left and z up.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import SpatialTerrain
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.motion import quaternion
+from trl_suite.terrain import spatial_ground
+from trl_suite.terrain.spatial_ground import SAMPLES, SpatialGround
+from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
+
+CLEARANCE = 0.001  # m; left under every link at the start
+LINK_POSE, LINK_VELOCITY = 7, 6  # numbers of each link in the blocks pose and velocity
+
+
+class SpatialBody(NamedTuple):
+    """A character's ids in a compiled model; links and joints in link order.
+
+    Attributes:
+      qpos, dof: addresses of the columns of a pose and of a velocity, as `motion.Layout` has them:
+        root, then joints.
+      joint_dof: addresses of the joints' rates.
+      balls: addresses of the quaternions of ball joints, four each.
+      hinges: addresses of the angles of the other joints.
+      links: body ids, the root body first, (L,).
+      effectors: body ids of the end effectors, (E,).
+      share: of each link in the mass, (L,).
+      about_com: whether end effectors are measured from the centre of mass, else from the root.
+      fall: addresses of the contact sensors of fall links.
+      contact: addresses of those of end effectors, (E, sensors of each).
+    """
+
+    qpos: np.ndarray
+    dof: np.ndarray
+    joint_dof: np.ndarray
+    balls: np.ndarray
+    hinges: np.ndarray
+    links: np.ndarray
+    effectors: np.ndarray
+    share: np.ndarray
+    about_com: bool
+    fall: np.ndarray
+    contact: np.ndarray
+
+
+class SpatialState(NamedTuple):
+    """Fields of the physics that spatial tasks read, each (n, ...); see `engine.World`."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    xpos: np.ndarray
+    xquat: np.ndarray
+    xipos: np.ndarray
+    cvel: np.ndarray
+    subtree_com: np.ndarray
+    sensordata: np.ndarray
+
+
+class SpatialMeasurement(NamedTuple):
+    """What `measure` finds, rows of n simulations.
+
+    Attributes:
+      root, com: of the root and of the centre of mass, (n, 3) m.
+      heading: of the root, rad to the left of +x, (n,).
+      cosine, sine: of the heading, (n,).
+      under: height of the ground under the root, (n,) m.
+      feet: the end effectors' joints in the world, (n, E, 3) m.
+      com_velocity: of the centre of mass, world axes, (n, 3) m/s.
+      contact: 1 where an end effector touches the ground, (n, E).
+      fallen: whether a fall link touches the ground, (n,).
+      pose: height of the root above the ground, then of each link the position of its centre from
+        the root in the heading frame (3) and its orientation in it (4), w not negative, (n, 7L + 1).
+      velocity: of each link the velocity of its centre against the ground under the root (3) and
+        its angular velocity (3), in the heading frame, (n, 6L).
+      features: what is compared with a reference, (n, F); see `feature_columns`.
+    """
+
+    root: np.ndarray
+    com: np.ndarray
+    heading: np.ndarray
+    cosine: np.ndarray
+    sine: np.ndarray
+    under: np.ndarray
+    feet: np.ndarray
+    com_velocity: np.ndarray
+    contact: np.ndarray
+    fallen: np.ndarray
+    pose: np.ndarray
+    velocity: np.ndarray
+    features: np.ndarray
+
+
+def measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
+    """Makes room for what `measure` finds of n characters."""
+    links, effectors = len(body.links), len(body.effectors)
+    columns = feature_columns(body)
+    return SpatialMeasurement(
+        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n),
+        np.zeros((n, effectors, 3)),
+        np.zeros((n, 3)), np.zeros((n, effectors)), np.zeros(n, bool),
+        np.zeros((n, LINK_POSE * links + 1)), np.zeros((n, LINK_VELOCITY * links)),
+        np.zeros((n, columns['height'].stop)),
+    )  # fmt: skip
+
+
+def feature_columns(body: SpatialBody) -> dict[str, slice]:
+    """Returns name -> columns of the features of a character.
+
+    `rotations`, quaternions of the root without its heading and of the ball joints; `angles` of the
+    hinges, rad; `rates` of the root in the heading frame and of all joints, rad/s; `effectors` in
+    the heading frame, in x and y from the middle that was asked for, in z above the ground, m;
+    `com_velocity` in world axes, m/s; `height` of the root above the ground, m.
+    """
+    sizes = {
+        'rotations': 4 + len(body.balls), 'angles': len(body.hinges),
+        'rates': 3 + len(body.joint_dof), 'effectors': 3 * len(body.effectors),
+        'com_velocity': 3, 'height': 1,
+    }  # fmt: skip
+    stops = itertools.accumulate(sizes.values())
+    return {
+        name: slice(stop - size, stop)
+        for (name, size), stop in zip(sizes.items(), stops, strict=True)
+    }
+
+
+@compiled
+def measure(
+    i: int, body: SpatialBody, state: SpatialState, ground: SpatialGround,
+    found: SpatialMeasurement,
+) -> None:  # fmt: skip
+    """Measures the character of simulation i."""
+    body_id = body.links[0]
+    root_x, root_y, root_z = (
+        state.xpos[i, body_id, 0], state.xpos[i, body_id, 1], state.xpos[i, body_id, 2],
+    )  # fmt: skip
+    com_x, com_y, com_z = (
+        state.subtree_com[i, body_id, 0], state.subtree_com[i, body_id, 1],
+        state.subtree_com[i, body_id, 2],
+    )  # fmt: skip
+    w, x = state.xquat[i, body_id, 0], state.xquat[i, body_id, 1]
+    y, z = state.xquat[i, body_id, 2], state.xquat[i, body_id, 3]
+    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    cosine, sine = math.cos(heading), math.sin(heading)
+    half_cosine, half_sine = math.cos(0.5 * heading), -math.sin(0.5 * heading)
+    under = spatial_ground.height(i, root_x, root_y, ground)
+    drift_x = drift_y = 0.0  # of the ground under the root, m/s
+    if ground.box_velocity.shape[1] + ground.mover_top.shape[1] > 0:
+        drift_x, drift_y = spatial_ground.velocity(i, root_x, root_y, ground)
+    found.root[i, 0], found.root[i, 1], found.root[i, 2] = root_x, root_y, root_z
+    found.com[i, 0], found.com[i, 1], found.com[i, 2] = com_x, com_y, com_z
+    found.heading[i], found.cosine[i], found.sine[i] = heading, cosine, sine
+    found.under[i] = under
+    found.pose[i, 0] = root_z - under
+
+    speed_x = speed_y = speed_z = 0.0
+    features = 0
+    for k in range(len(body.links)):
+        link = body.links[k]
+        centre_x, centre_y = state.xipos[i, link, 0], state.xipos[i, link, 1]
+        centre_z = state.xipos[i, link, 2]
+        spin_x, spin_y, spin_z = (
+            state.cvel[i, link, 0], state.cvel[i, link, 1], state.cvel[i, link, 2],
+        )  # fmt: skip
+        # Spatial velocities are about the centre of mass of the whole tree: v + w x r.
+        arm_x, arm_y, arm_z = centre_x - com_x, centre_y - com_y, centre_z - com_z
+        v_x = state.cvel[i, link, 3] + (spin_y * arm_z - spin_z * arm_y)
+        v_y = state.cvel[i, link, 4] + (spin_z * arm_x - spin_x * arm_z)
+        v_z = state.cvel[i, link, 5] + (spin_x * arm_y - spin_y * arm_x)
+        speed_x += v_x * body.share[k]
+        speed_y += v_y * body.share[k]
+        speed_z += v_z * body.share[k]
+
+        column = 1 + LINK_POSE * k
+        away_x, away_y = centre_x - root_x, centre_y - root_y
+        found.pose[i, column] = cosine * away_x + sine * away_y
+        found.pose[i, column + 1] = cosine * away_y - sine * away_x
+        found.pose[i, column + 2] = centre_z - root_z
+        w, x = state.xquat[i, link, 0], state.xquat[i, link, 1]
+        y, z = state.xquat[i, link, 2], state.xquat[i, link, 3]
+        turned_w, turned_x = half_cosine * w - half_sine * z, half_cosine * x - half_sine * y
+        turned_y, turned_z = half_cosine * y + half_sine * x, half_cosine * z + half_sine * w
+        if k == 0:
+            found.features[i, 0], found.features[i, 1] = turned_w, turned_x
+            found.features[i, 2], found.features[i, 3] = turned_y, turned_z
+        sign = -1.0 if turned_w < 0.0 else 1.0
+        found.pose[i, column + 3], found.pose[i, column + 4] = sign * turned_w, sign * turned_x
+        found.pose[i, column + 5], found.pose[i, column + 6] = sign * turned_y, sign * turned_z
+        column = LINK_VELOCITY * k
+        v_x, v_y = v_x - drift_x, v_y - drift_y
+        found.velocity[i, column] = cosine * v_x + sine * v_y
+        found.velocity[i, column + 1] = cosine * v_y - sine * v_x
+        found.velocity[i, column + 2] = v_z
+        found.velocity[i, column + 3] = cosine * spin_x + sine * spin_y
+        found.velocity[i, column + 4] = cosine * spin_y - sine * spin_x
+        found.velocity[i, column + 5] = spin_z
+    found.com_velocity[i, 0], found.com_velocity[i, 1] = speed_x, speed_y
+    found.com_velocity[i, 2] = speed_z
+
+    features = 4
+    for address in body.balls:
+        found.features[i, features] = state.qpos[i, address]
+        features += 1
+    for address in body.hinges:
+        found.features[i, features] = state.qpos[i, address]
+        features += 1
+    for k in range(3):
+        found.features[i, features] = found.velocity[i, 3 + k]
+        features += 1
+    for address in body.joint_dof:
+        found.features[i, features] = state.qvel[i, address]
+        features += 1
+    middle_x, middle_y = (com_x, com_y) if body.about_com else (root_x, root_y)
+    for k in range(len(body.effectors)):
+        foot = body.effectors[k]
+        foot_x, foot_y = state.xpos[i, foot, 0], state.xpos[i, foot, 1]
+        foot_z = state.xpos[i, foot, 2]
+        found.feet[i, k, 0], found.feet[i, k, 1], found.feet[i, k, 2] = foot_x, foot_y, foot_z
+        away_x, away_y = foot_x - middle_x, foot_y - middle_y
+        found.features[i, features] = cosine * away_x + sine * away_y
+        found.features[i, features + 1] = cosine * away_y - sine * away_x
+        found.features[i, features + 2] = foot_z - spatial_ground.height(i, foot_x, foot_y, ground)
+        features += 3
+        touching = 0.0
+        for sensor in body.contact[k]:
+            if state.sensordata[i, sensor] > 0.0:
+                touching = 1.0
+        found.contact[i, k] = touching
+    for k in range(3):
+        found.features[i, features + k] = found.com_velocity[i, k]
+    found.features[i, features + 3] = root_z - under
+    found.fallen[i] = False
+    for sensor in body.fall:
+        if state.sensordata[i, sensor] != 0.0:
+            found.fallen[i] = True
+
+
+@compiled_inline
+def ahead_and_left(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
+    """Returns a horizontal vector of the world in the heading frame."""
+    cosine, sine = found.cosine[i], found.sine[i]
+    return cosine * x + sine * y, cosine * y - sine * x
+
+
+@compiled_inline
+def polar(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
+    """Returns bearing (rad to the left) and length of a horizontal vector of the world."""
+    ahead, left = ahead_and_left(i, x, y, found)
+    return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
+
+
+@compiled
+def write_body(
+    i: int, pose: int, velocity: int, found: SpatialMeasurement, observation: np.ndarray
+) -> None:
+    """Writes the blocks pose and velocity into an observation, at these columns."""
+    for k in range(found.pose.shape[1]):
+        observation[i, pose + k] = found.pose[i, k]
+    for k in range(found.velocity.shape[1]):
+        observation[i, velocity + k] = found.velocity[i, k]
+
+
+@compiled
+def write_terrain(
+    i: int, column: int, ground: SpatialGround, found: SpatialMeasurement, observation: np.ndarray
+) -> None:
+    """Writes the map of heights around a character; nothing if the column is negative."""
+    if column >= 0:
+        block = observation[i, column : column + SAMPLES * SAMPLES]
+        x, y = found.root[i, 0], found.root[i, 1]
+        spatial_ground.height_map(i, x, y, found.heading[i], ground, block)
+
+
+class Measured(NamedTuple):
+    """What the loop over characters works on."""
+
+    body: SpatialBody
+    state: SpatialState
+    ground: SpatialGround
+    found: SpatialMeasurement
+
+
+@compiled_loop
+def measure_all(env_ids: np.ndarray, measured: Measured) -> None:
+    """Measures the characters of some simulations; takes a pack."""
+    for i in env_ids:
+        measure(i, measured.body, measured.state, measured.ground, measured.found)
+
+
+class SpatialFigure:
+    """One character in every simulation of a world.
+
+    Attributes:
+      body: its ids, after `bind`; see `SpatialBody`.
+      state: the fields of the physics that it is measured by.
+      found: what was measured last.
+      pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
+      links: body ids, in link order.
+      blocks: observation blocks of the body, with their sizes.
+    """
+
+    body: SpatialBody
+    state: SpatialState
+    found: SpatialMeasurement
+    fields: tuple[str, ...] = ('xquat',)  # of MjData, beside those that every world binds
+
+    def __init__(self, character: Character, arena: SpatialTerrain, terrain_map: bool) -> None:
+        """Attaches the character; adds contact sensors for its fall links and end effectors.
+
+        Args:
+          character: a spatial character; it is attached to the arena and given a free joint.
+          arena: where it moves.
+          terrain_map: whether it sees the heights around it, 32 x 32 samples.
+        """
+        self.character, self.arena, self.terrain_map = character, arena, terrain_map
+        (self._root,) = character.create_root_joints(arena.attach(character))
+        self._sensors = {
+            kind: [self._add_sensors(name, kind) for name in names]
+            for kind, names in (
+                ('fall', character.row.fall_links),
+                ('contact', character.row.end_effectors),
+            )
+        }
+        links = len(character.row.links)
+        self.blocks = {
+            'terrain': SAMPLES**2 if terrain_map else 0,
+            'pose': LINK_POSE * links + 1,
+            'velocity': LINK_VELOCITY * links,
+        }
+
+    def _add_sensors(self, link: str, kind: str) -> list[str]:
+        """Adds sensors of the contacts between a link and the ground; returns their names."""
+        names = []
+        for i, ground in enumerate(self.arena.touched):
+            names.append(f'{self.character.mjcf_model.model}_{link}_{kind}_{i}')
+            self.arena.mjcf_model.sensor.add(
+                'contact', name=names[-1], body1=self.character.mjcf_model.find('body', link),
+                num=1, data='found', **ground,
+            )  # fmt: skip
+        return names
+
+    def bind(self, world: World, about: str = 'com') -> None:
+        """Resolves ids in a compiled world.
+
+        Args:
+          world: the simulations.
+          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
+        """
+        self._world = world
+        self.arena.bind(world)
+        character, model = self.character, world.models[0]
+        names = [self._root.full_identifier, *(j.full_identifier for j in character.joints)]
+        qpos, dof = world.joint_addresses(names)
+        ball = character.spherical
+        sizes, rates = np.where(ball, 4, 1), np.where(ball, 3, 1)
+        self.pose_qpos = _addresses(qpos, [7, *sizes])
+        self.pose_dof = _addresses(dof, [6, *rates])
+        self.links = world.body_ids([body.full_identifier for body in character.bodies])
+        mass = model.body_mass[self.links]
+        fall, contact = (
+            world.sensor_addresses([*itertools.chain(*names)]).astype(int)
+            for names in self._sensors.values()
+        )
+        self.body = SpatialBody(
+            self.pose_qpos, self.pose_dof, self.pose_dof[6:].copy(),
+            _addresses(qpos[1:][ball], sizes[ball]), qpos[1:][~ball], self.links,
+            world.body_ids([b.full_identifier for b in character.end_effectors]),
+            mass / mass.sum(), about == 'com', fall,
+            contact.reshape(len(self._sensors['contact']), len(self.arena.touched)),
+        )  # fmt: skip
+        self.state = SpatialState(*(getattr(world, name) for name in SpatialState._fields))
+        self.found = measurement(world.n, self.body)
+        self._pack = packed(Measured(self.body, self.state, self.ground, self.found))
+        geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
+        self._bodies = model.geom_bodyid[geoms]
+        signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
+        boxes = model.geom_aabb[geoms, None]  # middle and half sides, in the geoms' frames
+        corners = quaternion.rotate(
+            model.geom_quat[geoms, None], boxes[..., :3] + signs * boxes[..., 3:]
+        )
+        self._corners = model.geom_pos[geoms, None] + corners  # (G, 8, 3), in the links' frames
+
+    @property
+    def ground(self) -> SpatialGround:
+        """The ground under all simulations, for compiled functions."""
+        return self.arena.surroundings.arrays
+
+    @property
+    def effectors(self) -> np.ndarray:
+        """Body ids of the end effectors, in link order."""
+        return self.body.effectors
+
+    def measure(self, env_ids: np.ndarray | None = None) -> SpatialMeasurement:
+        """Measures the characters of some simulations, or of all; returns `found`."""
+        measure_all(self._world.all_ids if env_ids is None else env_ids, self._pack)
+        return self.found
+
+    def place(
+        self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray
+    ) -> None:
+        """Puts the characters of some simulations on the ground.
+
+        Each is lifted until the corners of all its boxes are clear of the ground; never lowered.
+
+        Args:
+          env_ids: which simulations; their physics was reset.
+          poses: of a free root that stands at the origin, z above the ground, and the joints in link
+            order, (m, columns of a pose).
+          rates: their velocities, (m, columns of a velocity).
+          spawns: where the origin is put: x, y in m, and by how much it is turned, rad, (m, 3).
+        """
+        world, angle = self._world, spawns[:, 2]
+        poses, rates = poses.copy(), rates.copy()
+        poses[:, :2] = spawns[:, :2] + quaternion.turned(poses[:, :2], angle)
+        poses[:, 3:7] = quaternion.multiply(quaternion.about_z(angle), poses[:, 3:7])
+        rates[:, :2] = quaternion.turned(rates[:, :2], angle)
+        poses[:, 2] += self.arena.height(poses[:, :1], poses[:, 1:2], env_ids)[:, 0]
+        world.qpos[env_ids[:, None], self.pose_qpos] = poses
+        world.qvel[env_ids[:, None], self.pose_dof] = rates
+        world.forward(env_ids)
+        bodies = (env_ids[:, None], self._bodies)
+        corners = world.xpos[bodies][:, :, None] + quaternion.rotate(
+            world.xquat[bodies][:, :, None], self._corners
+        )
+        x, y, z = corners.reshape(len(env_ids), -1, 3).transpose(2, 0, 1)
+        depth = self.arena.height(x, y, env_ids) - z
+        lift = np.maximum(depth.max(1) + CLEARANCE, 0)
+        world.qpos[env_ids, self.pose_qpos[2]] += lift
+        world.forward(env_ids)
+
+
+def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
+    """Returns the addresses of blocks of columns, one block after the other."""
+    blocks = [start + np.arange(size) for start, size in zip(starts, sizes, strict=True)]
+    return np.concatenate(blocks) if blocks else np.zeros(0, int)
