@@ -59,6 +59,7 @@ class Compiled:
         native: Callable[[], Callable[..., Any]] | None = None,
         inline: bool = False,
         counted: bool = False,
+        kept: bool = True,
     ) -> None:
         """Wraps a function.
 
@@ -67,10 +68,11 @@ class Compiled:
           native: returns what is compiled in its place: for what only Numba can express.
           inline: whether its code takes the place of calls.
           counted: whether arrays are reference-counted, as reading a pack needs.
+          kept: whether the machine code is kept on disk.
         """
         functools.update_wrapper(self, function)
         self.function, self._native = function, native
-        self._inline, self._counted = inline, counted
+        self._inline, self._counted, self._kept = inline, counted, kept
         self._lock = threading.Lock()
         self._dispatcher: Callable[..., Any] | None = None
 
@@ -91,7 +93,7 @@ class Compiled:
         if self._native is not None:  # a line or two; what calls it is kept on disk
             return numba.njit(self._native(), _nrt=True, **options)
         options['_nrt'] = self._counted
-        folder = cache_folder()
+        folder = cache_folder() if self._kept else None
         if folder is None:
             return numba.njit(self.function, **options)
         # Numba looks at its setting when a function is decorated; it is the user's otherwise.
@@ -99,6 +101,8 @@ class Compiled:
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
             try:
                 return numba.njit(self.function, cache=True, **options)
+            except RuntimeError:  # no file: a function that was typed in
+                return numba.njit(self.function, **options)
             finally:
                 numba.config.CACHE_DIR = before
 
@@ -134,9 +138,19 @@ def packed(value: Any) -> Any:
     """
     if _numba().config.DISABLE_JIT:
         return Unpacked(value)
-    from trl_suite.util.pack import pack
+    from trl_suite.util.pack import pack, pack_foreign
 
-    return pack(value)
+    return pack(value) if _of_the_package(value) else pack_foreign(value)
+
+
+def _of_the_package(value: Any) -> bool:
+    """Whether a tuple, with all tuples in it, is of a type of this package."""
+    if not isinstance(value, tuple):
+        return True
+    package = type(value).__module__.partition('.')[0]
+    return package in (__package__.partition('.')[0], 'builtins') and all(
+        map(_of_the_package, value)
+    )
 
 
 _setting = threading.Lock()

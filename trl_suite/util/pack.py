@@ -11,7 +11,7 @@ from typing import Any
 from numba import types
 from numba.experimental import structref
 
-from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.compiled import Compiled, compiled_loop
 
 
 @structref.register
@@ -33,3 +33,8 @@ structref.define_proxy(Pack, PackType, ['value'])
 def pack(value: Any) -> Pack:
     """Returns a pack of a value."""
     return Pack(value)
+
+
+# Numba writes down the types for which it has compiled a function, and reads all of them in every
+# process. Types of other packages must not be among them: they cannot be imported everywhere.
+pack_foreign = Compiled(pack.function, counted=True, kept=False)
