@@ -124,7 +124,7 @@ STEPS, LONG = (0, 1, 5, 20), (0, 1, 2)
 TOLERANCE = 1e-6
 NUDGE = 1e-12  # changes of actions that must not matter, many times those of other processors
 NUDGES = 8
-SEEDS = 500
+SEEDS = 100
 
 
 class Log:
@@ -477,30 +477,37 @@ def summarised(id_):
 
 
 def store(path):
-    """Writes summaries, each with the first seed with which small changes of actions do not matter."""
+    """Writes summaries; each has the steps up to which small changes of the actions do not matter.
+
+    Of some seeds the first is taken with which that is all of them, or else most.
+    """
     stored = {}
     for id_ in tqdm(suite.ALL_IDS, mininterval=5):
-        environment = summarised(id_)
+        environment, best, wanted = summarised(id_), 0, len(LONG if is_long(id_) else STEPS)
         for seed in range(SEEDS):
-            expected = summary(id_, seed, 0.0, environment)
-            if all(
-                agree(expected, summary(id_, seed, NUDGE, environment), TOLERANCE / 100)
-                for _ in range(NUDGES)
-            ):
+            expected, count = summary(id_, seed, 0.0, environment), wanted
+            for _ in range(NUDGES):
+                count = min(count, agreeing(expected, summary(id_, seed, NUDGE, environment)))
+                if count <= best:
+                    break
+            else:
+                best = count
+                rounded = {k: [float(f'{x:.12g}') for x in v[:best]] for k, v in expected.items()}
+                stored[id_] = {'seed': seed, **rounded}
+            if best == wanted:
                 break
-        else:
-            raise ValueError(f'{id_}: small changes of the actions matter with any seed')
-        rounded = {k: [float(f'{x:.12g}') for x in values] for k, values in expected.items()}
-        stored[id_] = {'seed': seed, **rounded}
         environment.close()
     lines = ',\n'.join(f' {json.dumps(id_)}: {json.dumps(value)}' for id_, value in stored.items())
     pathlib.Path(path).write_text(f'{{\n{lines}\n}}\n')
 
 
-def agree(expected, found, tolerance):
-    return expected.keys() == found.keys() and all(
-        np.allclose(found[name], values, tolerance, tolerance) for name, values in expected.items()
-    )
+def agreeing(expected, found):
+    """Returns the number of first steps of which two summaries are almost the same."""
+    near = [
+        np.isclose(found[name], values, TOLERANCE / 100, TOLERANCE / 100)
+        for name, values in expected.items()
+    ]
+    return int(np.logical_and.accumulate(np.all(near, axis=0)).sum())
 
 
 def main():
