@@ -21,7 +21,7 @@ Trajectories are chaotic, so what follows the first difference says little. Thre
 characters are more so than others: when a ball joint's servo is at its limit, it depends on the last
 bit whether MuJoCo takes its force for limited, and one step later velocities differ by some rad/s.
 
-Recording or comparing everything takes about six minutes of one core. Where a step is a whole gait
+Recording or comparing everything takes about five minutes of one core. Where a step is a whole gait
 cycle or footstep there are fewer of them.
 """
 
