@@ -1,0 +1,344 @@
+"""Compiled functions: what they may do, and where their machine code is kept."""
+
+import contextlib
+import io
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+import unittest.mock
+from typing import NamedTuple
+
+import numpy as np
+from absl.testing import absltest, parameterized
+from helpers import FolderTest
+
+import trl_suite
+from trl_suite.util import compiled as module
+from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
+
+PACKAGE = pathlib.Path(trl_suite.__file__).parent
+INNER = """
+from trl_suite.util.compiled import compiled
+
+@compiled
+def inner(x):
+    return {}
+"""
+OUTER = """
+from trl_suite.inner import inner
+from trl_suite.util.compiled import compiled
+
+@compiled
+def outer(x):
+    return inner(x) + 1.0
+"""
+ASK = 'from trl_suite.outer import outer; print(outer(1.0))'
+FOLDER = 'from trl_suite.util.compiled import cache_folder; print(cache_folder())'
+TUPLE = 'from typing import NamedTuple\nclass {}(NamedTuple):\n    array: object\n'
+FIRST = """
+from trl_suite.util.compiled import compiled_loop
+
+@compiled_loop
+def first(pack):
+    return pack.array[0]
+"""
+PACKED = (
+    'import numpy as np; from trl_suite.own import first; '
+    'from trl_suite.util.compiled import packed; '
+)
+
+
+class Pair(NamedTuple):
+    first: np.ndarray
+    second: np.ndarray
+
+
+class Whole(NamedTuple):
+    pair: Pair
+    count: int
+    share: float
+    flag: bool
+
+
+@compiled_loop
+def mixed(whole):
+    first, second = whole.pair.first, whole.pair.second
+    return first[-1], second.shape[1], whole.count * whole.share, whole.flag
+
+
+@compiled_inline
+def twice(x):
+    return 2.0 * x
+
+
+@compiled
+def scaled(i, pair):
+    pair.second[i] = twice(pair.first[i]) / (i - 1)
+
+
+@compiled_loop
+def scale_all(env_ids, pair):
+    for i in env_ids:
+        scaled(i, pair)
+
+
+@compiled
+def allocates(n):
+    return np.zeros(n)
+
+
+class FunctionTest(parameterized.TestCase):
+    """What compiled functions can do."""
+
+    def test_loops_take_packs(self):
+        pair = Pair(np.array([1.0, 2.0, 3.0]), np.zeros(3))
+        scale_all(np.array([0, 2]), packed(pair))
+        np.testing.assert_array_equal(pair.second, [-2, 0, 6])
+
+    def test_fields_of_packs(self):
+        whole = Whole(Pair(np.arange(3.0), np.zeros((2, 3), np.float32)), 7, 0.5, True)
+        for pack in (packed(whole), packed(whole)):  # of one type
+            self.assertEqual(mixed(pack), (2.0, 3, 3.5, 1))
+        frozen = np.arange(4.0)
+        frozen.flags.writeable = False
+        other = packed(whole._replace(pair=Pair(frozen[::2], np.zeros((1, 1)))))
+        self.assertEqual(mixed(other), (2.0, 1, 3.5, 1))
+
+    def test_what_cannot_be_packed(self):
+        with self.assertRaisesRegex(TypeError, 'Whole.pair.second is list; expected an array, a'):
+            packed(Whole(Pair(np.zeros(2), [1.0]), 7, 0.5, True))
+
+    def test_a_division_by_zero_gives_infinity(self):
+        pair = Pair(np.ones(3), np.zeros(3))
+        scale_all(np.arange(3), packed(pair))
+        np.testing.assert_array_equal(pair.second, [-2, np.inf, 2])
+
+    def test_a_pack_keeps_its_arrays(self):
+        second = np.zeros(2000)
+        pack, others = packed(Pair(np.full(2000, 3.0), second)), []
+        for _ in range(20):
+            others.append(np.full(2000, 7.0))  # would take the place of what was freed
+        scale_all(np.array([5]), pack)
+        self.assertEqual(second[5], 1.5)
+
+    def test_who_allocates_is_refused(self):
+        import numba
+
+        with self.assertRaises(numba.core.errors.NumbaError):
+            allocates(3)
+
+    def test_the_python_function_remains(self):
+        self.assertEqual(twice.function(4), 8)
+        self.assertEqual(twice.__name__, 'twice')
+
+    def test_long_compilations_are_announced_on_a_terminal(self):
+        for terminal, seconds, lines in ((True, 0.2, 2), (True, 0.0, 0), (False, 0.2, 0)):
+            stream = io.StringIO()
+            stream.isatty = lambda terminal=terminal: terminal
+            with (
+                unittest.mock.patch.object(module, 'PATIENCE', 0.1),
+                contextlib.redirect_stderr(stream),
+                module.announcing('the test'),
+            ):
+                time.sleep(seconds)
+            self.assertLen(stream.getvalue().splitlines(), lines)
+
+
+class CacheTest(FolderTest):
+    """The folder of the machine code, in processes of their own."""
+
+    def setUp(self):
+        super().setUp()
+        self.cache, self.package = self.folder / 'cache', self.folder / 'trl_suite'
+        (self.package / 'util').mkdir(parents=True)
+        (self.package / '__init__.py').touch()
+        for path in (PACKAGE / 'util').glob('*.py'):
+            shutil.copy(path, self.package / 'util')
+        self.write('x * 10.0')
+        (self.package / 'outer.py').write_text(OUTER)
+
+    def write(self, expression):
+        (self.package / 'inner.py').write_text(INNER.format(expression))
+
+    def environ(self, **variables):
+        kept = {k: v for k, v in os.environ.items() if not k.startswith('NUMBA_')}
+        paths = {'PYTHONPATH': str(self.folder), 'HOME': str(self.folder / 'home')}
+        variables = {'NUMBA_CACHE_DIR': str(self.cache), **paths, **variables}
+        return {**kept, 'XDG_CACHE_HOME': '', **variables}
+
+    def ask(self, script=ASK, **variables):
+        """Runs a script; returns what it prints and what it warns of."""
+        done = subprocess.run(
+            [sys.executable, '-c', textwrap.dedent(script)], capture_output=True, text=True,
+            check=True, cwd=self.folder, env=self.environ(**variables),
+        )  # fmt: skip
+        return done.stdout.split(), done.stderr
+
+    def folders(self, base=None):
+        return sorted((base or self.cache).glob('trl_suite-*'))
+
+    def test_code_is_kept_for_each_state_of_the_sources(self):
+        self.assertEqual(self.ask(), (['11.0'], ''))
+        (first,) = self.folders()
+        files = {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')}
+        self.assertNotEmpty(files)
+        self.assertEqual(self.ask()[0], ['11.0'])
+        self.assertEqual(files, {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')})
+        # Numba alone would go on with the code of `outer`, whose file is as it was.
+        self.write('x * 20.0')
+        self.assertEqual(self.ask()[0], ['21.0'])
+        self.assertLen(self.folders(), 2)
+        self.write('x * 10.0')
+        self.assertEqual(self.ask()[0], ['11.0'])
+        self.assertLen(self.folders(), 2)
+
+    def test_other_sources_do_not_matter(self):
+        found = self.ask(FOLDER)
+        (self.package / 'plain.py').write_text('VALUE = 1\n')
+        self.assertEqual(self.ask(FOLDER), found)
+        (self.package / 'plain.py').write_text(INNER.format('x'))
+        self.assertNotEqual(self.ask(FOLDER), found)
+
+    def test_the_users_cache_folder(self):
+        base = self.folder / 'xdg'
+        found, warned = self.ask(FOLDER, NUMBA_CACHE_DIR='', XDG_CACHE_HOME=str(base))
+        self.assertEmpty(warned)
+        if sys.platform == 'linux':
+            self.assertEqual(found, [str(path) for path in self.folders(base)])
+        self.assertFalse(self.cache.exists())
+
+    def test_without_a_folder_that_can_be_written(self):
+        file = self.folder / 'file'
+        file.touch()
+        nowhere = str(file / 'cache')
+        found, warned = self.ask(
+            'from trl_suite.outer import outer; from trl_suite.inner import inner; '
+            'print(outer(1.0), inner(2.0))',
+            NUMBA_CACHE_DIR=nowhere, XDG_CACHE_HOME=nowhere, HOME=nowhere, LOCALAPPDATA=nowhere,
+        )  # fmt: skip
+        self.assertEqual(found, ['11.0', '20.0'])
+        self.assertEqual(warned.count('no folder for compiled code can be written'), 1)
+
+    def test_numbas_setting_is_left_alone(self):
+        found, _ = self.ask("""
+            import numba
+            from trl_suite.outer import outer
+            before = numba.config.CACHE_DIR
+            outer(1.0)
+            print(numba.config.CACHE_DIR == before)
+        """)
+        self.assertEqual(found, ['True'])
+
+    def test_unused_folders_are_removed(self):
+        old, new = self.cache / 'trl_suite-0', self.cache / 'trl_suite-1'
+        other = self.cache / 'another'
+        for path in (old, new, other):
+            path.mkdir(parents=True)
+            (path / 'file').touch()
+        for path in (old, other):
+            os.utime(path, (0, time.time() - 2 * module.UNUSED))
+        self.ask(FOLDER)
+        self.assertEqual([p.exists() for p in (old, new, other)], [False, True, True])
+
+    def test_types_of_others_are_not_kept(self):
+        """Who has not the module of a type could not read the list in which it is."""
+        (self.folder / 'foreign.py').write_text(TUPLE.format('Foreign'))
+        (self.package / 'own.py').write_text(TUPLE.format('Own') + FIRST)
+        self.ask(f'{PACKED} from foreign import Foreign; print(first(packed(Foreign(np.ones(2)))))')
+        (self.folder / 'foreign.py').unlink()
+        self.ask(f'{PACKED} from trl_suite.own import Own; print(first(packed(Own(np.ones(2)))))')
+
+    def test_functions_without_a_file(self):
+        found, _ = self.ask("""
+            from trl_suite.util.compiled import compiled
+
+            @compiled
+            def plus(x):
+                return x + 1.0
+
+            print(plus(2.0))
+        """)
+        self.assertEqual(found, ['3.0'])
+
+    def test_processes_that_compile_at_once(self):
+        running = [
+            subprocess.Popen([sys.executable, '-c', ASK], stdout=subprocess.PIPE,
+                             stderr=subprocess.PIPE, text=True, env=self.environ(), cwd=self.folder)
+            for _ in range(3)
+        ]  # fmt: skip
+        self.assertEqual([each.communicate() for each in running], [('11.0\n', '')] * 3)
+
+    @parameterized.parameters(
+        *[('fork', True), ('fork', False)][: 2 * hasattr(os, 'fork')], ('spawn', True)
+    )
+    def test_child_processes(self, method, before):
+        (self.folder / 'program.py').write_text(
+            'import multiprocessing, sys\n'
+            'from trl_suite.outer import outer\n'
+            'def call(x):\n'
+            '    return outer(x)\n'
+            'if __name__ == "__main__":\n'
+            f'    value = outer(3.0) if {before} else None\n'
+            f'    with multiprocessing.get_context({method!r}).Pool(2) as pool:\n'
+            '        print(*pool.map(call, [1.0, 2.0]))\n'
+        )
+        done = subprocess.run(
+            [sys.executable, 'program.py'], capture_output=True, text=True, timeout=120,
+            cwd=self.folder, env=self.environ(),
+        )  # fmt: skip
+        self.assertEqual((done.stdout.split(), done.returncode), (['11.0', '21.0'], 0), done.stderr)
+
+    def test_numba_is_imported_when_a_function_is_called(self):
+        found, _ = self.ask("""
+            import sys
+            from trl_suite.outer import outer
+            print('numba' in sys.modules)
+            outer(1.0)
+            print('numba' in sys.modules)
+        """)
+        self.assertEqual(found, ['False', 'True'])
+
+    def test_without_compiling(self):
+        self.assertEqual(self.ask(NUMBA_DISABLE_JIT='1'), (['11.0'], ''))
+        self.assertEmpty(self.folders())
+
+
+class DisabledTest(parameterized.TestCase):
+    """Environments return the same numbers where their rules run as Python."""
+
+    SCRIPT = """
+        import hashlib, sys
+        import numpy as np
+        from trl_suite import suite
+        from trl_suite.vector import VectorEnvironment
+        for id_ in sys.argv[1:]:
+            environment = suite.make(id_, {'random': 3, 'step_limit': 9}, {'flat_observation': True})
+            many = VectorEnvironment(id_, 2, 1, 7, step_limit=9)
+            draw, size = np.random.default_rng(0), len(many.action_map)
+            found = [environment.reset().observation['observations'], many.reset()]
+            for _ in range(14):
+                time_step = environment.step(draw.uniform(-1, 1, size))
+                found += [time_step.observation['observations'], np.float64(time_step.reward or 0)]
+                found += many.step(draw.uniform(-1, 1, (2, size)))[:4]
+            print(hashlib.sha256(b''.join(array.tobytes() for array in found)).hexdigest())
+    """
+
+    @parameterized.parameters('PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped2D_LLC_Flat_Step-v0')
+    def test_planar(self, id_):
+        found = [
+            subprocess.run(
+                [sys.executable, '-c', textwrap.dedent(self.SCRIPT), id_], capture_output=True,
+                text=True, check=True, env={**os.environ, 'NUMBA_DISABLE_JIT': switch},
+            ).stdout
+            for switch in ('0', '1')
+        ]  # fmt: skip
+        self.assertLen(found[0].strip(), 64)
+        self.assertEqual(found[0], found[1])
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,340 @@
+"""Simulations as arrays: what the engine does is what MuJoCo does."""
+
+import pathlib
+import tempfile
+import threading
+import unittest.mock
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import mjcf
+
+from trl_suite import engine
+from trl_suite.engine import BatchWorld, PhysicsWorld, native
+from trl_suite.engine.world import CHUNKS, LEAST, READABLE, STATE, WRITABLE
+
+# A hopper on a box, driven by servos and a muscle, a belt that is moved, and a ball.
+XML = """
+<mujoco model="test">
+  <option timestep="0.002" integrator="implicitfast"/>
+  <asset><texture name="sky" type="skybox" builtin="flat" width="8" height="8"/>
+    <material name="red" rgba="1 0 0 1"/></asset>
+  <worldbody>
+    <geom name="floor" type="box" size="5 5 .1" pos="0 0 -.1" material="red"/>
+    <body name="belt" mocap="true" pos="0 0 .1"><geom type="box" size=".2 .2 .02"/></body>
+    <body name="trunk" pos="0 0 .6">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="pitch" axis="0 1 0"/>
+      <geom name="trunk" type="capsule" size=".05 .1" mass="3"/><site name="middle"/>
+      <body name="leg" pos="0 0 -.1"><joint name="hip" axis="0 1 0" damping=".1"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.3" mass="1"/>
+        <site name="foot" pos="0 0 -.3" size=".06"/></body>
+    </body>
+    <body name="ball" pos=".5 0 1"><freejoint/><geom type="sphere" size=".1" mass=".5"/></body>
+  </worldbody>
+  <tendon><spatial name="rope"><site site="middle"/><site site="foot"/></spatial></tendon>
+  <actuator><position name="servo" joint="hip" kp="50" kv="3" forcerange="-20 20"/>
+    <muscle name="muscle" tendon="rope" lengthrange=".2 .5" force="30"/></actuator>
+  <sensor><touch name="touch" site="foot"/></sensor>
+</mujoco>
+"""
+SUBSTEPS = 7
+
+
+def model():
+    return mujoco.MjModel.from_xml_string(XML)
+
+
+def controls(steps, n=1, seed=0):
+    return np.random.default_rng(seed).uniform(0, 1, (steps, n, 2))
+
+
+def state_of(model, data):
+    state = np.empty(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    return state
+
+
+class StepTest(parameterized.TestCase):
+    """A step is `mj_step` as often as asked."""
+
+    def raw(self, ctrl):
+        """States, and what is computed from them, after plain steps of MuJoCo."""
+        raw_model = model()
+        data, found = mujoco.MjData(raw_model), []
+        mujoco.mj_forward(raw_model, data)
+        for each in ctrl:
+            data.ctrl[:] = each
+            for _ in range(SUBSTEPS):
+                mujoco.mj_step(raw_model, data)
+            found.append(np.concatenate([data.qpos, data.qvel, data.act]))
+        return np.array(found), data.time
+
+    def stepped(self, world, ctrl):
+        found = []
+        world.forward(world.all_ids)
+        for each in ctrl:
+            world.ctrl[:] = each
+            world.step(SUBSTEPS)
+            found.append(np.concatenate([world.qpos, world.qvel, world.act], 1))
+        return np.array(found)
+
+    def test_one_simulation(self):
+        physics = mjcf.Physics.from_xml_string(XML)
+        world, ctrl = PhysicsWorld(physics), controls(60)
+        expected, time = self.raw(ctrl[:, 0])
+        np.testing.assert_array_equal(self.stepped(world, ctrl)[:, 0], expected)
+        self.assertEqual(world.time[0], time)
+        np.testing.assert_array_equal(world.qpos[0], physics.data.qpos)
+
+    @parameterized.parameters(1, 2)
+    def test_many_simulations(self, num_threads):
+        world, ctrl = BatchWorld(model(), 3, num_threads), controls(60, 3)
+        found = self.stepped(world, ctrl)
+        for i in range(3):
+            expected, time = self.raw(ctrl[:, i])
+            np.testing.assert_array_equal(found[:, i], expected)
+            self.assertEqual(world.time[i], time)
+        self.assertGreater(np.abs(found[-1, 0] - found[-1, 1]).max(), 1e-3)
+
+    def test_derived_quantities_are_of_the_new_state(self):
+        world = BatchWorld(model(), 2, 1, ('site_xpos',))
+        world.forward(world.all_ids)
+        for ctrl in controls(40, 2):
+            world.ctrl[:] = ctrl
+            world.step(SUBSTEPS)
+        for i in range(2):
+            data = mujoco.MjData(world.models[i])
+            mujoco.mj_setState(world.models[i], data, world.get_state(i), STATE)
+            mujoco.mj_forward(world.models[i], data)
+            for name in ('xpos', 'xipos', 'cvel', 'subtree_com', 'ten_length', 'site_xpos'):
+                found = getattr(world, name)[i]
+                np.testing.assert_array_equal(found, getattr(data, name), err_msg=name)
+
+    def test_others_do_not_move(self):
+        world = BatchWorld(model(), 4, 1)
+        world.forward(world.all_ids)
+        before = [world.get_state(i) for i in range(4)]
+        world.step(SUBSTEPS, np.array([1, 3]))
+        moved = [not np.array_equal(world.get_state(i), before[i]) for i in range(4)]
+        self.assertEqual(moved, [False, True, False, True])
+        np.testing.assert_array_equal(world.time > 0, moved)
+
+    def test_what_is_written_reaches_the_physics(self):
+        world = BatchWorld(model(), 2, 1)
+        world.qpos[1, :4], world.qvel[1, :4] = (1.0, 0.2, 0.3, -0.4), 0.5
+        world.mocap_pos[1, 0] = (3.0, 0.0, 1.0)
+        world.forward(np.array([1]))
+        one, data = world.models[1], mujoco.MjData(world.models[1])
+        data.qpos[:4], data.qvel[:4] = (1.0, 0.2, 0.3, -0.4), 0.5
+        data.mocap_pos[0] = (3.0, 0.0, 1.0)
+        mujoco.mj_forward(one, data)
+        np.testing.assert_array_equal(world.xpos[1], data.xpos)
+        np.testing.assert_array_equal(world.xpos[1, world.body_ids(['belt'])], [[3.0, 0.0, 1.0]])
+        self.assertEqual(world.xpos[0, 1, 0], 0.0)
+
+    def test_reset(self):
+        world = BatchWorld(model(), 2, 1)
+        start = [world.get_state(i) for i in range(2)]
+        world.forward(world.all_ids)
+        world.step(SUBSTEPS)
+        gone = world.get_state(1)
+        world.reset(np.array([0]))
+        np.testing.assert_array_equal(world.get_state(0), start[0])
+        np.testing.assert_array_equal(world.get_state(1), gone)
+        np.testing.assert_array_equal(world.qpos[0], world.models[0].qpos0)
+        self.assertEqual(world.time[0], 0)
+
+    @parameterized.parameters(False, True)
+    def test_what_may_be_written(self, one):
+        world = (
+            PhysicsWorld(mjcf.Physics.from_xml_string(XML)) if one else BatchWorld(model(), 2, 1)
+        )
+        for name in (*WRITABLE, *READABLE):
+            self.assertEqual(getattr(world, name).flags.writeable, name in WRITABLE, name)
+            self.assertLen(getattr(world, name), world.n)
+
+
+class StateTest(parameterized.TestCase):
+    """States that are saved and restored, and simulations that break down."""
+
+    def worlds(self):
+        return PhysicsWorld(mjcf.Physics.from_xml_string(XML)), BatchWorld(model(), 2, 1)
+
+    def advance(self, world, steps, seed):
+        for ctrl in controls(steps, 1, seed):
+            world.ctrl[:] = ctrl
+            world.step(SUBSTEPS)
+        return np.concatenate([world.qpos[0], world.qvel[0], world.sensordata[0], world.time[:1]])
+
+    def test_a_restored_state_goes_on_bit_for_bit(self):
+        for world in self.worlds():
+            world.forward(world.all_ids)
+            self.advance(world, 30, 1)
+            state = world.get_state(0)
+            expected = self.advance(world, 30, 2)
+            world.set_state(0, state)
+            np.testing.assert_array_equal(world.get_state(0), state)
+            np.testing.assert_array_equal(self.advance(world, 30, 2), expected)
+
+    def test_a_state_of_another_world(self):
+        one, many = self.worlds()
+        one.forward(one.all_ids)
+        self.advance(one, 30, 1)
+        many.set_state(1, one.get_state(0))
+        many.set_state(0, one.get_state(0))
+        for name in ('qpos', 'qvel', 'xpos', 'cvel', 'sensordata'):
+            np.testing.assert_array_equal(getattr(many, name)[1], getattr(one, name)[0])
+        np.testing.assert_array_equal(self.advance(many, 30, 2), self.advance(one, 30, 2))
+
+    @parameterized.parameters(np.nan, np.inf, 1e12)
+    def test_divergence(self, speed):
+        for world in self.worlds():
+            world.forward(world.all_ids)
+            world.step(1)
+            good = world.get_state(0)
+            np.testing.assert_array_equal(world.diverged(), np.zeros(world.n, bool))
+            world.qvel[0, 0] = speed
+            world.step(SUBSTEPS)
+            np.testing.assert_array_equal(world.diverged(), [True, False][: world.n])
+            self.assertTrue(world.any_diverged())
+            world.step(SUBSTEPS)  # MuJoCo has put it back; it stays known as diverged
+            self.assertTrue(world.diverged()[0])
+            world.set_state(0, good)
+            self.assertFalse(world.any_diverged())
+            world.qvel[0, 0] = speed
+            world.step(SUBSTEPS)
+            self.assertTrue(world.any_diverged())
+            world.reset(world.all_ids)
+            self.assertFalse(world.any_diverged())
+
+
+class NamesTest(parameterized.TestCase):
+    """Where things are, by name."""
+
+    def test_ids_and_addresses(self):
+        world = BatchWorld(model(), 1, 1)
+        one = world.models[0]
+        self.assertEqual(world.body_ids(['leg', 'ball']).tolist(), [3, 4])
+        self.assertEqual(world.geom_ids(['floor']).tolist(), [0])
+        self.assertEqual(world.site_ids(['foot']).tolist(), [1])
+        self.assertEqual([a.tolist() for a in world.joint_addresses(['hip', 'x'])], [[3, 0]] * 2)
+        self.assertEqual(world.control_addresses(['muscle']).tolist(), [1])
+        self.assertEqual(world.sensor_addresses(['touch']).tolist(), [one.sensor_adr[0]])
+
+    def test_unknown_names(self):
+        world = BatchWorld(model(), 1, 1)
+        with self.assertRaisesRegex(ValueError, r"the model has no body named \['tail'\]"):
+            world.body_ids(['leg', 'tail'])
+
+    def test_a_light_model_has_the_same_physics(self):
+        root = mjcf.from_xml_string(XML)
+        full, light = mjcf.Physics.from_mjcf_model(root).model.ptr, engine.light_model(root)
+        self.assertEqual((full.ntex, full.nmat), (1, 1))
+        self.assertEqual((light.ntex, light.nmat), (0, 0))
+        worlds = [BatchWorld(each, 1, 1) for each in (full, light)]
+        found = []
+        for world in worlds:
+            world.forward(world.all_ids)
+            for ctrl in controls(30):
+                world.ctrl[:] = ctrl
+                world.step(SUBSTEPS)
+            found.append(world.qpos)
+        np.testing.assert_array_equal(*found)
+
+
+class LibraryTest(parameterized.TestCase):
+    """MuJoCo's functions are those of the package that is imported."""
+
+    def test_addresses(self):
+        found = native.addresses()
+        self.assertLen(set(found), len(native.NAMES))
+        self.assertTrue(all(found))
+
+    def test_another_version(self):
+        native.check_version('3.17.0', '3.17.0', 'libmujoco.so')
+        with self.assertRaisesRegex(
+            ImportError,
+            'libmujoco.so is MuJoCo 3.9.0, and the Python package is MuJoCo 3.17.0; rei',
+        ):
+            native.check_version('3.9.0', '3.17.0', 'libmujoco.so')
+
+    def test_no_library(self):
+        with tempfile.TemporaryDirectory() as folder:
+            file = str(pathlib.Path(folder) / '__init__.py')
+            with (
+                unittest.mock.patch.object(mujoco, '__file__', file),
+                self.assertRaisesRegex(ImportError, f'no MuJoCo library .* in {folder}; install'),
+            ):
+                native.addresses.__wrapped__()
+
+
+class ShareTest(parameterized.TestCase):
+    """Work that threads share."""
+
+    def world(self, num_threads=2, n=40):
+        return BatchWorld(model(), n, num_threads)
+
+    def test_parts_are_everything_once_in_order(self):
+        world, ids, parts = self.world(), np.arange(1, 40, 2), []
+        world.share(lambda part: parts.append((part, threading.get_ident())), ids)
+        self.assertLen(parts, min(2 * CHUNKS, len(ids) // LEAST))
+        parts.sort(key=lambda each: each[0][0])
+        np.testing.assert_array_equal(np.concatenate([part for part, _ in parts]), ids)
+        self.assertNotIn(threading.get_ident(), [thread for _, thread in parts])
+
+    @parameterized.parameters((1, 40), (8, 2 * LEAST - 1))
+    def test_little_work_and_one_thread(self, num_threads, count):
+        parts = []
+        self.world(num_threads).share(
+            lambda part: parts.append((part.tolist(), threading.get_ident())), np.arange(count)
+        )
+        self.assertEqual(parts, [(list(range(count)), threading.get_ident())])
+
+    def test_nothing_to_do(self):
+        parts = []
+        self.world().share(lambda part: parts.append(len(part)), np.arange(0))
+        self.assertEqual(sum(parts), 0)
+
+    def test_the_other_parts_are_finished_before_it_raises(self):
+        world, done, go = self.world(), [], threading.Event()
+
+        def work(part):
+            if part[0] == 0:
+                raise KeyError('first')
+            go.wait(0.05)
+            done.extend(part.tolist())
+
+        with self.assertRaisesRegex(KeyError, 'first'):
+            world.share(work, world.all_ids)
+        self.assertLen(done, 40 - min(done))
+        self.assertEqual(sorted(done), list(range(min(done), 40)))
+        done.clear()
+        world.share(lambda part: done.extend(part.tolist()), world.all_ids)  # it can go on
+        self.assertCountEqual(done, range(40))
+
+    def test_close(self):
+        world = self.world()
+        before = threading.active_count()
+        world.share(lambda part: None, world.all_ids)
+        self.assertGreater(threading.active_count(), before)
+        for _ in range(2):
+            world.close()
+        self.assertEqual(threading.active_count(), before)
+
+    def test_steps_do_not_depend_on_threads(self):
+        found = []
+        for num_threads in (1, 2, 3):
+            world = self.world(num_threads)
+            world.forward(world.all_ids)
+            for ctrl in controls(20, 40):
+                world.ctrl[:] = ctrl
+                world.share(lambda part, world=world: world.step(SUBSTEPS, part), world.all_ids)
+            found.append(world.qpos.copy())
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[0], found[2])
+
+
+if __name__ == '__main__':
+    absltest.main()

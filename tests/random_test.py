@@ -1,0 +1,116 @@
+"""Random numbers in compiled functions are those of NumPy."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+from absl.testing import absltest, parameterized
+
+from trl_suite.util import random
+from trl_suite.util.compiled import compiled
+
+COUNT = 20_000  # a normal number is in the tail of the ziggurat once in 3700
+
+
+@compiled
+def fill_random(i, state, out):
+    for k in range(len(out)):
+        out[k] = random.random(i, state)
+
+
+@compiled
+def fill_uniform(i, low, high, state, out):
+    for k in range(len(out)):
+        out[k] = random.uniform(i, low, high, state)
+
+
+@compiled
+def fill_normal(i, state, out):
+    for k in range(len(out)):
+        out[k] = random.standard_normal(i, state)
+
+
+def seeded(*seeds):
+    streams = random.Streams(len(seeds))
+    for i, seed in enumerate(seeds):
+        streams.seed(i, np.random.SeedSequence(seed))
+    return streams
+
+
+class StreamsTest(parameterized.TestCase):
+    """Streams against `numpy.random.Generator`."""
+
+    @parameterized.parameters(0, 7, 2**63, [[1, 2, 3]])
+    def test_numbers_are_those_of_numpy(self, seed):
+        streams, expected = seeded(1, seed), np.random.default_rng(seed)
+        found = np.empty(COUNT)
+        fill_random(1, streams.state, found)
+        np.testing.assert_array_equal(found, expected.random(COUNT))
+        fill_uniform(1, -0.3, 1e3, streams.state, found)
+        np.testing.assert_array_equal(found, expected.uniform(-0.3, 1e3, COUNT))
+        fill_normal(1, streams.state, found)
+        np.testing.assert_array_equal(found, expected.standard_normal(COUNT))
+        fill_random(1, streams.state, found[:9])  # as many bits were drawn
+        np.testing.assert_array_equal(found[:9], expected.random(9))
+
+    def test_normal_numbers_of_the_tail(self):
+        streams, expected = seeded(5), np.random.default_rng(5)
+        found = np.empty(200_000)
+        fill_normal(0, streams.state, found)
+        np.testing.assert_array_equal(found, expected.standard_normal(len(found)))
+        self.assertGreater(found.max(), 3.66)
+        self.assertLess(found.min(), -3.66)
+
+    def test_streams_do_not_touch_each_other(self):
+        streams = seeded(3, 4, 3)
+        before = streams.state.copy()
+        fill_random(1, streams.state, np.empty(5))
+        np.testing.assert_array_equal(streams.state[[0, 2]], before[[0, 2]])
+        self.assertTrue((streams.state[1] != before[1]).any())
+
+    def test_python_and_compiled_functions_by_turns(self):
+        streams, expected = seeded(11), np.random.default_rng(11)
+        found = np.empty(7)
+        for _ in range(3):
+            fill_normal(0, streams.state, found)
+            np.testing.assert_array_equal(found, expected.standard_normal(7))
+            with streams.generator(0) as generator:
+                # 32 bits of a word remain in the buffer.
+                self.assertEqual(generator.integers(5), expected.integers(5))
+                draw = generator.uniform(-np.pi, np.pi), generator.permutation(9).tolist()
+            self.assertEqual(
+                draw, (expected.uniform(-np.pi, np.pi), expected.permutation(9).tolist())
+            )
+            with streams.generator(0) as generator:
+                self.assertEqual(generator.bit_generator.state, expected.bit_generator.state)
+
+    def test_a_stream_goes_on_from_a_copy_of_its_state(self):
+        streams, other = seeded(21), seeded(22)
+        with streams.generator(0) as generator:
+            generator.integers(3)
+        other.state[0] = streams.state[0]
+        numbers = np.empty((2, 50))
+        for each, out in zip((streams, other), numbers, strict=True):
+            fill_normal(0, each.state, out)
+        np.testing.assert_array_equal(numbers[0], numbers[1])
+        with streams.generator(0) as first, other.generator(0) as second:
+            self.assertEqual(first.bit_generator.state, second.bit_generator.state)
+
+    def test_the_same_without_compiling(self):
+        script = (
+            'import numpy as np\n'
+            'from trl_suite.util import random\n'
+            'streams, expected = random.Streams(1), np.random.default_rng(6)\n'
+            'streams.seed(0, np.random.SeedSequence(6))\n'
+            'for _ in range(4000):\n'
+            '    assert random.random(0, streams.state) == expected.random()\n'
+            '    assert random.uniform(0, 2.0, 3.0, streams.state) == expected.uniform(2.0, 3.0)\n'
+            '    assert random.standard_normal(0, streams.state) == expected.standard_normal()\n'
+        )
+        environ = {**os.environ, 'NUMBA_DISABLE_JIT': '1'}
+        subprocess.run([sys.executable, '-c', script], check=True, env=environ)
+
+
+if __name__ == '__main__':
+    absltest.main()
