@@ -72,18 +72,22 @@ class Compiled:
         self.function, self._native = function, native
         self._inline, self._counted = inline, counted
         self._lock = threading.Lock()
-        self._dispatcher: Callable[..., Any] | None = None
+        self._dispatchers: dict[bool, Callable[..., Any]] = {}
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
         """What Numba made of the function; the function itself if compiling is switched off."""
-        if self._dispatcher is None:
-            with self._lock:
-                if self._dispatcher is None:
-                    self._dispatcher = self._compile()
-        return self._dispatcher
+        return self._dispatcher(False)
 
-    def _compile(self) -> Callable[..., Any]:
+    def _dispatcher(self, within: bool) -> Callable[..., Any]:
+        """What Python calls, or what is called within compiled functions."""
+        if within not in self._dispatchers:
+            with self._lock:
+                if within not in self._dispatchers:
+                    self._dispatchers[within] = self._compile(within)
+        return self._dispatchers[within]
+
+    def _compile(self, within: bool) -> Callable[..., Any]:
         numba = _numba()
         if numba.config.DISABLE_JIT:
             return self.function
@@ -91,9 +95,13 @@ class Compiled:
         if self._native is not None:  # a line or two; what calls it is kept on disk
             return numba.njit(self._native(), _nrt=True, **options)
         options['_nrt'] = self._counted
+        # Taking tuples of arrays from Python takes longer to compile than most functions do.
+        options |= {'no_cfunc_wrapper': True, 'no_cpython_wrapper': within}
         folder = cache_folder()
         if folder is None:
             return numba.njit(self.function, **options)
+        if within:  # Numba would take the one for the other
+            folder /= 'within'
         # Numba looks at its setting when a function is decorated; it is the user's otherwise.
         with _setting:
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
@@ -150,7 +158,7 @@ def _numba() -> Any:
 
     @typeof_impl.register(Compiled)
     def type_of(value: Compiled, _: Any) -> Any:
-        return numba.types.Dispatcher(value.dispatcher)
+        return numba.types.Dispatcher(value._dispatcher(within=True))
 
     return numba
 
