@@ -19,7 +19,7 @@ COUNTS = {
     'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 5, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
     'biped2d_simbicon': (33, 28, 5, 7, 8, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
 }  # fmt: skip
-# Of base action 0 and the largest deviation of any other, by name.
+# Of base action 0, and the largest deviation of any base action from the centre, by name.
 FIGURES = {
     'dog': {
         'TransTime': (0.125, 0), 'Cv': (0.014184, 0.034553), 'BackForceX': (378.334188, 432.678275),
@@ -29,21 +29,21 @@ FIGURES = {
         'Gather.Ankle': (0.930373, 1.546647),
     },
     'goat': {
-        'Cv': (0.034247, 0.016135), 'BackForceX': (657.431367, 206.038741),
-        'FrontForceY': (444.031403, 267.186149), 'BackStance.Shoulder': (-3.281075, 2.124269),
-        'Extend.Hip': (2.000835, 1.032987), 'Gather.Ankle': (1.469614, 0.314952),
+        'Cv': (0.034247, 0.016941), 'BackForceX': (657.431367, 354.062),
+        'FrontForceY': (444.031403, 290.285499), 'BackStance.Shoulder': (-3.281075, 2.505011),
+        'Extend.Hip': (2.000835, 0.870675), 'Gather.Ankle': (1.469614, 0.431577),
     },
     'raptor': {
-        'TransTime': (0.0825, 0), 'Cv': (0.163639, 0.090977), 'Cd': (2.014739, 0.066559),
-        'ForceX': (0, 0), 'Contact.RootPitch': (0.20376, 1.009025), 'Contact.SpineCurve': (0, 0),
-        'Contact.StanceHip': (0.823847, 0.412785), 'Down.SwingHip': (1.77748, 2.061252),
-        'Passing.RootPitch': (0, 0), 'Up.SwingAnkle': (0.166636, 0.306875),
+        'TransTime': (0.0825, 0), 'Cv': (0.163639, 0.078682), 'Cd': (2.014739, 0.083013),
+        'ForceX': (0, 0), 'Contact.RootPitch': (0.20376, 1.01999), 'Contact.SpineCurve': (0, 0),
+        'Contact.StanceHip': (0.823847, 0.434167), 'Down.SwingHip': (1.77748, 1.863269),
+        'Passing.RootPitch': (0, 0), 'Up.SwingAnkle': (0.166636, 0.205606),
     },
     'biped2d_simbicon': {
-        'TransTime': (0.0825, 0), 'Cv': (0.251474, 0.06503), 'Cd': (2.099796, 0.13648),
-        'Contact.RootPitch': (-0.097252, 0.228057), 'Contact.StanceKnee': (0.273527, 1.395015),
-        'Down.SwingHip': (1.240827, 0.80722), 'Passing.RootPitch': (-0.170533, 0),
-        'Up.SwingAnkle': (0.634434, 1.221746),
+        'TransTime': (0.0825, 0), 'Cv': (0.251474, 0.057892), 'Cd': (2.099796, 0.197019),
+        'Contact.RootPitch': (-0.097252, 0.234595), 'Contact.StanceKnee': (0.273527, 1.479149),
+        'Down.SwingHip': (1.240827, 0.807482), 'Passing.RootPitch': (-0.170533, 0),
+        'Up.SwingAnkle': (0.634434, 1.673853),
     },
     'hopper': {
         'MagicGain': (0.840456, 0.162049), 'Descent.Hip': (0.069732, 0.013257),
@@ -122,6 +122,15 @@ class ParametersTest(parameterized.TestCase):
         idle = np.delete(np.arange(len(gait.names)), gait.actions)
         np.testing.assert_array_equal(gait.half_range[idle], 0)
 
+    @parameterized.parameters(*NAMES)
+    def test_actions_reach_base_actions(self, name):
+        gait = controllers.load(name)
+        actions = gait.action(gait.base_actions)
+        self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
+        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # none is out of reach
+        found = gait.vector(np.clip(actions, -1, 1))
+        np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
+
     def test_what_action_0_means(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
         np.testing.assert_array_equal(dog.centre, dog.base_actions[0])
@@ -172,7 +181,7 @@ class ParametersTest(parameterized.TestCase):
         self.assertEqual(gait.names, ('Gain', 'Up.Hip', 'Down.Hip'))
         np.testing.assert_array_equal(gait.base_actions, [[1, 2, 3], [1.5, 3, 4.5]])
         np.testing.assert_array_equal(gait.centre, [2, 4, 6])
-        np.testing.assert_array_equal(gait.half_range, [0.5, 1, 1.5])
+        np.testing.assert_array_equal(gait.half_range, [1, 2, 3])
         np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
         for message, change in (
             ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),

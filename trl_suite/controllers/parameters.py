@@ -69,7 +69,8 @@ class Parameters:
       base_actions: (8 or so, P).
       blends: of each base action: a set, another, and the other's share.
       centre: what action 0 means, (P,).
-      half_range: largest deviation of a base action from the first one, (P,); what action 1 adds.
+      half_range: largest deviation of a base action from the centre, (P,); what action 1 adds. So
+        every base action lies in [-1, 1].
       search_scale: standard deviation for a search, (P,).
       start: the pose of the first instant, see the module.
       gravity_compensation: whether legs of a bound on the ground carry the weight.
@@ -163,6 +164,7 @@ def read(data: dict[str, Any]) -> Parameters:
         [(1 - blend) * sets[a] + blend * sets[b] for a, b, blend in data['base_actions']]
     )
     centre = data['centre']
+    centre = sets[centre] if isinstance(centre, str) else base[centre]
     return Parameters(
         character=data['character'],
         kind=data['kind'],
@@ -178,8 +180,8 @@ def read(data: dict[str, Any]) -> Parameters:
         sets=sets,
         base_actions=base,
         blends=tuple((a, b, float(blend)) for a, b, blend in data['base_actions']),
-        centre=sets[centre] if isinstance(centre, str) else base[centre],
-        half_range=np.abs(base - base[0]).max(0),
+        centre=centre,
+        half_range=np.abs(base - centre).max(0),
         search_scale=np.array([data['search_scale'][name.split('.')[-1]] for name in names]),
         start=data['start'],
         gravity_compensation=data.get('gravity_compensation', True),
