@@ -43,6 +43,7 @@ GRAVITY = 9.81
 ON_TERRAIN = 3.0  # m; where episodes over terrain begin, beyond the flat start
 REACH = 0.6  # m to both sides of the root that must be clear of the ground there
 RESAMPLES = 1000  # of the bootstrap
+ONE = np.zeros(1, int)  # the simulation of a single environment
 
 # What is compared: id for each character, actuation model and clip of the catalogue on flat
 # ground, and the hardest ground for each character that walks over terrain.
@@ -133,23 +134,23 @@ class Subject:
             self.data.qpos[moved] += random.normal(0, noise, len(moved))
             mujoco.mj_forward(self.model, self.data)
         if self.on_terrain:
-            ground = self.task.figure.ground
-            before = ground(0, np.zeros(1)).max()
+            heights = self.task.figure.ground_heights
+            before = heights(0, np.zeros(1)).max()
             x, z = self.root_qpos
             self.data.qpos[x] = ON_TERRAIN
             self.task.arena.follow(np.full((1, 1), ON_TERRAIN))
             around = ON_TERRAIN + np.linspace(-REACH, REACH, 49)
-            self.data.qpos[z] += ground(0, around).max() - before
+            self.data.qpos[z] += heights(0, around).max() - before
             mujoco.mj_forward(self.model, self.data)
 
     def step(self, action):
         """As the environment does it, timed."""
         begin = time.process_time()
-        self.task.act(action[None])
+        self.task.apply_action(action[None], ONE)
         middle = time.process_time()
-        self.task.simulate()
+        self.task.simulate(ONE)
         end = time.process_time()
-        self.task.finish_step()
+        self.task.finish_step(ONE)
         self.cpu += end - middle
         self.cpu_all += time.process_time() - begin
         self.timed += 1
@@ -157,13 +158,13 @@ class Subject:
     def watched_step(self, action):
         """Looks at every substep; returns vertical contact forces / weight and depths (m)."""
         forces, depths = np.empty(self.substeps), np.empty(self.substeps)
-        self.task.act(action[None])
+        self.task.apply_action(action[None], ONE)
         for i in range(self.substeps):
             self.task.world.step(1)
             # Of all constraints only contacts act along the root's vertical slide.
             forces[i] = self.data.qfrc_constraint[self.z_dof]
             depths[i] = self.depth()
-        self.task.finish_step()
+        self.task.finish_step(ONE)
         return forces / self.weight, depths
 
     def depth(self):

@@ -32,7 +32,7 @@ import numpy as np
 
 from trl_suite import errors
 from trl_suite.catalogue import Row
-from trl_suite.controllers import CONTROL_TIMESTEP, GAITS, Parameters, load, parameters
+from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
 from trl_suite.tasks.gait import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
 from trl_suite.vector import VectorEnvironment
 
@@ -107,11 +107,11 @@ class Bench:
         self.environments = VectorEnvironment(row, rows, threads, seed=0)
         task = self.environments.task
         assert isinstance(task, GaitTask)
-        self.task, gait = task, task.gait
+        self.task, self.gait = task, task.gait.parameters
+        self.centre, self.half_range = centre, REACH * self.gait.search_scale
         # So that actions in [-1, 1] reach every candidate.
-        gait.parameters = dataclasses.replace(
-            gait.parameters, centre=centre, half_range=REACH * gait.parameters.search_scale
-        )
+        task.rules.options.centre[:] = centre
+        task.rules.options.half_range[:] = self.half_range[self.gait.actions]
         self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
 
     def run(
@@ -131,19 +131,19 @@ class Bench:
             world.set_const(row)
         self.frictions = np.array(friction, float)
         self.environments.reset(seed=[int(seed) for seed in seeds])
-        task.act(np.array([task.gait.parameters.action(vector) for vector in vectors]))
-        everyone = np.arange(count)
-        start = task.gait.dynamics.com(everyone)[:, 0]
+        places = self.gait.actions
+        actions = (vectors - self.centre)[:, places] / self.half_range[places]
+        root = task.figure.links[0]
+        start = world.subtree_com[:, root, 0].copy()
         elapsed, distance = np.zeros((2, count))
         cycles, going = np.zeros(count, int), np.ones(count, bool)
         upright = np.ones(count, bool)
         while going.any():
             rows = np.flatnonzero(going)
-            task.simulate(rows)
-            task.finish_step(going)
-            duration, failed = task.infos()['duration'][rows], task.failed[rows]
+            task.step(actions, rows)
+            duration, failed = task.state.duration[rows], task.failed[rows]
             elapsed[rows] += duration
-            now = np.nan_to_num(task.gait.dynamics.com(rows)[:, 0] - start[rows])
+            now = np.nan_to_num(world.subtree_com[rows, root, 0] - start[rows])
             whole = (duration > CYCLE) & (duration < LONGEST_CYCLE * FRAME - CONTROL_TIMESTEP)
             cycles[rows] += whole & ~failed & (now > distance[rows])
             distance[rows] = now
@@ -194,7 +194,7 @@ def record(runs: Runs, target: float) -> dict[str, Any]:
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    choices = itertools.product(arguments.characters or GAITS, arguments.terrain)
+    choices = itertools.product(arguments.characters or available(), arguments.terrain)
     for character, terrain in choices:
         gait, options = load(character), (terrain, arguments.substeps, arguments.threads)
         vector = vector_of(gait, arguments.start)
@@ -324,7 +324,7 @@ def write(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Pa
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('characters', nargs='*', metavar='character', help=', '.join(GAITS))
+    parser.add_argument('characters', nargs='*', metavar='character', help=', '.join(available()))
     parser.add_argument('--evaluate', action='store_true', help='measure; search and write nothing')
     parser.add_argument('--start', help='a set by name, or a base action by number; else action 0')
     parser.add_argument('--friction', type=float, nargs='+', help='of ground and character')
@@ -347,7 +347,7 @@ def main() -> None:
     )  # fmt: skip
     arguments = parser.parse_args()
     try:
-        for character in arguments.characters or GAITS:
+        for character in arguments.characters or available():
             vector_of(load(character), arguments.start)
     except ValueError as error:
         parser.error(str(error))

@@ -507,20 +507,15 @@ class RolloutTest(CommandTest):
         self.assert_only()
 
     def test_how_an_episode_of_a_gait_ends(self):
-        finish_step = GaitTask.finish_step
-
-        def fail(task, *args):
-            finish_step(task, *args)
-            task.failed[...] = True
-
         for end in ('fell', 'stuck'):
-            info = {'fell': end == 'fell', 'stuck': end == 'stuck', 'diverged': False}
-            with (
-                mock.patch.object(GaitTask, 'info_of', lambda task, env_id, info=info: info),
-                mock.patch.object(GaitTask, 'finish_step', fail),
-            ):
+
+            def fail(task, env_ids, finish=GaitTask.finish_step, end=end):
+                finish(task, env_ids)
+                task.outcome.failed[:] = getattr(task.state, end)[:] = True
+
+            with mock.patch.object(GaitTask, 'finish_step', fail):
                 out = self.output('rollout', 'terrainrl/hopper_steps', '--steps', '1')
-            self.assertRegex(out, rf'\n +1 +1 +\S+ +0.00  {end}\n')
+            self.assertRegex(out, rf'\n +1 +1 +\S+ +\S+  {end}\n')
 
     def test_a_gif_from_another_camera(self):
         self.output('rollout', GAPS, '--steps', '2', '--video', 'a.gif', '--camera', 'front', *SIZE)

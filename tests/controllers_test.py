@@ -8,7 +8,7 @@ from dm_control.locomotion.arenas import floors
 
 from trl_suite import actuation, characters, controllers, terrain
 from trl_suite.arenas import PlanarTerrain
-from trl_suite.controllers import dynamics, parameters
+from trl_suite.controllers import dynamics, machine, parameters
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
 DT = 1 / 600
@@ -19,7 +19,7 @@ COUNTS = {
     'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 5, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
     'biped2d_simbicon': (33, 28, 5, 7, 8, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
 }  # fmt: skip
-# Of base action 0 and the largest deviation of any other, by name.
+# Of base action 0, and the largest deviation of any base action from the centre, by name.
 FIGURES = {
     'dog': {
         'TransTime': (0.125, 0), 'Cv': (0.014184, 0.034553), 'BackForceX': (378.334188, 432.678275),
@@ -29,21 +29,21 @@ FIGURES = {
         'Gather.Ankle': (0.930373, 1.546647),
     },
     'goat': {
-        'Cv': (0.034247, 0.016135), 'BackForceX': (657.431367, 206.038741),
-        'FrontForceY': (444.031403, 267.186149), 'BackStance.Shoulder': (-3.281075, 2.124269),
-        'Extend.Hip': (2.000835, 1.032987), 'Gather.Ankle': (1.469614, 0.314952),
+        'Cv': (0.034247, 0.016941), 'BackForceX': (657.431367, 354.062),
+        'FrontForceY': (444.031403, 290.285499), 'BackStance.Shoulder': (-3.281075, 2.505011),
+        'Extend.Hip': (2.000835, 0.870675), 'Gather.Ankle': (1.469614, 0.431577),
     },
     'raptor': {
-        'TransTime': (0.0825, 0), 'Cv': (0.163639, 0.090977), 'Cd': (2.014739, 0.066559),
-        'ForceX': (0, 0), 'Contact.RootPitch': (0.20376, 1.009025), 'Contact.SpineCurve': (0, 0),
-        'Contact.StanceHip': (0.823847, 0.412785), 'Down.SwingHip': (1.77748, 2.061252),
-        'Passing.RootPitch': (0, 0), 'Up.SwingAnkle': (0.166636, 0.306875),
+        'TransTime': (0.0825, 0), 'Cv': (0.163639, 0.078682), 'Cd': (2.014739, 0.083013),
+        'ForceX': (0, 0), 'Contact.RootPitch': (0.20376, 1.01999), 'Contact.SpineCurve': (0, 0),
+        'Contact.StanceHip': (0.823847, 0.434167), 'Down.SwingHip': (1.77748, 1.863269),
+        'Passing.RootPitch': (0, 0), 'Up.SwingAnkle': (0.166636, 0.205606),
     },
     'biped2d_simbicon': {
-        'TransTime': (0.0825, 0), 'Cv': (0.251474, 0.06503), 'Cd': (2.099796, 0.13648),
-        'Contact.RootPitch': (-0.097252, 0.228057), 'Contact.StanceKnee': (0.273527, 1.395015),
-        'Down.SwingHip': (1.240827, 0.80722), 'Passing.RootPitch': (-0.170533, 0),
-        'Up.SwingAnkle': (0.634434, 1.221746),
+        'TransTime': (0.0825, 0), 'Cv': (0.251474, 0.057892), 'Cd': (2.099796, 0.197019),
+        'Contact.RootPitch': (-0.097252, 0.234595), 'Contact.StanceKnee': (0.273527, 1.479149),
+        'Down.SwingHip': (1.240827, 0.807482), 'Passing.RootPitch': (-0.170533, 0),
+        'Up.SwingAnkle': (0.634434, 1.673853),
     },
     'hopper': {
         'MagicGain': (0.840456, 0.162049), 'Descent.Hip': (0.069732, 0.013257),
@@ -85,8 +85,7 @@ class ParametersTest(parameterized.TestCase):
     """Vectors, base actions, and what an action means."""
 
     def test_who_has_a_gait(self):
-        self.assertCountEqual(parameters.available(), NAMES)
-        self.assertCountEqual(controllers.GAITS, NAMES)
+        self.assertCountEqual(controllers.available(), NAMES)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
             controllers.load('dgo')
 
@@ -122,6 +121,15 @@ class ParametersTest(parameterized.TestCase):
         self.assertTrue((gait.half_range[gait.actions] > 0).all())
         idle = np.delete(np.arange(len(gait.names)), gait.actions)
         np.testing.assert_array_equal(gait.half_range[idle], 0)
+
+    @parameterized.parameters(*NAMES)
+    def test_actions_reach_base_actions(self, name):
+        gait = controllers.load(name)
+        actions = gait.action(gait.base_actions)
+        self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
+        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # none is out of reach
+        found = gait.vector(np.clip(actions, -1, 1))
+        np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
     def test_what_action_0_means(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
@@ -163,7 +171,8 @@ class ParametersTest(parameterized.TestCase):
 
     def test_files_that_are_wrong(self):
         good = {
-            'character': 'hopper', 'misc': ['Gain'], 'states': ['Up', 'Down'],
+            'character': 'hopper', 'kind': 'hop', 'legs': [['hip', 'leg']], 'feet': ['leg'],
+            'targets': {'Hip': ['hip']}, 'misc': ['Gain'], 'states': ['Up', 'Down'],
             'state_parameters': ['Hip'], 'fixed': ['Gain'], 'absolute': [], 'target_speed': 1.0,
             'sets': {'a': [1, 2, 3], 'b': [2, 4, 6]}, 'base_actions': [['a', 'b', 0], ['a', 'b', 0.5]],
             'centre': 'b', 'search_scale': {'Gain': 1, 'Hip': 2}, 'start': {},
@@ -172,13 +181,17 @@ class ParametersTest(parameterized.TestCase):
         self.assertEqual(gait.names, ('Gain', 'Up.Hip', 'Down.Hip'))
         np.testing.assert_array_equal(gait.base_actions, [[1, 2, 3], [1.5, 3, 4.5]])
         np.testing.assert_array_equal(gait.centre, [2, 4, 6])
-        np.testing.assert_array_equal(gait.half_range, [0.5, 1, 1.5])
+        np.testing.assert_array_equal(gait.half_range, [1, 2, 3])
         np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
         for message, change in (
             ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),
             ("set 'a' needs 3", {'sets': {'a': [1, 2, float('nan')]}}),
             ("unknown parameter 'Up.Hp'.*'Up.Hip'", {'fixed': ['Up.Hp']}),
             ("unknown parameter 'gain'.*'Gain'", {'absolute': ['gain']}),
+            ("unknown kind of gait 'hopp'.*'hop'", {'kind': 'hopp'}),
+            ("unknown parameter of a state 'Hp'.*'Hip'", {'targets': {'Hp': ['hip']}}),
+            ('as many joints', {'legs': [['hip'], ['hip', 'leg']], 'feet': ['leg', 'leg']}),
+            ('a foot each', {'feet': []}),
         ):
             with self.assertRaisesRegex(ValueError, message):
                 parameters.read({**good, **change})
@@ -191,7 +204,7 @@ class Rig:
         arena = PlanarTerrain(terrain.load('flat'))
         self.character = characters.make(name)
         self.character.create_root_joints(arena.attach(self.character))
-        self.gait = controllers.make(self.character, arena.ground_body, arena.mjcf_model)
+        self.gait = controllers.Gait(self.character, arena.ground_body, arena.mjcf_model)
         actuation.add(self.character, 'torque', DT / 2)
         for joint in self.character.joints:
             joint.damping = joint.armature = 0
@@ -207,10 +220,18 @@ class Rig:
         self.rows = np.arange(self.world.n)
         for row in self.rows:
             arena.begin_episode(row, terrain.Strip(arena.terrain, 0))
-        self.dynamics, self.name = self.gait.dynamics, name
+        self.rules, self.name = self.gait.rules, name
         self.joints = list(self.character.row.joints)
         self.touches(())
         self.gait.begin(self.rows)
+
+    @property
+    def positions(self):
+        return self.world.qpos[:, self.rules.skeleton.qpos]
+
+    @property
+    def velocities(self):
+        return self.world.qvel[:, self.rules.skeleton.dof]
 
     def scatter(self, seed=0, speed=5.0):
         """Random poses in the air, at random speeds."""
@@ -225,14 +246,19 @@ class Rig:
         return rng
 
     def put(self, q, v):
-        self.world.qpos[self.rows[:, None], self.dynamics.qpos] = q
-        self.world.qvel[self.rows[:, None], self.dynamics.dofs] = v
+        self.world.qpos[self.rows[:, None], self.rules.skeleton.qpos] = q
+        self.world.qvel[self.rows[:, None], self.rules.skeleton.dof] = v
         self.world.forward(self.rows)
 
     def touches(self, links):
-        """Makes the gait believe in contacts: names of links, the same in every row."""
-        on = np.isin(self.character.row.links, links)
-        self.gait.touching = lambda rows: np.tile(on, (len(rows), 1))
+        """Makes the gait believe in contacts until the next step: names of links, or (n, L) bool."""
+        on = np.isin(self.character.row.links, links) if isinstance(links, tuple) else links
+        first, sensed = self.rules.machine.contact, self.world.sensordata
+        if isinstance(self.world, BatchWorld):
+            sensed = sensed.base
+        else:
+            sensed = self.physics.data.sensordata[None]
+        sensed[:, first : first + len(self.character.row.links)] = on
 
     def data(self, row=0):
         """The engine's own view of one row, and the columns of its degrees of freedom."""
@@ -248,7 +274,13 @@ class Rig:
         """Parameters by name ('Down.Hip' as Down__Hip) for all rows."""
         for name, value in values.items():
             place = self.gait.parameters.place(name.replace('__', '.'))
-            self.gait.vectors[:, place] = value
+            self.gait.state.vector[:, place] = value
+
+
+def enter(rig):
+    """Has all machines enter the states that they are in."""
+    for row in rig.rows:
+        machine.enter(row, rig.rules)
 
 
 def inertia(model, data, columns):
@@ -294,9 +326,9 @@ def dense_pd(rig, row, off=(), wanted=None):
     full_kd = np.array([0, 0, 0, *(joint.kd for joint in links)])  # stays in the matrix
     q, v = data.qpos[columns], data.qvel[columns]
     target = np.zeros(len(q))
-    target[3:] = rig.gait.targets[row] if wanted is None else wanted
-    for name in rig.gait.world_joints:
-        dof = 3 + rig.joints.index(name)
+    target[3:] = rig.gait.state.target[row] if wanted is None else wanted
+    for hip in rig.rules.machine.legs[:, 0]:
+        dof, name = 3 + hip, rig.joints[hip]
         angle = world_angle(data, model.body(f'{rig.name}/{name}').id)
         target[dof] -= angle - q[dof]
     pull = kp * (target - q - DT * v) - kd * v
@@ -307,72 +339,98 @@ def dense_pd(rig, row, off=(), wanted=None):
 
 
 class DynamicsTest(parameterized.TestCase):
-    """Arrays against the engine's own functions."""
+    """Compiled functions against the engine's own."""
 
     @parameterized.product(name=NAMES, batch=(False, True))
     def test_equations_of_motion(self, name, batch):
         rig = Rig(name, 3 if batch else 1, batch)
         rig.scatter(1)
-        found = rig.dynamics
-        matrices, forces = found.inertia(rig.rows), found.bias(rig.rows)
-        np.testing.assert_array_equal(found.positions(rig.rows), rig.world.qpos[:, found.qpos])
+        skeleton, mechanics = rig.rules.skeleton, rig.rules.mechanics
+        size = len(skeleton.dof)
+        matrices = np.zeros((len(rig.rows), size, size))
         for row in rig.rows:
+            dynamics.write_inertia(row, skeleton, mechanics.M, matrices)
             model, data, columns = rig.data(row)
             np.testing.assert_allclose(matrices[row], inertia(model, data, columns), atol=1e-10)
-            np.testing.assert_allclose(forces[row], bias(model, data, columns), atol=1e-9)
-            np.testing.assert_array_equal(found.velocities(rig.rows)[row], data.qvel[columns])
+            forces = mechanics.qfrc_bias[row, skeleton.dof]
+            np.testing.assert_allclose(forces, bias(model, data, columns), atol=1e-9)
+            np.testing.assert_array_equal(rig.velocities[row], data.qvel[columns])
             np.linalg.cholesky(matrices[row])
         mass = sum(model.body(f'{name}/{link}').mass[0] for link in rig.character.row.links)
-        self.assertAlmostEqual(found.mass, mass)
+        self.assertAlmostEqual(skeleton.mass, mass)
         self.assertAlmostEqual(matrices[0, 0, 0], mass, places=9)
 
     @parameterized.product(name=NAMES[:4], batch=(False, True))
     def test_kinematics(self, name, batch):
         rig = Rig(name, 3 if batch else 1, batch)
         rng = rig.scatter(2)
-        found, joints = rig.dynamics, np.arange(len(rig.joints))
-        q, v = found.positions(rig.rows), found.velocities(rig.rows)
-        coefficients, constants = found.frame(joints)
-        angles = q @ coefficients + constants + q[:, 3:]
-        speed = found.com_speed(rig.rows, v)
+        skeleton, mechanics, joints = rig.rules.skeleton, rig.rules.mechanics, len(rig.joints)
+        coefficients, constants = dynamics.frame(np.arange(joints), skeleton, rig.world)
+        angles = rig.positions @ coefficients.T + constants + rig.positions[:, 3:]
         for row in rig.rows:
-            model, data, _ = rig.data(row)
+            model, data, columns = rig.data(row)
             root = model.body(f'{name}/root').id
-            np.testing.assert_allclose(found.com(rig.rows)[row], data.subtree_com[root], atol=1e-12)
             mujoco.mj_subtreeVel(model, data)
-            self.assertAlmostEqual(speed[row], data.subtree_linvel[root, 0], places=9)
+            speed = dynamics.com_speed(row, skeleton, mechanics.M, rig.world.qvel)
+            self.assertAlmostEqual(speed, data.subtree_linvel[root, 0], places=9)
             for joint, link in enumerate(rig.joints):
                 angle = world_angle(data, model.body(f'{name}/{link}').id)
                 self.assertAlmostEqual(np.cos(angles[row, joint] - angle), 1.0, places=9, msg=link)
                 self.assertLess(abs(np.sin(angles[row, joint] - angle)), 1e-9)
-        for link in rng.choice(rig.character.row.links, 6, replace=False):
-            body = model.body(f'{name}/{link}').id
-            points = rig.world.xipos[rig.rows][:, body] + rng.uniform(-0.2, 0.2, (len(rig.rows), 3))
-            matrices = found.jacobian(rig.rows, body, points)
-            for row in rig.rows:
-                expected = jacobian(*rig.data(row), body, points[row])
-                np.testing.assert_allclose(matrices[row], expected, atol=1e-10, err_msg=link)
+            for leg, hip in enumerate(rig.rules.machine.legs[:, 0]):
+                found = machine.hip_angle(
+                    row, leg, rig.rules.machine, skeleton, rig.world.qpos
+                )  # fmt: skip
+                own = rig.positions[row, 3 + hip]
+                self.assertAlmostEqual(found + own, angles[row, hip], places=12)
+            for link in rng.choice(rig.character.row.links, 6, replace=False):
+                body, found = model.body(f'{name}/{link}').id, np.ones((row + 1, 5, 3 + joints))
+                point = data.xipos[body] + rng.uniform(-0.2, 0.2, 3)
+                dynamics.write_jacobian(
+                    row, body, point[0], point[2], 2, skeleton, mechanics.xanchor, found
+                )
+                expected = jacobian(model, data, columns, body, point)
+                np.testing.assert_allclose(found[row, 2:4], expected, atol=1e-10, err_msg=link)
+                np.testing.assert_array_equal(found[row, [0, 1, 4]], 1.0)
 
     @parameterized.parameters(*NAMES)
     def test_gravity(self, name):
         rig = Rig(name, 2, batch=True)
         rig.scatter(3, speed=0.0)
-        found = rig.dynamics.gravity(rig.rows)
-        hinges = rig.dynamics.hinges | (np.arange(rig.dynamics.size) < 3)  # slides of joints: no
-        self.assertEqual(int((~hinges).sum()), int(name == 'hopper'))
+        skeleton, world = rig.rules.skeleton, rig.world
+        kinds = world.models[0].jnt_type[skeleton.joint]
+        slides = (kinds != mujoco.mjtJoint.mjJNT_HINGE) & (np.arange(len(kinds)) >= 3)
+        self.assertEqual(int(slides.sum()), int(name == 'hopper'))
         for row in rig.rows:
             _, data, columns = rig.data(row)
-            weight = -data.qfrc_bias[columns]  # at rest
-            np.testing.assert_allclose(found[row, hinges], weight[hinges], atol=1e-9)
+            at_rest = -data.qfrc_bias[columns]
+            for k in np.flatnonzero(~slides).tolist():  # of slides of joints: no
+                found = dynamics.weight(row, k, skeleton, world.subtree_com, world.xanchor)
+                self.assertAlmostEqual(found, at_rest[k], delta=1e-9)
+
+    def test_solve(self):
+        """Within rounding of LAPACK, pivots included."""
+        rng = np.random.default_rng(0)
+        for n in (1, 4, 23):
+            matrix, vector = rng.normal(size=(3, n + 1, n + 1)), rng.normal(size=(3, n + 1))
+            a, b = matrix[1, :n, :n].copy(), vector[1, :n].copy()
+            a[0, 0] = 0.0 if n > 1 else 2.0
+            matrix[1, :n, :n] = a
+            others = matrix[[0, 2]].copy()
+            dynamics.solve(1, n, matrix, vector)
+            expected = np.linalg.solve(a, b)
+            bound = 1e-15 * np.linalg.cond(a) * np.abs(expected).max()
+            np.testing.assert_allclose(vector[1, :n], expected, rtol=0, atol=bound)
+            np.testing.assert_array_equal(matrix[[0, 2]], others)
 
     @parameterized.parameters(*NAMES)
     def test_rows_do_not_depend_on_each_other(self, name):
         rig = Rig(name, 5, batch=True)
         rig.scatter(4)
-        gait, feet = rig.gait, list(rig.gait.feet) or rig.character.row.end_effectors
+        gait, feet = rig.gait, rig.gait.parameters.feet
         rig.touches(feet)
-        gait.state[:] = rig.rows % 4
-        gait.enter(rig.rows)
+        gait.state.number[:] = rig.rows % 4
+        enter(rig)
         together = gait.torques(rig.rows)
         for rows in ([0], [1, 3], [2], [4]):
             np.testing.assert_array_equal(gait.torques(np.array(rows)), together[rows])
@@ -386,26 +444,26 @@ class LawTest(parameterized.TestCase):
         rig = Rig(name, 3 if batch else 1, batch)
         rng = rig.scatter(5)
         gait = rig.gait
-        gait.targets[...] = rng.uniform(-4, 4, gait.targets.shape)
-        q, v = rig.dynamics.positions(rig.rows), rig.dynamics.velocities(rig.rows)
-        found = gait.stable_pd(rig.rows, q, v)
-        free = rig.joints[-1]
-        off = np.tile(np.array(rig.joints) == free, (len(q), 1))
-        freed = gait.stable_pd(rig.rows, q, v, off)
+        targets, torque = gait.state.target, rig.rules.scratch.torque
+        targets[...] = rng.uniform(-4, 4, targets.shape)
+        count = len(rig.joints)
         for row in rig.rows:
-            np.testing.assert_allclose(found[row], dense_pd(rig, row), rtol=1e-8, atol=1e-7)
-            expected = dense_pd(rig, row, off=(free,))
-            np.testing.assert_allclose(freed[row], expected, rtol=1e-8, atol=1e-7)
-            self.assertEqual(freed[row, -1], 0.0)
+            machine.stable_pd(row, count, rig.rules)
+            np.testing.assert_allclose(torque[row], dense_pd(rig, row), rtol=1e-8, atol=1e-7)
+            machine.stable_pd(row, count - 1, rig.rules)
+            expected = dense_pd(rig, row, off=(rig.joints[-1],))
+            np.testing.assert_allclose(torque[row], expected, rtol=1e-8, atol=1e-7)
+            self.assertEqual(torque[row, -1], 0.0)
 
     def test_world_angles_are_wrapped(self):
         rig = Rig('raptor')
-        q = np.zeros((1, rig.dynamics.size))
+        q = np.zeros((1, len(rig.rules.skeleton.dof)))
         q[0, 1:3] = 3.0, 3.0
         q[0, 3 + rig.joints.index('right_hip')] = 0.5  # 3.5 rad to the world: -2.78
         rig.put(q, np.zeros_like(q))
-        rig.gait.targets[:] = 0.0
-        found = rig.gait.local_targets(rig.rows, q)
+        rig.gait.state.target[:] = 0.0
+        found = np.ones((1, len(rig.joints)))
+        machine.write_local_targets(0, rig.rules, found)
         hip = rig.joints.index('right_hip')
         model, data, _ = rig.data()
         angle = world_angle(data, model.body('raptor/right_hip').id)
@@ -420,12 +478,12 @@ class LawTest(parameterized.TestCase):
         vector = np.random.default_rng(0).uniform(-2, 2, len(figures.names))
         gait.apply(rig.rows, vector[None])
         vector = np.where(np.isin(figures.names, ABSOLUTE[name]), np.abs(vector), vector)
-        np.testing.assert_array_equal(gait.vectors[0], vector)
+        np.testing.assert_array_equal(gait.state.vector[0], vector)
         value = lambda parameter: vector[figures.names.index(parameter)]  # noqa: E731
         files = {joint: each.target for joint, each in rig.character.row.joints.items()}
         for number, state in enumerate(figures.states):
-            gait.state[:] = number
-            gait.enter(rig.rows)
+            gait.state.number[:] = number
+            enter(rig)
             expected = dict(files)
             if name in ('dog', 'goat'):
                 for joint in ('shoulder', 'elbow', 'hip', 'knee', 'ankle'):
@@ -438,18 +496,18 @@ class LawTest(parameterized.TestCase):
                     expected[f'left_{joint}'] = value(f'{state}.Swing{joint.title()}')
             else:
                 expected = {'hip': value(f'{state}.Hip'), 'leg': value(f'{state}.Knee')}
-            found = dict(zip(rig.joints, gait.targets[0], strict=True))
+            found = dict(zip(rig.joints, gait.state.target[0], strict=True))
             self.assertEqual(found, expected)
 
     def test_targets_of_joints_that_no_state_moves(self):
         dog, raptor = Rig('dog'), Rig('raptor')
-        found = dict(zip(dog.joints, dog.gait.targets[0], strict=True))
+        found = dict(zip(dog.joints, dog.gait.state.target[0], strict=True))
         for joint, angle in (
             ('neck0', 0.68507), ('head', 0.20456), ('tail0', 0.4), ('wrist', 0.11488),
             ('finger', -0.46365), ('toe', -0.62549),
         ):  # fmt: skip
             self.assertEqual(found[joint], angle)
-        found = dict(zip(raptor.joints, raptor.gait.targets[0], strict=True))
+        found = dict(zip(raptor.joints, raptor.gait.state.target[0], strict=True))
         for joint, angle in (('spine0', 0.16682), ('tail4', 0.24638), ('right_toe', -0.3883)):
             self.assertEqual(found[joint], angle)
 
@@ -461,11 +519,11 @@ class LawTest(parameterized.TestCase):
         gait, foot = rig.gait, {'raptor': 'toe'}.get(name, 'ankle')
         right, left = 'right', 'left'
         stance_leg, swing_leg = (left, right) if stance else (right, left)
-        gait.stance[:], gait.state[:] = stance, state
+        gait.state.stance[:], gait.state.number[:] = stance, state
         name_of = STATES[name][state]
         rig.set(Cv=0.3, Cd=1.7)
         rig.set(**{f'{name_of}__RootPitch': 0.4, f'{name_of}__SwingHip': 0.6})
-        gait.enter(rig.rows)
+        enter(rig)
         rig.touches((f'{stance_leg}_{foot}',) if loaded else (f'{swing_leg}_{foot}', 'root'))
         found = gait.torques(rig.rows)[0]
 
@@ -477,7 +535,7 @@ class LawTest(parameterized.TestCase):
         else:
             target = 0.6 + 1.7 * (data.subtree_com[root, 0] - data.xipos[box, 0])
         swing, hip = rig.joints.index(f'{swing_leg}_hip'), rig.joints.index(f'{stance_leg}_hip')
-        self.assertAlmostEqual(gait.targets[0, swing], target, places=9)
+        self.assertAlmostEqual(gait.state.target[0, swing], target, places=9)
         acts = loaded and state < 2
         expected = dense_pd(rig, 0, off=(f'{stance_leg}_hip',) if acts else ())
         if acts:
@@ -497,8 +555,8 @@ class LawTest(parameterized.TestCase):
         forces = {'toe': (31.0, 17.0), 'finger': (-12.0, 23.0)}
         rig.set(Cv=0.2, BackForceX=31.0, BackForceY=17.0, FrontForceX=-12.0, FrontForceY=23.0)
         rig.set(**{f'{figures}__Hip': 0.3, f'{figures}__Shoulder': -0.4})
-        gait.state[:] = state
-        gait.enter(rig.rows)
+        gait.state.number[:] = state
+        enter(rig)
         rig.touches(('knee', *feet))
         found = gait.torques(rig.rows)[0]
 
@@ -507,7 +565,7 @@ class LawTest(parameterized.TestCase):
         speed = data.subtree_linvel[model.body(f'{name}/root').id, 0]
         for joint, foot, angle in (('hip', 'toe', 0.3), ('shoulder', 'finger', -0.4)):
             expected = angle + (0.0 if foot in feet else 0.2 * speed)
-            target = gait.targets[0, rig.joints.index(joint)]
+            target = gait.state.target[0, rig.joints.index(joint)]
             self.assertAlmostEqual(target, expected, places=9)
         expected = dense_pd(rig, 0)
         of_feet = {
@@ -545,10 +603,10 @@ class LawTest(parameterized.TestCase):
         rig = Rig('hopper')
         rig.scatter(8, speed=0.5)
         gait = rig.gait
-        gait.vectors[:, 0] = 0.7
-        gait.state[:] = state
-        rig.set(**{f'{STATES["hopper"][state]}__Knee': rig.dynamics.positions(rig.rows)[0, 4]})
-        gait.enter(rig.rows)
+        gait.state.vector[:, 0] = 0.7
+        gait.state.number[:] = state
+        rig.set(**{f'{STATES["hopper"][state]}__Knee': rig.positions[0, 4]})
+        enter(rig)
         rig.touches(('leg',) if landed else ('root', 'hip'))
         found = gait.torques(rig.rows)[0]
         self.assertLess(abs(found[1]), 179.0)  # the leg's limit hides nothing
@@ -569,11 +627,13 @@ class LawTest(parameterized.TestCase):
         rng = rig.scatter(9, speed=30.0)
         gait, limits = rig.gait, rig.character.torque_limits
         spread = np.maximum(5 * np.abs(gait.parameters.half_range), 3.0)
-        gait.apply(rig.rows, gait.parameters.centre + rng.normal(size=gait.vectors.shape) * spread)
-        gait.state[:] = rig.rows % 4
-        gait.enter(rig.rows)
+        gait.apply(
+            rig.rows, gait.parameters.centre + rng.normal(size=gait.state.vector.shape) * spread
+        )
+        gait.state.number[:] = rig.rows % 4
+        enter(rig)
         touching = rng.random((40, len(rig.character.row.links))) < 0.5
-        gait.touching = lambda rows: touching[rows]
+        rig.touches(touching)
         torques = gait.torques(rig.rows)
         self.assertTrue((np.abs(torques) <= limits).all())
         self.assertTrue((np.abs(torques) == limits).any())
@@ -586,11 +646,11 @@ class MachineTest(parameterized.TestCase):
     def leave(self, rig, state, links, phase=0.0):
         """Puts the machine into a state, advances it once, and returns (state, cycle's end)."""
         gait = rig.gait
-        gait.state[:], gait.phase[:] = state, phase
-        gait.enter(rig.rows)
+        gait.state.number[:], gait.state.phase[:] = state, phase
+        enter(rig)
         rig.touches(links)
         (ended,) = gait.advance(rig.rows)
-        return int(gait.state[0]), bool(ended)
+        return int(gait.state.number[0]), bool(ended)
 
     def test_bound(self):
         rig = Rig('dog')
@@ -612,52 +672,57 @@ class MachineTest(parameterized.TestCase):
         for links in ((), (stance_foot,), (swing_foot,), (stance_foot, swing_foot)):
             for phase, late in ((0.5, False), (0.99, True)):
                 for state in range(4):
-                    rig.gait.stance[:] = stance
+                    rig.gait.state.stance[:] = stance
                     ends = late if state < 3 else swing_foot in links
                     expected = (min(state + 1, 3), state == 3) if ends else (state, False)
                     self.assertEqual(self.leave(rig, state, links, phase), expected)
                     # The legs change places with the cycle, before anybody looks.
-                    self.assertEqual(rig.gait.stance[0], 1 - stance if expected[1] else stance)
+                    self.assertEqual(
+                        rig.gait.state.stance[0], 1 - stance if expected[1] else stance
+                    )
 
     def test_phase(self):
         for name, duration in (('dog', 0.125), ('raptor', 0.0825), ('biped2d_simbicon', 0.0825)):
             rig = Rig(name)
             steps = 0
-            while rig.gait.state[0] == 0:
+            while rig.gait.state.number[0] == 0:
                 rig.gait.advance(rig.rows)
                 steps += 1
             self.assertAlmostEqual(steps * DT, duration, delta=1.01 * DT)
-            self.assertEqual(rig.gait.phase[0], 0.0)
+            self.assertEqual(rig.gait.state.phase[0], 0.0)
             rig.gait.advance(rig.rows)
-            self.assertAlmostEqual(rig.gait.phase[0], 0.0 if name == 'dog' else DT / duration,
+            self.assertAlmostEqual(rig.gait.state.phase[0], 0.0 if name == 'dog' else DT / duration,
                                    delta=DT / duration)  # fmt: skip
 
     def test_a_new_cycle(self):
         rig = Rig('raptor')
         gait = rig.gait
-        gait.state[:], gait.phase[:], gait.stance[:] = 3, 0.4, 1
+        gait.state.number[:], gait.state.phase[:], gait.state.stance[:] = 3, 0.4, 1
         vector = gait.parameters.base_actions[2:3].copy()
         vector[0, :3] *= -1
         gait.apply(rig.rows, vector)
-        self.assertEqual((gait.state[0], gait.phase[0], gait.stance[0]), (0, 0.0, 1))
-        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[2:3])
-        left_knee = gait.targets[0, rig.joints.index('left_knee')]  # of the stance leg now
+        self.assertEqual(
+            (gait.state.number[0], gait.state.phase[0], gait.state.stance[0]), (0, 0.0, 1)
+        )
+        np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[2:3])
+        left_knee = gait.state.target[0, rig.joints.index('left_knee')]  # of the stance leg now
         self.assertEqual(left_knee, vector[0, gait.parameters.place('Contact.StanceKnee')])
         vector[...] = 0  # the caller's own
-        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[2:3])
+        np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[2:3])
 
     def test_rows_move_on_by_themselves(self):
         rig = Rig('dog', 4, batch=True)
         gait = rig.gait
-        gait.state[:], gait.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
-        on = np.isin(rig.character.row.links, ('toe',))
-        gait.touching = lambda rows: np.tile(on, (len(rows), 1))
-        before = gait.targets.copy()
+        gait.state.number[:], gait.state.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
+        rig.touches(('toe',))
+        before = gait.state.target.copy()
         ended = gait.advance(np.array([0, 1, 2]))
         np.testing.assert_array_equal(ended, [False, False, True])
-        np.testing.assert_array_equal(gait.state, [1, 1, 3, 0])
-        self.assertEqual(gait.phase[3], 0.3)
-        np.testing.assert_array_equal((gait.targets != before).any(1), [True, False, False, False])
+        np.testing.assert_array_equal(gait.state.number, [1, 1, 3, 0])
+        self.assertEqual(gait.state.phase[3], 0.3)
+        np.testing.assert_array_equal(
+            (gait.state.target != before).any(1), [True, False, False, False]
+        )
 
     def test_hop(self):
         rig = Rig('hopper')
@@ -667,7 +732,7 @@ class MachineTest(parameterized.TestCase):
             q = np.zeros((1, 5))
             q[0, 1] = 3.0
             rig.put(q, np.array([[0, 1.0 if rising else -1.0, 0, 0, 0]]))
-            gait.rising[:] = was_rising
+            gait.state.rising[:] = was_rising
             return self.leave(rig, state, ('leg',) if landed else ())
 
         for was in (False, True):
@@ -682,43 +747,43 @@ class MachineTest(parameterized.TestCase):
                         leave(3, landed, was, now),
                         (2 if landed else 0 if turned_down else 3, False),
                     )
-                    self.assertEqual(bool(gait.rising[0]), now)
+                    self.assertEqual(bool(gait.state.rising[0]), now)
 
     def test_hop_begins_in_the_air_and_goes_on_at_touch_down(self):
         rig = Rig('hopper')
         gait = rig.gait
         gait.apply(rig.rows, gait.parameters.base_actions[3:4])
-        self.assertEqual(gait.state[0], 0)  # the first action: still in descent
-        np.testing.assert_array_equal(gait.vectors, gait.parameters.base_actions[3:4])
+        self.assertEqual(gait.state.number[0], 0)  # the first action: still in descent
+        np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[3:4])
         self.assertEqual(self.leave(rig, 0, ('leg',)), (0, True))
         gait.apply(rig.rows, gait.parameters.base_actions[4:5])
-        self.assertEqual(gait.state[0], 1)
-        self.assertEqual(gait.targets[0, 0], gait.parameters.base_actions[4, 3])
+        self.assertEqual(gait.state.number[0], 1)
+        self.assertEqual(gait.state.target[0, 0], gait.parameters.base_actions[4, 3])
         gait.begin(rig.rows)
         gait.apply(rig.rows, gait.parameters.base_actions[3:4])
-        self.assertEqual(gait.state[0], 0)
+        self.assertEqual(gait.state.number[0], 0)
 
     @parameterized.parameters(*NAMES)
     def test_save_and_restore(self, name):
         rig = Rig(name, 2, batch=True)
-        del rig.gait.touching  # the true ones
         start(rig)
         run(rig, 100)
-        saved = [(rig.world.get_state(row), rig.gait.get_state(row)) for row in rig.rows]
+        saved = [array.copy() for array in rig.gait.state]
+        worlds = [rig.world.get_state(row) for row in rig.rows]
         expected = run(rig, 300)
         other = Rig(name, 2, batch=True)
-        del other.gait.touching
         start(other)
         run(other, 37)
-        for row, (world, gait) in enumerate(saved):
-            other.gait.set_state(row, gait)
+        for array, values in zip(other.gait.state, saved, strict=True):
+            array[...] = values
+        for row, world in enumerate(worlds):
             other.world.set_state(row, world)
         np.testing.assert_array_equal(run(other, 300), expected)
 
 
 def start(rig):
     """The pose of the first instant; the character stands on the ground."""
-    begin, q = rig.gait.parameters.start, np.zeros((rig.world.n, rig.dynamics.size))
+    begin, q = rig.gait.parameters.start, np.zeros((rig.world.n, len(rig.rules.skeleton.dof)))
     v = np.zeros_like(q)
     q[:, 1:3], v[:, :3] = (begin['height'], begin['pitch']), begin['velocity']
     q[:, 1] += 0.02
@@ -750,14 +815,15 @@ class AloneTest(parameterized.TestCase):
         option = arena.mjcf_model.option
         option.timestep, option.gravity = controllers.CONTROL_TIMESTEP / 2, (0, 0, -9.8)
         dog.create_root_joints(arena.attach(dog))
-        gait = controllers.make(dog, 'world', arena.mjcf_model)
+        gait = controllers.Gait(dog, 'world', arena.mjcf_model)
         actuation.add(dog, 'torque', option.timestep)
         for joint in dog.joints:
             joint.damping = joint.armature = 0
         physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
         world, rows = PhysicsWorld(physics, dynamics.FIELDS), np.arange(1)
         gait.bind(world)
-        begin, places, rates = gait.parameters.start, gait.dynamics.qpos, gait.dynamics.dofs
+        begin, skeleton = gait.parameters.start, gait.rules.skeleton
+        places, rates = skeleton.qpos, skeleton.dof
         world.qpos[0, places[1:3]] = begin['height'], begin['pitch']
         world.qvel[0, rates[:3]] = begin['velocity']
         for name, (angle, rate) in begin['joints'].items():
@@ -773,7 +839,7 @@ class AloneTest(parameterized.TestCase):
             if gait.advance(rows)[0]:
                 gait.apply(rows, gait.parameters.centre[None])
                 cycles += 1
-            down += gait.touching(rows)[0, trunk].any()
+            down += (world.sensordata[0, gait.rules.machine.contact + np.array(trunk)] > 0).any()
         self.assertBetween(cycles, 5, 9)
         self.assertLess(down, 60)  # of 1800
         self.assertGreater(world.qpos[0, places[0]], 6.0)
@@ -783,7 +849,7 @@ class AloneTest(parameterized.TestCase):
         arena, biped = floors.Floor(), characters.make('biped2d')
         arena.attach(biped)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'biped2d'"):
-            controllers.make(biped, 'world', arena.mjcf_model)
+            controllers.Gait(biped, 'world', arena.mjcf_model)
 
 
 if __name__ == '__main__':

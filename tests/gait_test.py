@@ -1,7 +1,7 @@
 """Tests of the gait task: observation, reward, falls and cycles, recomputed by other means."""
 
+import ctypes
 import dataclasses
-from unittest import mock
 
 import mujoco
 import numpy as np
@@ -10,6 +10,7 @@ from dm_control import composer
 from helpers import advance, assert_goes_on, assert_rows_are_singles, links_on_ground
 
 from trl_suite import controllers, suite, terrain
+from trl_suite.engine import native
 from trl_suite.vector import VectorEnvironment
 
 # One of each character, on ground of which much is seen.
@@ -45,6 +46,33 @@ def idle(environment):
 
 def on_flat(id_):
     return dataclasses.replace(suite.find(id_), terrain='flat')
+
+
+def around_physics(environment, before=None, after=None):
+    """Has functions called in the midst of a step, around the physics of each control step."""
+    functions = environment.task.world.engine.functions
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+
+    def wrapped(number, first, last):
+        original = kind(int(functions[number]))
+
+        def call(model, data):
+            if first:
+                first()
+            original(model, data)
+            if last:
+                last()
+
+        return kind(call)
+
+    # Where its physics begins and ends, see `native.step`.
+    calls = {
+        native.STEP2: wrapped(native.STEP2, before, None),
+        native.STEP1: wrapped(native.STEP1, None, after),
+    }
+    for number, call in calls.items():
+        functions[number] = ctypes.cast(call, ctypes.c_void_p).value
+    environment.calls = calls  # must be kept alive
 
 
 class Probe:
@@ -217,10 +245,10 @@ class RewardTest(parameterized.TestCase):
         """Reward of a cycle of 0.4 s with a mean speed and a share of stumbling."""
         environment = make(id_)
         task = environment.task
-        task._lasted[:] = 240
-        task._stumbled[:] = round(240 * share)
-        task._from[:] = Probe(environment).com() - 0.4 * speed
-        task.finish_step()
+        task.state.lasted[:] = 240
+        task.state.stumbled[:] = round(240 * share)
+        task.state.start[:] = Probe(environment).com() - 0.4 * speed
+        task.finish_step(np.arange(1))
         terms = environment.info['reward_terms']
         self.assertAlmostEqual(sum(terms.values()), float(task.reward[0]), places=12)
         return float(task.reward[0])
@@ -240,15 +268,11 @@ class RewardTest(parameterized.TestCase):
     def test_rollout(self, id_):
         """Speed and stumbling from what the engine did in between."""
         environment = make(id_, seed=1)
-        probe, task = Probe(environment), environment.task
-        step_world, stumbles = task.world.step, []
-
-        def watched(nstep, rows=None):
-            self.assertEqual(nstep, 2)  # 1200 Hz physics, 600 Hz control
-            step_world(nstep, rows)
-            stumbles.append(bool(probe.touching() - set(EXEMPT[id_])))
-
-        task.world.step = watched
+        probe, stumbles = Probe(environment), []
+        self.assertEqual(environment.physics.timestep(), 1 / 1200)
+        around_physics(
+            environment, after=lambda: stumbles.append(bool(probe.touching() - set(EXEMPT[id_])))
+        )
         rng, stumbled = np.random.default_rng(1), 0
         for _ in range(8):
             time, com = environment.physics.data.time, probe.com()
@@ -292,20 +316,18 @@ class Adrift:
         data.qpos[task.figure.pose_qpos[1:3]] = 8.0, pitch
         data.qvel[task.figure.pose_dof[:3]] = velocity
         task.world.forward(np.zeros(1, int))
-        task._milestone[:] = 0.0, 8.0
-        task.gait.torques = lambda rows: np.zeros((len(rows), len(self.links) - 1))
+        task.state.milestone[:] = 0.0, 8.0
         self.time, self.contacts = 0, lambda time: ()
+        first = task.gait.rules.machine.contact
+        self.sensed = environment.physics.data.sensordata[first : first + len(self.links)]
+        around_physics(environment, self.let_go, self.touch)
 
-        def touching(rows):
-            return np.isin(self.links, self.contacts(self.time * STEP))[None]
+    def let_go(self):
+        self.environment.physics.data.ctrl[:] = 0
 
-        advance = task.gait.advance
-
-        def advanced(rows):
-            self.time += 1
-            return advance(rows)
-
-        task.gait.touching, task.gait.advance = touching, advanced
+    def touch(self):
+        self.time += 1
+        self.sensed[:] = np.isin(self.links, self.contacts(self.time * STEP))
 
     def lasts(self, most=8.0):
         """Time in s until the episode ends, or None."""
@@ -441,7 +463,7 @@ class CycleTest(parameterized.TestCase):
             steps = environment.info['duration'] * 600
             self.assertAlmostEqual(steps, round(steps), places=6)
             self.assertLess(steps, 1000)
-            self.assertEqual(gait.state[0], 0 if id_ == HOPPER else 3)
+            self.assertEqual(gait.state.number[0], 0 if id_ == HOPPER else 3)
             swing_foot = f'{"left" if left else "right"}_{ {RAPTOR: "toe"}.get(id_, "ankle") }'
             self.assertIn(landing.get(id_, swing_foot), probe.touching())
             left = not left
@@ -464,29 +486,24 @@ class CycleTest(parameterized.TestCase):
             self.assertTrue(step.mid())
             self.assertAlmostEqual(environment.info['duration'], 50 / 30)
         stuck_in = {DOG: 1, RAPTOR: 3}[id_]
-        self.assertEqual(environment.task.gait.state[0], stuck_in)
+        self.assertEqual(environment.task.gait.state.number[0], stuck_in)
         # The next action begins a cycle all the same.
         adrift.contacts = lambda time: ()
-        seen = []
-        advance = environment.task.gait.advance
-        environment.task.gait.advance = lambda rows: (
-            seen.append(int(environment.task.gait.state[0])), advance(rows)
-        )[1]  # fmt: skip
+        seen, number = [], environment.task.gait.state.number
+        around_physics(environment, before=lambda: seen.append(int(number[0])))
         environment.step(idle(environment))
         self.assertEqual(seen[0], 0)
         if id_ == RAPTOR:  # no step was made
-            self.assertEqual(environment.task.gait.stance[0], 0)
+            self.assertEqual(environment.task.gait.state.stance[0], 0)
 
     def test_the_first_action_counts(self):
         for id_ in EXAMPLES:
             environment = make(id_)
             action = np.random.default_rng(0).uniform(-0.3, 0.3, len(environment.action_map))
             gait, seen = environment.task.gait, []
-            torques = gait.torques
-            with mock.patch.object(
-                gait, 'torques', lambda rows, s=seen, g=gait, t=torques: (s.append(g.vectors.copy()), t(rows))[1]
-            ):  # fmt: skip
-                environment.step(action)
+            vector = gait.state.vector
+            around_physics(environment, lambda s=seen, v=vector: s.append(v.copy()))
+            environment.step(action)
             expected = gait.parameters.vector(action[None])
             expected[:, gait.parameters.absolute] = np.abs(expected[:, gait.parameters.absolute])
             for vectors in (seen[0], seen[-1]):
@@ -530,29 +547,24 @@ class BaseActionTest(parameterized.TestCase):
         environment.step(preferences)
         self.assertAlmostEqual(environment.info['duration'], 1 / 30)
         self.assertAlmostEqual(environment.physics.data.time, 1 / 30)
-        np.testing.assert_array_equal(gait.vectors[0], gait.parameters.base_actions[2])
+        first, second = gait.parameters.base_actions[[2, 1]]
+        np.testing.assert_array_equal(gait.state.vector[0], first)
         # Another wish waits for the cycle's end.
         wish = np.zeros(count)
         wish[1] = 0.01
-        cycle_ends, seen = [], []
-        advance = gait.advance
-
-        def watched(rows):
-            ended = advance(rows)
-            cycle_ends.append(bool(ended[0]))
-            seen.append(gait.vectors[0].copy())
-            return ended
-
-        gait.advance = watched
+        seen, state = [], gait.state
+        around_physics(
+            environment, lambda: seen.append((int(state.number[0]), state.vector[0].copy()))
+        )
         for _ in range(60):
             step = environment.step(wish)
-            if step.last() or any(cycle_ends):
+            if step.last() or (state.vector[0] == second).all():
                 break
-        first = cycle_ends.index(True)
-        for vector in seen[: first + 1]:
-            np.testing.assert_array_equal(vector, gait.parameters.base_actions[2])
-        environment.step(wish)
-        np.testing.assert_array_equal(gait.vectors[0], gait.parameters.base_actions[1])
+        self.assertTrue((state.vector[0] == second).all())
+        of_first = [number for number, vector in seen if (vector == first).all()]
+        for _, vector in seen[len(of_first) :]:
+            np.testing.assert_array_equal(vector, second)
+        self.assertEqual(of_first[-1], 0 if id_ == HOPPER else 3)
 
     def test_rewards_are_of_frames(self):
         environment = make(DOG, interface='base_action')
@@ -674,8 +686,8 @@ class RowsTest(parameterized.TestCase):
         rows = VectorEnvironment(RAPTOR, 2, 1, seed=0, step_limit=1)
         rows.reset()
         self.assertTrue(rows.step(np.zeros((2, 28))).truncated.all())
-        with mock.patch.object(rows.task.world, 'step', side_effect=AssertionError):
-            step = rows.step(np.zeros((2, 28)))
+        step = rows.step(np.zeros((2, 28)))
+        np.testing.assert_array_equal(rows.task.world.time, 0)
         np.testing.assert_array_equal(step.reward, 0)
         np.testing.assert_array_equal(step.info['duration'], 0)
 

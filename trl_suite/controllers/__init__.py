@@ -1,7 +1,7 @@
 """Controllers between agent and joints: gait state machines and the dynamics they need."""
 
-from trl_suite.controllers.gait import CONTROL_TIMESTEP, Gait
-from trl_suite.controllers.gaits import GAITS, make
-from trl_suite.controllers.parameters import Parameters, load
+from trl_suite.controllers.gait import Gait
+from trl_suite.controllers.machine import CONTROL_TIMESTEP
+from trl_suite.controllers.parameters import Parameters, available, load
 
-__all__ = ['CONTROL_TIMESTEP', 'GAITS', 'Gait', 'Parameters', 'load', 'make']
+__all__ = ['CONTROL_TIMESTEP', 'Gait', 'Parameters', 'available', 'load']

@@ -1,131 +1,207 @@
-"""The equations of motion of a planar character as arrays over simulations.
+"""The equations of motion of a planar character, in compiled functions of one simulation.
 
 What stable PD, gravity compensation and virtual forces need: joint-space inertia, bias forces,
 Jacobians, world angles, the centre of mass. Degrees of freedom are in link order: x, z, pitch, then
 the joints; angles are positive nose up.
-
-A row's figures do not depend on which other rows are asked for, to the last bit: what is summed up
-later is taken (`take` packs each row, where an index may lay rows side by side).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from trl_suite.characters import Character
 from trl_suite.engine import World
+from trl_suite.util.compiled import compiled, compiled_inline
 
-# What a world must bind beyond the fields that every task reads.
-FIELDS = ('M', 'qfrc_bias', 'xanchor', 'subtree_com', 'xipos', 'site_xpos')
-Rows = np.ndarray | slice
+GRAVITY = 9.8  # m/s^2
 
 
-class PlanarDynamics:
-    """Arrays of m rows at a time, for whichever rows are asked for.
+class Skeleton(NamedTuple):
+    """A character's degrees of freedom D = 3 + J in a compiled model of B bodies.
 
     Attributes:
+      qpos, dof: addresses in qpos and in qvel, (D,).
+      joint: numbers in the model, (D,).
+      entry: where each entry of the inertia lies among those that MuJoCo stores, -1 where it is
+        always zero, (D, D).
+      body: which one it moves, (D,).
+      subtree_mass: of that body and what hangs on it, (D,) kg.
+      moves: whether it turns a body, (B, D) bool.
+      links: body ids in link order, the root first, (L,).
       mass: of the whole character, kg.
-      size: number of degrees of freedom D = 3 + J.
     """
 
-    def __init__(self, character: Character, world: World) -> None:
-        self.world = world
-        scope = f'{character.mjcf_model.model}/'
-        names = [f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')]
-        names += [joint.full_identifier for joint in character.joints]
-        self.qpos, self.dofs = world.joint_addresses(names)
-        self.bodies = world.body_ids([body.full_identifier for body in character.bodies])
-        self.size = len(names)
-        model = world.models[0]
-        self._joints = model.dof_jntid[self.dofs]
-        # Where each entry of the dense inertia lies among those that the engine stores by rows; the
-        # engine's order is by depth, so any of a pair may be the later.
-        places = np.full((model.nv, model.nv), -1)
-        for dof in range(model.nv):
-            start = model.M_rowadr[dof]
-            for k in range(start, start + model.M_rownnz[dof]):
-                places[dof, model.M_colind[k]] = places[model.M_colind[k], dof] = k
-        dense = places[np.ix_(self.dofs, self.dofs)]
-        self._entries, self._stored = np.maximum(dense, 0), (dense >= 0).astype(float)
-        self._body_of_dof = model.dof_bodyid[self.dofs]
-        self._subtree_mass = model.body_subtreemass[self._body_of_dof]
-        self.mass = float(model.body_subtreemass[self.bodies[0]])
-        # Which joints turn or move a body: those on its way to the root.
-        self._moves = np.zeros((model.nbody, self.size), bool)
-        for body in self.bodies:
-            above = body
-            while above:
-                self._moves[body] |= self._body_of_dof == above
-                above = model.body_parentid[above]
-        self.hinges = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        self._hinge = self.hinges.astype(float)
-        # Turn of each body against its parent at rest, rad; about -y, hence the sign.
-        quaternion = model.body_quat
-        self._rest = -2 * np.arctan2(quaternion[:, 2], quaternion[:, 0])
-        self._parents = model.body_parentid
+    qpos: np.ndarray
+    dof: np.ndarray
+    joint: np.ndarray
+    entry: np.ndarray
+    body: np.ndarray
+    subtree_mass: np.ndarray
+    moves: np.ndarray
+    links: np.ndarray
+    mass: float
 
-    def positions(self, rows: Rows) -> np.ndarray:
-        """x, z, pitch and joints, (m, D), m and rad."""
-        return self.world.qpos[rows].take(self.qpos, 1)
 
-    def velocities(self, rows: Rows) -> np.ndarray:
-        """Their rates, (m, D)."""
-        return self.world.qvel[rows].take(self.dofs, 1)
+class Mechanics(NamedTuple):
+    """Fields of the physics that only dynamics need, each (n, ...); see `engine.World`."""
 
-    def inertia(self, rows: Rows) -> np.ndarray:
-        """Joint-space inertia, (m, D, D)."""
-        return self.world.M[rows].take(self._entries, 1) * self._stored
+    M: np.ndarray
+    qfrc_bias: np.ndarray
+    xanchor: np.ndarray
+    site_xpos: np.ndarray
 
-    def bias(self, rows: Rows) -> np.ndarray:
-        """Coriolis, centrifugal and gravity forces, (m, D); what rest costs."""
-        return self.world.qfrc_bias[rows].take(self.dofs, 1)
 
-    def gravity(self, rows: Rows, acceleration: float = 9.8) -> np.ndarray:
-        """Generalised forces of gravity on hinges and root, (m, D)."""
-        com = self.world.subtree_com[rows].take(self._body_of_dof, 1)
-        anchor = self.world.xanchor[rows].take(self._joints, 1)
-        result = -acceleration * self._subtree_mass * (com[..., 0] - anchor[..., 0])
-        result[:, 0], result[:, 1] = 0.0, -acceleration * self.mass
-        return result
+# What a world must bind beyond the fields that every task reads.
+FIELDS = Mechanics._fields
 
-    def jacobian(self, rows: Rows, body: int, point: np.ndarray) -> np.ndarray:
-        """d(x, z)/d(degrees of freedom) of points (m, 3) of a body, (m, 2, D); hinges and root."""
-        arm = point[:, None] - self.world.xanchor[rows].take(self._joints, 1)
-        result = np.empty((len(point), 2, self.size))
-        on_the_way = self._moves[body] * self._hinge
-        np.multiply(-arm[..., 2], on_the_way, out=result[:, 0])
-        np.multiply(arm[..., 0], on_the_way, out=result[:, 1])
-        result[:, 0, :2], result[:, 1, :2] = (1.0, 0.0), (0.0, 1.0)
-        return result
 
-    def frame(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the world angles of links are made of, but for the angles of their own joints.
+def skeleton(character: Character, world: World) -> Skeleton:
+    """Resolves the names of a character with root joints in a compiled world."""
+    scope = f'{character.mjcf_model.model}/'
+    names = [f'{scope}root_{axis}/' for axis in ('x', 'z', 'pitch')]
+    names += [joint.full_identifier for joint in character.joints]
+    qpos, dof = world.joint_addresses(names)
+    links = world.body_ids([body.full_identifier for body in character.bodies])
+    model = world.models[0]
+    # MuJoCo stores a triangle by rows; its order is by depth, so any of a pair may be the later.
+    places = np.full((model.nv, model.nv), -1)
+    for row in range(model.nv):
+        start = model.M_rowadr[row]
+        for k in range(start, start + model.M_rownnz[row]):
+            places[row, model.M_colind[k]] = places[model.M_colind[k], row] = k
+    joint, body = model.dof_jntid[dof].astype(int), model.dof_bodyid[dof].astype(int)
+    hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    moves = np.zeros((model.nbody, len(names)), bool)
+    for link in links:  # the joints on its way to the root turn it
+        above = link
+        while above:
+            moves[link] |= (body == above) & hinge
+            above = model.body_parentid[above]
+    return Skeleton(
+        qpos=qpos,
+        dof=dof,
+        joint=joint,
+        entry=places[np.ix_(dof, dof)],
+        body=body,
+        subtree_mass=model.body_subtreemass[body],
+        moves=moves,
+        links=links,
+        mass=float(model.body_subtreemass[links[0]]),
+    )
 
-        Args:
-          joints: numbers of joints, (k,).
 
-        Returns:
-          Coefficients of all degrees of freedom (D, k), and constants (k,): their sum is the world
-          angle of the link that hangs on the joint minus the joint's own angle.
-        """
-        coefficients = np.zeros((self.size, len(joints)))
-        constants = np.zeros(len(joints))
-        for column, joint in enumerate(joints):
-            dof = 3 + joint
-            body = self._body_of_dof[dof]
-            coefficients[:, column] = self._moves[body] * self._hinge
-            coefficients[dof, column] = 0.0
-            while body:
-                constants[column] += self._rest[body]
-                body = self._parents[body]
-        return coefficients, constants
+def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what the world angles of links are made of, but for the angles of their own joints.
 
-    def com(self, rows: Rows) -> np.ndarray:
-        """Centre of mass, (m, 3), m."""
-        return self.world.subtree_com[rows][:, self.bodies[0]]
+    Args:
+      joints: numbers of joints in link order, (k,).
+      skeleton: of the character.
+      world: where it was compiled.
 
-    def com_speed(self, rows: Rows, v: np.ndarray) -> np.ndarray:
-        """Forward velocity of the centre of mass at velocities v (m, D), (m,), m/s."""
-        momentum = self.world.M[rows].take(self._entries[0], 1) * self._stored[0]
-        return (momentum[:, None] @ v[..., None])[:, 0, 0] / self.mass
+    Returns:
+      Coefficients of all degrees of freedom, (k, D), and constants, (k,): their sum is the world
+      angle of the link that hangs on the joint minus the joint's own angle.
+    """
+    model = world.models[0]
+    # Turn of each body against its parent at rest, rad; about -y, hence the sign.
+    rest = -2 * np.arctan2(model.body_quat[:, 2], model.body_quat[:, 0])
+    coefficients = np.zeros((len(joints), len(skeleton.dof)))
+    constants = np.zeros(len(joints))
+    for row, joint in enumerate(joints):
+        body = skeleton.body[3 + joint]
+        coefficients[row] = skeleton.moves[body]
+        coefficients[row, 3 + joint] = 0.0
+        while body:
+            constants[row] += rest[body]
+            body = model.body_parentid[body]
+    return coefficients, constants
+
+
+# Of simulation i.
+
+
+@compiled
+def write_inertia(i: int, skeleton: Skeleton, M: np.ndarray, out: np.ndarray) -> None:
+    """Writes the joint-space inertia into out[i], (D, D)."""
+    count = len(skeleton.dof)
+    for row in range(count):
+        for column in range(count):
+            entry = skeleton.entry[row, column]
+            out[i, row, column] = M[i, entry] if entry >= 0 else 0.0
+
+
+@compiled
+def com_speed(i: int, skeleton: Skeleton, M: np.ndarray, qvel: np.ndarray) -> float:
+    """Returns the forward velocity of the centre of mass, m/s."""
+    momentum = 0.0
+    for k in range(len(skeleton.dof)):
+        entry = skeleton.entry[0, k]
+        if entry >= 0:
+            momentum += M[i, entry] * qvel[i, skeleton.dof[k]]
+    return momentum / skeleton.mass
+
+
+@compiled_inline
+def weight(
+    i: int, k: int, skeleton: Skeleton, subtree_com: np.ndarray, xanchor: np.ndarray
+) -> float:
+    """Returns the generalised force of gravity on degree of freedom k, a hinge or of the root."""
+    if k == 0:
+        return 0.0
+    if k == 1:
+        return -GRAVITY * skeleton.mass
+    arm = subtree_com[i, skeleton.body[k], 0] - xanchor[i, skeleton.joint[k], 0]
+    return -GRAVITY * skeleton.subtree_mass[k] * arm
+
+
+@compiled
+def write_jacobian(
+    i: int, body: int, x: float, z: float, row: int, skeleton: Skeleton, xanchor: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Writes d(x, z) / d(degrees of freedom) of a point of a body into two rows of out[i], (., D).
+
+    Of slides other than those of the root it is 0.
+    """
+    for k in range(len(skeleton.dof)):
+        joint, moves = skeleton.joint[k], skeleton.moves[body, k]
+        out[i, row, k] = -(z - xanchor[i, joint, 2]) if moves else 0.0
+        out[i, row + 1, k] = x - xanchor[i, joint, 0] if moves else 0.0
+    out[i, row, 0] = out[i, row + 1, 1] = 1.0
+
+
+@compiled
+def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
+    """Solves n equations matrix[i] x = vector[i] by elimination; both are overwritten.
+
+    Pivoting is partial. The pivots and the order of operations are those of LAPACK's dgetf2 and dgetrs.
+    """
+    for k in range(n):
+        pivot = k
+        for row in range(k + 1, n):
+            if abs(matrix[i, row, k]) > abs(matrix[i, pivot, k]):
+                pivot = row
+        if pivot != k:
+            for column in range(k, n):
+                kept = matrix[i, k, column]
+                matrix[i, k, column] = matrix[i, pivot, column]
+                matrix[i, pivot, column] = kept
+            kept = vector[i, k]
+            vector[i, k] = vector[i, pivot]
+            vector[i, pivot] = kept
+        inverse = 1.0 / matrix[i, k, k]
+        for row in range(k + 1, n):
+            factor = matrix[i, row, k] * inverse
+            if factor == 0.0:
+                continue
+            for column in range(k + 1, n):
+                matrix[i, row, column] -= factor * matrix[i, k, column]
+            vector[i, row] -= factor * vector[i, k]
+    for k in range(n - 1, -1, -1):
+        x = vector[i, k]
+        for column in range(k + 1, n):
+            x -= matrix[i, k, column] * vector[i, column]
+        vector[i, k] = x / matrix[i, k, k]

@@ -1,286 +1,283 @@
 """The gaits: the bound of dog and goat, the stride of raptor and biped, the hopper's hop.
 
-Sources: see `trl_suite.controllers.gait`, which has what they share.
+Compiled functions of simulation i; sources: see `trl_suite.controllers.machine`. The feedback of
+bipeds is after Yin, Loken, van de Panne (2007).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import math
 
 import numpy as np
 
-from trl_suite import errors
-from trl_suite.characters import Character
-from trl_suite.controllers.gait import Gait
-from trl_suite.controllers.parameters import Parameters
-from trl_suite.engine import World
+from trl_suite.controllers.dynamics import com_speed, solve, weight, write_jacobian
+from trl_suite.controllers.machine import (
+    BOUND,
+    CONTROL_TIMESTEP,
+    HOP,
+    STATES,
+    STRIDE,
+    TRANSITION,
+    GaitRules,
+    enter,
+    hip_angle,
+    limit,
+    of_state,
+    stable_pd,
+    touches,
+)
+from trl_suite.util.compiled import compiled, compiled_loop
 
-GRAVITY = 9.8  # m/s^2
 REGULARISATION = 1e-4  # of the contact forces that carry the weight
+LAST = STATES - 1
+
+# Bound: back stance, extend, front stance, gather; one hind and one fore leg, in this order.
+# Parameters: TransTime, Cv, and pushes of hind foot and fore foot.
 
 
-class Bound(Gait):
-    """Dog and goat: back stance, extend, front stance, gather; one fore and one hind leg."""
-
-    feet = ('toe', 'finger')
-    world_joints = ('hip', 'shoulder')
-    _legs = (('toe', 'ankle', 'knee', 'hip'), ('finger', 'wrist', 'elbow', 'shoulder'))
-    _spine = ('spine0', 'spine1', 'spine2', 'spine3', 'torso')
-    _limbs = ('shoulder', 'elbow', 'hip', 'knee', 'ankle')
-    _no_gravity_compensation = ('goat',)
-    endings = (
-        'after TransTime', 'finger touches the ground', 'after TransTime',
-        'toe touches the ground: end of the cycle',
-    )  # fmt: skip
-
-    def bind(self, world: World) -> None:
-        super().bind(world)
-        self._spine_joints = np.array([self.number[name] for name in self._spine])
-        self._limb_joints = np.array([self.number[name] for name in self._limbs])
-        self._compensate = self.character.row.name not in self._no_gravity_compensation
-        # Which parameter of the state moves which world joint with speed: those of _limbs follow
-        # SpineCurve.
-        self._swing = [
-            (self.link['toe'], self.number['hip'], 1 + self._limbs.index('hip')),
-            (self.link['finger'], self.number['shoulder'], 1 + self._limbs.index('shoulder')),
-        ]
-        self._pushes = np.zeros((2, len(self.kp)), bool)
-        for leg, joints in enumerate(self._legs):
-            self._pushes[leg, [self.number[name] for name in joints]] = True
-
-    def enter(self, rows: np.ndarray) -> None:
-        values = self.of_state(rows)
-        self.targets[rows[:, None], self._spine_joints] = values[:, :1]
-        self.targets[rows[:, None], self._limb_joints] = values[:, 1:]
-
-    def ends(self, rows: np.ndarray) -> np.ndarray:
-        state, touching = self.state[rows], self.touching(rows)
-        timed = (state == 0) | (state == 2)
-        landed = np.where(
-            state == 1, touching[:, self.link['finger']], touching[:, self.link['toe']]
-        )
-        return np.where(timed, self.phase[rows] >= 1, landed)
-
-    def torques(self, rows: np.ndarray) -> np.ndarray:
-        dynamics, world = self.dynamics, self.world
-        q, v = dynamics.positions(rows), dynamics.velocities(rows)
-        touching = self.touching(rows)
-        vectors, values = self.vectors[rows], self.of_state(rows)
-        lead = vectors[:, 1] * dynamics.com_speed(rows, v)
-        for link, joint, place in self._swing:
-            swinging = ~touching[:, link]
-            self.targets[rows[swinging], joint] = values[swinging, place] + lead[swinging]
-        tau = self.stable_pd(rows, q, v)
-        on = touching[:, [self.link[foot] for foot in self.feet]]
-        if on.any():
-            bodies = [dynamics.bodies[self.link[foot]] for foot in self.feet]
-            soles = [world.site_xpos[rows][:, self._sites[foot]] for foot in self.feet]
-            jacobians = np.stack(
-                [
-                    dynamics.jacobian(rows, body, sole)
-                    for body, sole in zip(bodies, soles, strict=True)
-                ],
-                axis=1,
-            )
-            jacobians *= on[:, :, None, None]
-            if self._compensate:
-                tau += self._weight(rows, jacobians) * on.any(axis=1, keepdims=True)
-            # A force on the body is its opposite on the ground, from one foot by state.
-            state = self.state[rows]
-            back = state < 2
-            forces = np.where(back[:, None], vectors[:, 2:4], vectors[:, 4:6])
-            foot = np.where(back, 0, 1)
-            pushing = jacobians[np.arange(len(rows)), foot]
-            push = -(forces[:, None] @ pushing)[:, 0, 3:]
-            tau += push * self._pushes[foot]
-        return np.clip(tau, -self.limits, self.limits)
-
-    def _weight(self, rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-        """Torques that hold the body against gravity, with the feet on the ground, (m, J)."""
-        gravity = self.dynamics.gravity(rows)
-        supports = jacobians.reshape(len(gravity), 4, -1)
-        root = supports[:, :, :3]  # transposed: forces by root coordinates
-        matrix = root @ root.swapaxes(1, 2)
-        matrix += REGULARISATION * np.eye(4)
-        right = -(root @ gravity[:, :3, None])
-        forces = np.linalg.solve(matrix, right)[..., 0]
-        return (-gravity - (forces[:, None] @ supports)[:, 0])[:, 3:]
+@compiled
+def bound_ends(i: int, gait: GaitRules) -> bool:
+    """Whether a state is over: by time, or as the foot lands that comes next."""
+    number = gait.state.number[i]
+    if number == 0 or number == 2:
+        return gait.state.phase[i] >= 1.0
+    return touches(i, gait.machine.feet[1 if number == 1 else 0], gait)
 
 
-class Stride(Gait):
-    """Raptor and biped: one step of a run per cycle; stance and swing leg change places.
+@compiled
+def bound_torques(i: int, gait: GaitRules) -> None:
+    """PD, with legs that swing further the faster it runs and that push on the ground."""
+    machine, state, torque = gait.machine, gait.state, gait.scratch.torque
+    lead = state.vector[i, 1] * com_speed(i, gait.skeleton, gait.mechanics.M, gait.physics.qvel)
+    for leg in range(2):
+        hip = machine.legs[leg, 0]
+        if not touches(i, machine.feet[leg], gait):
+            state.target[i, hip] = of_state(i, machine.place[0, hip], gait) + lead
+    stable_pd(i, len(machine.kp), gait)
+    if touches(i, machine.feet[0], gait) or touches(i, machine.feet[1], gait):
+        stand(i, gait)
+        if machine.holds_weight:
+            add_weight(i, gait)
+        # A force on the body is its opposite on the ground, from one foot by state.
+        leg = 0 if state.number[i] < 2 else 1
+        ahead, up = state.vector[i, 2 + 2 * leg], state.vector[i, 3 + 2 * leg]
+        support = gait.scratch.support
+        for joint in machine.legs[leg]:
+            k = 3 + joint
+            torque[i, joint] -= ahead * support[i, 2 * leg, k] + up * support[i, 2 * leg + 1, k]
+    limit(i, gait)
 
-    Attributes:
-      stance: 0 where the right leg is the stance leg, 1 the left, (n,).
+
+@compiled
+def stand(i: int, gait: GaitRules) -> None:
+    """Writes the Jacobians of the feet; they are 0 in the air."""
+    machine, support = gait.machine, gait.scratch.support
+    for leg in range(2):
+        if touches(i, machine.feet[leg], gait):
+            body, sole = gait.skeleton.links[machine.feet[leg]], machine.soles[leg]
+            x, z = gait.mechanics.site_xpos[i, sole, 0], gait.mechanics.site_xpos[i, sole, 2]
+            anchors = gait.mechanics.xanchor
+            write_jacobian(i, body, x, z, 2 * leg, gait.skeleton, anchors, support)
+        else:
+            for k in range(support.shape[2]):
+                support[i, 2 * leg, k] = support[i, 2 * leg + 1, k] = 0.0
+
+
+@compiled
+def add_weight(i: int, gait: GaitRules) -> None:
+    """Adds the torques that hold the body against gravity, with the feet on the ground."""
+    skeleton, scratch = gait.skeleton, gait.scratch
+    com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
+    support, grip, force = scratch.support, scratch.matrix, scratch.vector
+    for row in range(4):  # forces that carry the root, the first three degrees of freedom
+        for column in range(4):
+            grip[i, row, column] = 0.0
+            for k in range(3):
+                grip[i, row, column] += support[i, row, k] * support[i, column, k]
+        grip[i, row, row] += REGULARISATION
+        force[i, row] = 0.0
+        for k in range(3):
+            force[i, row] -= support[i, row, k] * weight(i, k, skeleton, com, anchors)
+    solve(i, 4, grip, force)
+    for joint in range(len(gait.machine.kp)):
+        k = 3 + joint
+        carried = 0.0
+        for row in range(4):
+            carried += force[i, row] * support[i, row, k]
+        scratch.torque[i, joint] += -weight(i, k, skeleton, com, anchors) - carried
+
+
+# Stride: one step of a run per cycle; stance and swing leg then change places. Contact, down,
+# passing, up; parameters: TransTime, Cv, Cd, and of a state first the root's pitch.
+
+
+@compiled
+def stride_ends(i: int, gait: GaitRules) -> bool:
+    """Whether a state is over: by time, the last one as the swing foot lands."""
+    if gait.state.number[i] < LAST:
+        return gait.state.phase[i] >= 1.0
+    return touches(i, gait.machine.feet[1 - gait.state.stance[i]], gait)
+
+
+@compiled
+def stride_torques(i: int, gait: GaitRules) -> None:
+    """PD, with a swing leg that keeps the balance and a stance hip that keeps the root upright."""
+    machine, state, torque = gait.machine, gait.state, gait.scratch.torque
+    skeleton, physics = gait.skeleton, gait.physics
+    stance = state.stance[i]
+    foot, early = machine.feet[stance], state.number[i] < 2
+    hip, swing_hip = machine.legs[stance, 0], machine.legs[1 - stance, 0]
+    if early:
+        lead = state.vector[i, 1] * com_speed(i, skeleton, gait.mechanics.M, physics.qvel)
+    else:
+        com = physics.subtree_com[i, skeleton.links[0], 0]
+        lead = state.vector[i, 2] * (com - physics.xipos[i, skeleton.links[foot], 0])
+    place = machine.place[stance, swing_hip]
+    state.target[i, swing_hip] = of_state(i, place, gait) + lead
+    loaded = early and touches(i, foot, gait)
+    stable_pd(i, hip if loaded else len(machine.kp), gait)
+    if loaded:
+        pitch, rate = physics.qpos[i, skeleton.qpos[2]], physics.qvel[i, skeleton.dof[2]]
+        upright = machine.kp[hip] * (of_state(i, 0, gait) - pitch) - machine.kd[hip] * rate
+        torque[i, hip] -= torque[i, swing_hip] + upright
+    limit(i, gait)
+
+
+# Hop: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter: MagicGain.
+DESCENT, DOWN, UP, ASCENT = range(STATES)
+
+
+@compiled
+def hop_advance(i: int, gait: GaitRules) -> bool:
+    """Moves the hopper on; returns whether it lands."""
+    state = gait.state
+    landed = touches(i, gait.machine.feet[0], gait)
+    number, following = state.number[i], state.number[i]
+    was, rising = state.rising[i], gait.physics.qvel[i, gait.skeleton.dof[1]] > 0.0
+    state.rising[i] = rising
+    if number == DOWN and rising and not was:
+        following = UP
+    elif number == UP and not landed:
+        following = ASCENT
+    elif number == ASCENT and landed:
+        following = UP
+    elif number == ASCENT and was and not rising:
+        following = DESCENT
+    if following != number:
+        state.number[i] = following
+        enter(i, gait)
+    return number == DESCENT and landed
+
+
+@compiled
+def hop_torques(i: int, gait: GaitRules) -> None:
+    """PD, with a hip that keeps the root upright and a leg that pushes, on the ground."""
+    machine, state, torque = gait.machine, gait.state, gait.scratch.torque
+    skeleton, qpos, qvel = gait.skeleton, gait.physics.qpos, gait.physics.qvel
+    hip, leg = machine.legs[0, 0], machine.legs[0, 1]
+    stable_pd(i, len(machine.kp), gait)
+    if state.number[i] == DOWN or state.number[i] == UP:
+        pitch, rate = qpos[i, skeleton.qpos[2]], qvel[i, skeleton.dof[2]]
+        upright = -machine.kp[hip] * pitch - machine.kd[hip] * rate
+        torque[i, hip] -= state.vector[i, 0] * upright
+    if touches(i, machine.feet[0], gait):
+        thigh = hip_angle(i, 0, machine, skeleton, qpos) + qpos[i, skeleton.qpos[3 + hip]]
+        torque[i, leg] += machine.lift * math.cos(thigh)
+    limit(i, gait)
+
+
+# Any gait.
+
+
+@compiled
+def apply(i: int, gait: GaitRules) -> None:
+    """Begins a cycle with the parameters in the state's vector."""
+    machine, state = gait.machine, gait.state
+    for place in machine.absolute:
+        state.vector[i, place] = abs(state.vector[i, place])
+    # A hopper's cycle ends where it lands, and the next begins there; only the first is in the air.
+    state.number[i] = DOWN if machine.kind == HOP and not state.airborne[i] else 0
+    state.airborne[i] = False
+    state.phase[i] = 0.0
+    enter(i, gait)
+
+
+@compiled
+def act(i: int, gait: GaitRules) -> None:
+    """Writes the torques of the next control step, within limits."""
+    if gait.machine.kind == BOUND:
+        bound_torques(i, gait)
+    elif gait.machine.kind == STRIDE:
+        stride_torques(i, gait)
+    else:
+        hop_torques(i, gait)
+
+
+@compiled
+def advance(i: int, gait: GaitRules) -> bool:
+    """Moves a machine on after a control step; returns whether its cycle has ended.
+
+    A machine whose cycle has ended stays in its last state until `apply`.
     """
-
-    _hips = ('right_hip', 'left_hip')
-    world_joints = _hips
-    _leg = ('hip', 'knee', 'ankle')
-
-    def bind(self, world: World) -> None:
-        super().bind(world)
-        self.stance = np.zeros(world.n, int)
-        self._joints = np.array(
-            [[self.number[f'{side}_{name}'] for name in self._leg] for side in ('right', 'left')]
-        )
-        foot = self.foot_link
-        self._feet = np.array([self.link[f'{side}_{foot}'] for side in ('right', 'left')])
-        # Of a state: root pitch, perhaps spine curve (not used), stance leg, swing leg.
-        names = [name.split('.')[1] for name in self.parameters.names[self.parameters.misc :]]
-        self._stance_place, self._swing_place = names.index('StanceHip'), names.index('SwingHip')
-
-    @property
-    def foot_link(self) -> str:
-        """Name of the link that steps, without side."""
-        return 'toe' if 'right_toe' in self.character.row.joints else 'ankle'
-
-    @property
-    def endings(self) -> tuple[str, ...]:  # type: ignore[override]
-        foot = f"the swing leg's {self.foot_link} touches the ground"
-        return *3 * ('after TransTime',), f'{foot}: end of the cycle, the legs change places'
-
-    def begin(self, rows: np.ndarray) -> None:
-        self.stance[rows] = 0
-        super().begin(rows)
-
-    def enter(self, rows: np.ndarray) -> None:
-        values, stance = self.of_state(rows), self.stance[rows]
-        k, first, second = len(self._leg), self._stance_place, self._swing_place
-        self.targets[rows[:, None], self._joints[stance]] = values[:, first : first + k]
-        self.targets[rows[:, None], self._joints[1 - stance]] = values[:, second : second + k]
-
-    def ends(self, rows: np.ndarray) -> np.ndarray:
-        state = self.state[rows]
-        swing_foot = self._feet[1 - self.stance[rows]]
-        landed = self.touching(rows)[np.arange(len(rows)), swing_foot]
-        return np.where(state == 3, landed, self.phase[rows] >= 1)
-
-    def advance(self, rows: np.ndarray) -> np.ndarray:
-        ended = super().advance(rows)
-        if ended.any():
-            self.stance[rows[ended]] = 1 - self.stance[rows[ended]]
-        return ended
-
-    def torques(self, rows: np.ndarray) -> np.ndarray:
-        dynamics, count = self.dynamics, np.arange(len(rows))
-        q, v = dynamics.positions(rows), dynamics.velocities(rows)
-        state, stance = self.state[rows], self.stance[rows]
-        vectors, values = self.vectors[rows], self.of_state(rows)
-        foot, early = self._feet[stance], state < 2
-        loaded = early & self.touching(rows)[count, foot]
-        hip, swing_hip = self._joints[stance, 0], self._joints[1 - stance, 0]
-        ahead = dynamics.com(rows)[:, 0] - self.world.xipos[rows][count, dynamics.bodies[foot], 0]
-        lead = np.where(early, vectors[:, 1] * dynamics.com_speed(rows, v), vectors[:, 2] * ahead)
-        self.targets[rows, swing_hip] = values[:, self._swing_place] + lead
-        off = np.zeros((len(rows), len(self.kp)), bool)
-        off[count, hip] = loaded
-        tau = self.stable_pd(rows, q, v, off)
-        upright = self.kp[hip] * (values[:, 0] - q[:, 2]) - self.kd[hip] * v[:, 2]
-        tau[count, hip] -= loaded * (tau[count, swing_hip] + upright)
-        return np.clip(tau, -self.limits, self.limits)
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {**super().get_state(row), 'stance': int(self.stance[row])}
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        super().set_state(row, state)
-        self.stance[row] = state['stance']
+    machine, state = gait.machine, gait.state
+    if machine.kind == HOP:
+        return hop_advance(i, gait)
+    state.phase[i] += CONTROL_TIMESTEP / state.vector[i, TRANSITION]
+    leaving = bound_ends(i, gait) if machine.kind == BOUND else stride_ends(i, gait)
+    if not leaving:
+        return False
+    if state.number[i] < LAST:
+        state.number[i] += 1
+        state.phase[i] = 0.0
+        enter(i, gait)
+        return False
+    if machine.kind == STRIDE:
+        state.stance[i] = 1 - state.stance[i]
+    return True
 
 
-class Hop(Gait):
-    """The one-legged hopper: descent, down stance, up stance, ascent; a cycle ends at touch-down.
-
-    Attributes:
-      rising: whether the root was moving up at the last control step, (n,).
-    """
-
-    world_joints = ('hip',)
-    endings = (
-        'leg touches the ground: end of the cycle', 'root turns upwards', 'leg leaves the ground',
-        'root turns downwards; if leg touches the ground first, back to UpStance',
-    )  # fmt: skip
-
-    def bind(self, world: World) -> None:
-        super().bind(world)
-        self.rising = np.zeros(world.n, bool)
-        self._fresh = np.zeros(world.n, bool)
-        model = world.models[0]
-        self._lift = -(float(model.body_mass[self.dynamics.bodies[0]]) + 0.5) * GRAVITY
-
-    def begin(self, rows: np.ndarray) -> None:
-        self._fresh[rows] = True
-        self.rising[rows] = False
-        super().begin(rows)
-        self._fresh[rows] = True  # still in the air: the first action waits for the ground
-
-    def apply(self, rows: np.ndarray, vectors: np.ndarray) -> None:
-        fresh = self._fresh[rows]
-        super().apply(rows, vectors)
-        self.state[rows] = np.where(fresh, 0, 1)
-        self._fresh[rows] = False
-        self.enter(rows)
-
-    def enter(self, rows: np.ndarray) -> None:
-        self.targets[rows] = self.of_state(rows)
-
-    def advance(self, rows: np.ndarray) -> np.ndarray:
-        landed = self.touching(rows)[:, -1]
-        rising = self.dynamics.velocities(rows)[:, 1] > 0
-        was, state = self.rising[rows], self.state[rows]
-        self.rising[rows] = rising
-        following = state.copy()
-        following[(state == 1) & rising & ~was] = 2
-        following[(state == 2) & ~landed] = 3
-        following[(state == 3) & ~rising & was] = 0
-        following[(state == 3) & landed] = 2
-        moved = following != state
-        if moved.any():
-            self.state[rows[moved]] = following[moved]
-            self.enter(rows[moved])
-        return (state == 0) & landed
-
-    def torques(self, rows: np.ndarray) -> np.ndarray:
-        dynamics = self.dynamics
-        q, v = dynamics.positions(rows), dynamics.velocities(rows)
-        state = self.state[rows]
-        tau = self.stable_pd(rows, q, v)
-        standing = (state == 1) | (state == 2)
-        upright = -self.kp[0] * q[:, 2] - self.kd[0] * v[:, 2]
-        tau[:, 0] -= standing * self.vectors[rows, 0] * upright
-        thigh = (q[:, None] @ self._frame)[:, 0, 0] + self._turn + q[:, 3]
-        tau[:, 1] += self.touching(rows)[:, -1] * self._lift * np.cos(thigh)
-        return np.clip(tau, -self.limits, self.limits)
-
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            **super().get_state(row),
-            'rising': bool(self.rising[row]),
-            'fresh': bool(self._fresh[row]),
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        super().set_state(row, state)
-        self.rising[row], self._fresh[row] = state['rising'], state['fresh']
+@compiled
+def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
+    """Puts a machine at the start of its first cycle, with a gait (P,)."""
+    state = gait.state
+    state.stance[i] = 0
+    state.rising[i], state.airborne[i] = False, True
+    for k in range(len(gait.machine.rest)):
+        state.target[i, k] = gait.machine.rest[k]
+    for k in range(len(vector)):
+        state.vector[i, k] = vector[k]
+    apply(i, gait)
+    state.airborne[i] = True  # the first action waits for the ground
 
 
-GAITS: dict[str, Callable[..., Gait]] = {
-    'dog': Bound,
-    'goat': Bound,
-    'raptor': Stride,
-    'biped2d_simbicon': Stride,
-    'hopper': Hop,
-}
+# Loops over simulations; they take packs.
 
 
-def make(character: Character, ground_body: str, root: Any, gait: Parameters | None = None) -> Gait:
-    """Makes the gait of a character; see `Gait`.
+@compiled_loop
+def begin_all(env_ids: np.ndarray, vector: np.ndarray, gait: GaitRules) -> None:
+    """Puts machines at the start of their first cycle."""
+    for i in env_ids:
+        begin(i, vector, gait)
 
-    Raises:
-      ValueError: no gait drives this character.
-    """
-    name = gait.character if gait else character.row.name
-    if name not in GAITS:
-        raise ValueError(errors.unknown('character with a gait', name, GAITS))
-    return GAITS[name](character, ground_body, root, gait)
+
+@compiled_loop
+def apply_all(env_ids: np.ndarray, vectors: np.ndarray, gait: GaitRules) -> None:
+    """Begins cycles with parameters (m, P)."""
+    for row in range(len(env_ids)):
+        for k in range(vectors.shape[1]):
+            gait.state.vector[env_ids[row], k] = vectors[row, k]
+        apply(env_ids[row], gait)
+
+
+@compiled_loop
+def act_all(env_ids: np.ndarray, gait: GaitRules) -> None:
+    """Writes the torques of the next control step."""
+    for i in env_ids:
+        act(i, gait)
+
+
+@compiled_loop
+def advance_all(env_ids: np.ndarray, gait: GaitRules, ended: np.ndarray) -> None:
+    """Moves machines on; writes whose cycle has ended, (m,)."""
+    for row in range(len(env_ids)):
+        ended[row] = advance(env_ids[row], gait)

@@ -2,7 +2,14 @@
 
 One JSON file per character:
 
+    kind                     'bound', 'stride' or 'hop', see `trl_suite.controllers.gaits`; what the
+                             first parameters mean goes by the kind
+    legs                     joints of each leg, the hip first: of a bound the hind leg and the fore
+                             leg, down to the joint of the foot, of a stride right and left
+    feet                     links that step, one for each leg
     misc, state_parameters   names; a vector is [misc..., of state 0..., of state 1..., ...]
+    targets                  of which joints the parameters of a state are targets; of a stride while
+                             the right leg stands
     states                   names, in the order of visit
     fixed                    parameters that are no part of an action
     absolute                 parameters whose sign does not count
@@ -13,6 +20,14 @@ One JSON file per character:
     search_scale             by name, without state: standard deviations for a search
     start                    the pose of the first instant: height of the root m, pitch rad, velocity
                              of the root (m/s, m/s, rad/s), and angle and rate of each joint
+
+and, where a character is an exception:
+
+    gravity_compensation     false: legs of a bound on the ground do not carry the weight
+    forward_only             true: a root that moves backwards is a fall
+    backward_reward          false: a cycle backwards earns nothing
+    reward                   weights of the terms 'speed' and 'stumble', 0.8 and 0.2
+    observe_pitch            true: pitch and its rate take the place of the last link's z and its rate
 
 Source of the figures: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
 Panne (2016); the sets 'tuned' of biped2d_simbicon and goat are our own.
@@ -30,6 +45,9 @@ import numpy as np
 
 from trl_suite import errors
 
+KINDS = ('bound', 'stride', 'hop')
+REWARD = {'speed': 0.8, 'stumble': 0.2}
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parameters:
@@ -37,6 +55,10 @@ class Parameters:
 
     Attributes:
       character: name of the character.
+      kind: one of `KINDS`.
+      legs: joints of each leg, the hip first.
+      feet: links that step, one for each leg.
+      targets: parameter of a state -> the joints whose target it is.
       names: of the P parameters, 'Cv' or 'Gather.Hip'.
       misc: how many come before those of the states.
       states: names.
@@ -47,12 +69,22 @@ class Parameters:
       base_actions: (8 or so, P).
       blends: of each base action: a set, another, and the other's share.
       centre: what action 0 means, (P,).
-      half_range: largest deviation of a base action from the first one, (P,); what action 1 adds.
+      half_range: largest deviation of a base action from the centre, (P,); what action 1 adds. So
+        every base action lies in [-1, 1].
       search_scale: standard deviation for a search, (P,).
       start: the pose of the first instant, see the module.
+      gravity_compensation: whether legs of a bound on the ground carry the weight.
+      forward_only: whether moving backwards is a fall.
+      backward_reward: whether a cycle backwards earns anything.
+      reward: weights of the reward terms, by name.
+      observe_pitch: whether pitch and its rate are observed in place of the last link's z.
     """
 
     character: str
+    kind: str
+    legs: tuple[tuple[str, ...], ...]
+    feet: tuple[str, ...]
+    targets: dict[str, tuple[str, ...]]
     names: tuple[str, ...]
     misc: int
     states: tuple[str, ...]
@@ -66,6 +98,11 @@ class Parameters:
     half_range: np.ndarray
     search_scale: np.ndarray
     start: dict[str, Any]
+    gravity_compensation: bool
+    forward_only: bool
+    backward_reward: bool
+    reward: dict[str, float]
+    observe_pitch: bool
 
     def vector(self, action: np.ndarray) -> np.ndarray:
         """Returns the parameters (n, P) that actions (n, a) mean: centre + half_range * action."""
@@ -105,8 +142,16 @@ def read(data: dict[str, Any]) -> Parameters:
     """Makes parameters from what a file holds.
 
     Raises:
-      ValueError: a vector has another length, or a name is unknown.
+      ValueError: a vector has another length, a name is unknown, or legs and feet do not fit.
     """
+    if data['kind'] not in KINDS:
+        raise ValueError(errors.unknown('kind of gait', data['kind'], KINDS))
+    legs = tuple(tuple(leg) for leg in data['legs'])
+    if len({len(leg) for leg in legs}) != 1 or len(legs) != len(data['feet']):
+        raise ValueError('legs need as many joints each, and a foot each')
+    for name in data['targets']:
+        if name not in data['state_parameters']:
+            raise ValueError(errors.unknown('parameter of a state', name, data['state_parameters']))
     names = (*data['misc'], *(f'{s}.{p}' for s in data['states'] for p in data['state_parameters']))
     sets = {name: np.array(values, float) for name, values in data['sets'].items()}
     for name, values in sets.items():
@@ -119,8 +164,13 @@ def read(data: dict[str, Any]) -> Parameters:
         [(1 - blend) * sets[a] + blend * sets[b] for a, b, blend in data['base_actions']]
     )
     centre = data['centre']
+    centre = sets[centre] if isinstance(centre, str) else base[centre]
     return Parameters(
         character=data['character'],
+        kind=data['kind'],
+        legs=legs,
+        feet=tuple(data['feet']),
+        targets={name: tuple(joints) for name, joints in data['targets'].items()},
         names=names,
         misc=len(data['misc']),
         states=tuple(data['states']),
@@ -130,8 +180,13 @@ def read(data: dict[str, Any]) -> Parameters:
         sets=sets,
         base_actions=base,
         blends=tuple((a, b, float(blend)) for a, b, blend in data['base_actions']),
-        centre=sets[centre] if isinstance(centre, str) else base[centre],
-        half_range=np.abs(base - base[0]).max(0),
+        centre=centre,
+        half_range=np.abs(base - centre).max(0),
         search_scale=np.array([data['search_scale'][name.split('.')[-1]] for name in names]),
         start=data['start'],
+        gravity_compensation=data.get('gravity_compensation', True),
+        forward_only=data.get('forward_only', False),
+        backward_reward=data.get('backward_reward', True),
+        reward=data.get('reward', REWARD),
+        observe_pitch=data.get('observe_pitch', False),
     )

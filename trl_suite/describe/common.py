@@ -36,7 +36,7 @@ def character(environment: Environment) -> Iterator[Section]:
     title, last = REWARD_WEIGHT, [joint.weight for joint in row.joints.values()]
     if gait is not None:
         title = 'target is to'
-        last = ['the world' if j in gait.world_joints else 'its parent' for j in row.joints]
+        last = ['the world' if j in gait.hips else 'its parent' for j in row.joints]
     elif above:
         title, last = '', [''] * len(last)
     yield section(f'Character: {row.name}', row.description, figures(figure))

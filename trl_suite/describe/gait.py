@@ -22,7 +22,7 @@ _BLOCKS = {
     'velocity': ('m/s', 'x, z velocity of each link centre'),
 }
 _STANCE_FIRST = '; the stance leg first, then the swing leg'
-_HOPPER_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
+_PITCH_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
 # Units of gait parameters that are no angles, by name without state.
 _UNITS = {
     'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
@@ -51,7 +51,7 @@ _FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
 def blocks(task: Any) -> Meanings:
     """Returns units and meanings of the observation blocks."""
     row = task.character.row
-    ends = _HOPPER_ENDS if row.name == 'hopper' else {}
+    ends = _PITCH_ENDS if task.gait.parameters.observe_pitch else {}
     if row.mirror:
         ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
     return {name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _BLOCKS.items()}
@@ -131,10 +131,11 @@ def _effect(task: Any, parameter: str) -> str:
 
 def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     """Yields reward and termination."""
-    figure, weights = task.character.row, task.reward_weights
+    figure, parameters = task.character.row, task.gait.parameters
+    weights = parameters.reward
     weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
     lines = [
-        f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {task.gait.parameters.target_speed:g})^2)',
+        f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
         'v: mean forward speed of the centre of mass, m/s',
     ]
     if weights['stumble']:
@@ -143,7 +144,7 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
             's: share of the time in which a link other than '
             f'{", ".join(figure.stumble_exempt)} touches the ground'
         )
-    if figure.name in gait.NO_REWARD_BACKWARDS:
+    if not parameters.backward_reward:
         lines.append('0 if v is negative')
     yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
     links = ', '.join(figure.fall_links)
@@ -154,7 +155,7 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
         f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
         'the physics diverges',
     ]
-    if figure.name in gait.FORWARD_ONLY:
+    if parameters.forward_only:
         ends.insert(2, 'it moves backwards')
     yield section(
         f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',

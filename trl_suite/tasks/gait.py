@@ -7,24 +7,43 @@ the environment's discount is 0 after a fall and 1 otherwise.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
-from typing import Any
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from trl_suite import actuation, controllers, errors
+from trl_suite import actuation, errors
 from trl_suite.action_map import ActionMap
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
-from trl_suite.controllers import CONTROL_TIMESTEP, dynamics
-from trl_suite.engine import World
+from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, gaits
+from trl_suite.controllers.machine import GaitRules, touches
+from trl_suite.engine import World, native
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarFigure,
+    PlanarMeasurement,
+    leaves,
+    measure,
+    must_wait,
+)
 from trl_suite.kinematics.planar_reference import link_extents
-from trl_suite.tasks.batch_task import BatchTask
-from trl_suite.tasks.figure import PlanarFigure
-from trl_suite.tasks.task import check_simulated, consecutive, drawn_seed
+from trl_suite.tasks.task import (
+    Outcome,
+    Task,
+    begin,
+    check_simulated,
+    conclude,
+    consecutive,
+    drawn_seed,
+    outcome,
+    too_fast,
+)
 from trl_suite.terrain import Strip
+from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m
 SUBSTEPS = 2  # physics steps per control step: 1/1200 s
@@ -38,21 +57,331 @@ SAMPLE = 0.1  # s
 FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples with a fall link down
 TURNED = 0.8 * np.pi  # rad
 PATIENCE, PROGRESS = 5.0, 0.5  # s, m; who moves less than that in that time is stuck
-NO_REWARD_BACKWARDS = ('raptor',)
-FORWARD_ONLY = ('biped2d_simbicon',)  # characters whose root may not move backwards
 MAX_JOINT_SPEED = 1000.0  # rad/s; feet whip: there is no damping in these joints
 
 # Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 share of time stumbling).
 SPEED_SHARPNESS, STUMBLE_SHARPNESS = 0.5, 10.0
-WEIGHTS = {'speed': 0.8, 'stumble': 0.2}
-ONLY_SPEED = {'speed': 1.0, 'stumble': 0.0}
+TERMS = ('speed', 'stumble')
+SPEED, STUMBLE = range(len(TERMS))
 
 _FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
+_OVER, _GROUND, _LOOK = range(3)  # why a step is interrupted: not at all, for ground, for `watch`
 
 
-class GaitTask(BatchTask):
+class GaitTaskState(NamedTuple):
+    """What the task remembers of each simulation, (n,); times are in control steps.
+
+    Attributes:
+      action: in [-1, 1], (n, k).
+      going: whether the current step is not over.
+      waiting: whether a gait's cycle is over and wants parameters.
+      lasted, stumbled: time of the last step, and that with a link on the ground that should not be.
+      age: time in the episode.
+      start: where the centre of mass was at the beginning of the step, m.
+      down: running share of samples with a fall link on the ground.
+      milestone: x and z of the root at the last test of progress, (n, 2) m.
+      fell, stuck: how the episode has ended.
+      duration, stumbling: the times in s, of steps that are finished.
+    """
+
+    action: np.ndarray
+    going: np.ndarray
+    waiting: np.ndarray
+    lasted: np.ndarray
+    stumbled: np.ndarray
+    age: np.ndarray
+    start: np.ndarray
+    down: np.ndarray
+    milestone: np.ndarray
+    fell: np.ndarray
+    stuck: np.ndarray
+    duration: np.ndarray
+    stumbling: np.ndarray
+
+
+class Options(NamedTuple):
+    """What tells one task from another.
+
+    Attributes:
+      by_cycle: whether a step is a cycle, not a frame.
+      substeps: physics steps per control step.
+      centre: parameters of the gait at action 0, (P,).
+      half_range: what action 1 adds to those that actions set, (k,).
+      places: which these are, (k,).
+      base_actions: parameters that a preference chooses, (B, P).
+      controls: addresses of the joints' torques in ctrl, (J,).
+      fall, stumble: numbers of links that must not touch the ground, or should not.
+      forward_only: whether moving backwards is a fall.
+      backward_reward: whether a cycle backwards earns anything.
+      target_speed: m/s.
+      weights: of the reward terms, (2,).
+      columns: of the measurement, which make an observation, by stance leg, (2, size).
+      pitch, pitch_rate: columns of the observation that they take, -1 for none.
+    """
+
+    by_cycle: bool
+    substeps: int
+    centre: np.ndarray
+    half_range: np.ndarray
+    places: np.ndarray
+    base_actions: np.ndarray
+    controls: np.ndarray
+    fall: np.ndarray
+    stumble: np.ndarray
+    forward_only: bool
+    backward_reward: bool
+    target_speed: float
+    weights: np.ndarray
+    columns: np.ndarray
+    pitch: int
+    pitch_rate: int
+
+
+class Rules(NamedTuple):
+    """All that the rules of gait tasks work on.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      measured: terrain, pose and velocity as `measure` writes them, (n, ...).
+      interruption: why the step of each was interrupted, (n,).
+    """
+
+    engine: native.Engine
+    body: PlanarBody
+    ground: PlanarGround
+    gait: GaitRules
+    ctrl: np.ndarray
+    options: Options
+    measured: np.ndarray
+    interruption: np.ndarray
+    found: PlanarMeasurement
+    state: GaitTaskState
+    outcome: Outcome
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def begin_step(i: int, action: np.ndarray, rules: Rules) -> None:
+    """Takes an action; it sets the gait of the cycle that begins."""
+    state = rules.state
+    for k in range(state.action.shape[1]):
+        state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+    state.lasted[i] = state.stumbled[i] = 0
+    state.going[i] = True
+    state.start[i] = rules.gait.physics.subtree_com[i, rules.body.links[0], 0]
+    if rules.options.by_cycle or state.waiting[i]:
+        set_gait(i, rules)
+
+
+@compiled
+def set_gait(i: int, rules: Rules) -> None:
+    """Begins a cycle with the parameters that the action means."""
+    options, action, vector = rules.options, rules.state.action, rules.gait.state.vector
+    rules.state.waiting[i] = False
+    if options.by_cycle:
+        for k in range(len(options.centre)):
+            vector[i, k] = options.centre[k]
+        for k in range(len(options.places)):
+            vector[i, options.places[k]] += options.half_range[k] * action[i, k]
+    else:
+        choice = 0
+        for k in range(1, len(options.base_actions)):
+            if action[i, k] > action[i, choice]:
+                choice = k
+        for k in range(len(options.centre)):
+            vector[i, k] = options.base_actions[choice, k]
+    gaits.apply(i, rules.gait)
+
+
+@compiled
+def go_on(i: int, watched: bool, rules: Rules) -> int:
+    """Goes on with a step until it is over, or is interrupted; returns why."""
+    state, options = rules.state, rules.options
+    while state.going[i]:
+        if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
+            i, rules.body, rules.gait.physics, rules.ground, rules.found
+        ):
+            return _GROUND
+        gaits.act(i, rules.gait)
+        for k in range(len(options.controls)):
+            rules.ctrl[i, options.controls[k]] = rules.gait.scratch.torque[i, k]
+        native.step(i, options.substeps, rules.engine)
+        ended = gaits.advance(i, rules.gait)
+        account(i, rules)
+        if options.by_cycle:
+            over = ended or state.lasted[i] == LONGEST_CYCLE * _FRAME_STEPS
+        else:
+            over = state.lasted[i] == _FRAME_STEPS
+            if ended:
+                set_gait(i, rules)
+        state.going[i] = not (over or rules.outcome.failed[i])
+        if watched and i == 0 and state.age[i] % _FRAME_STEPS == 0:
+            return _LOOK
+    return _OVER
+
+
+@compiled
+def account(i: int, rules: Rules) -> None:
+    """Time, stumbling and falls after a control step."""
+    state = rules.state
+    state.lasted[i] += 1
+    state.age[i] += 1
+    state.stumbled[i] += any_touches(i, rules.options.stumble, rules.gait)
+    if state.age[i] % _SAMPLE_STEPS == 0:
+        look(i, rules)
+
+
+@compiled
+def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
+    """Whether any of some links touches the ground."""
+    for link in links:
+        if touches(i, link, gait):
+            return True
+    return False
+
+
+@compiled
+def look(i: int, rules: Rules) -> None:
+    """Looks whether the episode has failed."""
+    state, body, physics = rules.state, rules.body, rules.gait.physics
+    state.down[i] *= FADING
+    if any_touches(i, rules.options.fall, rules.gait):
+        state.down[i] += SHARE
+    pitch = physics.qpos[i, body.qpos[2]]
+    turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
+    backwards = rules.options.forward_only and physics.qvel[i, body.dof[0]] < 0.0
+    state.fell[i] = state.down[i] > FALLEN or turn > TURNED or backwards
+    if state.age[i] % _PATIENCE_STEPS == 0:
+        x, z = physics.qpos[i, body.qpos[0]], physics.qpos[i, body.qpos[1]]
+        moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
+        state.stuck[i] = moved < PROGRESS
+        state.milestone[i, 0], state.milestone[i, 1] = x, z
+    diverged = breaks_down(i, rules)
+    rules.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
+
+
+@compiled
+def breaks_down(i: int, rules: Rules) -> bool:
+    """Whether the physics has diverged; the last finite observation then stands."""
+    joints = rules.body.dof[3:]
+    diverged = native.diverged(i, rules.engine) or too_fast(
+        i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel
+    )
+    rules.outcome.diverged[i] = diverged
+    return diverged
+
+
+@compiled
+def finish_step(i: int, rules: Rules) -> None:
+    """Reward, failure and observation of a step that is over."""
+    state, outcome = rules.state, rules.outcome
+    state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
+    state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
+    outcome.diverged[i] |= native.diverged(i, rules.engine)
+    failed = outcome.failed[i] or outcome.diverged[i]
+    if outcome.diverged[i]:
+        state.fell[i] = state.stuck[i] = False
+    else:
+        reward(i, rules)
+        observe(i, rules)
+    conclude(i, failed, outcome)
+
+
+@compiled
+def reward(i: int, rules: Rules) -> None:
+    """Writes the reward terms: speed, and how long it has not stumbled."""
+    state, options, terms = rules.state, rules.options, rules.outcome.reward_terms
+    travelled = rules.gait.physics.subtree_com[i, rules.body.links[0], 0] - state.start[i]
+    speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
+    off = speed - options.target_speed
+    share = state.stumbled[i] / state.lasted[i]
+    terms[i, SPEED] = options.weights[SPEED] * math.exp(-SPEED_SHARPNESS * (off * off))
+    terms[i, STUMBLE] = options.weights[STUMBLE] / (1 + STUMBLE_SHARPNESS * share)
+    if speed < 0.0 and not options.backward_reward:
+        terms[i, SPEED] = terms[i, STUMBLE] = 0.0
+
+
+@compiled
+def observe(i: int, rules: Rules) -> None:
+    """Writes the observation: the swing leg comes last."""
+    options, body, physics = rules.options, rules.body, rules.gait.physics
+    measured, observation = rules.measured, rules.outcome.observation
+    measure(i, body, physics, rules.ground, measured, rules.found)
+    stance = rules.gait.state.stance[i]
+    for k in range(options.columns.shape[1]):
+        observation[i, k] = measured[i, options.columns[stance, k]]
+    if options.pitch >= 0:
+        observation[i, options.pitch] = physics.qpos[i, body.qpos[2]]
+        observation[i, options.pitch_rate] = physics.qvel[i, body.dof[2]]
+
+
+@compiled
+def begin_episode(i: int, rules: Rules) -> None:
+    """Puts machine, outcome and what the task remembers to their starts."""
+    state, body, physics = rules.state, rules.body, rules.gait.physics
+    gaits.begin(i, rules.options.centre, rules.gait)
+    begin(i, rules.outcome)
+    state.going[i], state.waiting[i] = False, True
+    state.lasted[i] = state.stumbled[i] = state.age[i] = 0
+    state.down[i] = state.duration[i] = state.stumbling[i] = 0.0
+    state.fell[i] = state.stuck[i] = False
+    state.milestone[i, 0] = physics.qpos[i, body.qpos[0]]
+    state.milestone[i, 1] = physics.qpos[i, body.qpos[1]]
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def begin_steps(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> None:
+    """Takes actions."""
+    for i in env_ids:
+        begin_step(i, action, rules)
+
+
+@compiled_loop
+def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
+    """Goes on with steps; returns how many were interrupted."""
+    interrupted = 0
+    for i in env_ids:
+        rules.interruption[i] = go_on(i, watched, rules)
+        interrupted += rules.interruption[i] != _OVER
+    return interrupted
+
+
+@compiled_loop
+def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
+    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+        else:
+            finish_step(i, rules)
+    return waiting
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
+    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        if fresh:
+            begin_episode(i, rules)
+        observe(i, rules)
+    return waiting
+
+
+class GaitTask(Task):
     """Travel at the target speed by setting a gait's parameters.
 
     Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
@@ -61,10 +390,13 @@ class GaitTask(BatchTask):
     the hopper's last link z becomes the root's pitch in pose and its rate in velocity.
 
     Attributes:
+      gait: the state machines.
+      state: what the task remembers, after `bind`.
       watch: called at every multiple of 1/30 s of the first simulation's episode, within steps too;
         for pictures.
     """
 
+    state: GaitTaskState
     fields = dynamics.FIELDS
     watch: Callable[[], None] | None = None
 
@@ -82,7 +414,7 @@ class GaitTask(BatchTask):
         """Attaches character and gait to an arena.
 
         Args:
-          character: one with a gait, see `trl_suite.controllers.GAITS`.
+          character: one with a gait, see `trl_suite.controllers.available`.
           arena: planar terrain.
           interface: 'parameters': a step is a cycle, and an action sets the gait's parameters, 0 the
             default and +-1 the largest deviation of any base action. 'base_action': a step is 1/30
@@ -105,9 +437,9 @@ class GaitTask(BatchTask):
             raise ValueError(f'start_noise is {start_noise}; expected 0 or a positive number')
         self.character, self.arena, self.interface = character, arena, interface
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
-        self.gait = controllers.make(character, arena.ground_body, arena.mjcf_model)
+        self.gait = Gait(character, arena.ground_body, arena.mjcf_model)
         self._spawn, self._blend, self._noise = spawn, blend, float(start_noise)
-        self._control_steps = int(substeps)
+        self._control_substeps = int(substeps)
         timestep = CONTROL_TIMESTEP / substeps
         self.set_timesteps(FRAME, timestep)
         actuation.add(character, 'torque', timestep)
@@ -130,7 +462,6 @@ class GaitTask(BatchTask):
         self.blocks = consecutive({
             'terrain': SAMPLES, 'pose': 2 * links - 1, 'velocity': 2 * links,
         })  # fmt: skip
-        self.reward_weights = ONLY_SPEED if character.row.name == 'hopper' else WEIGHTS
 
     @property
     def root_entity(self) -> PlanarTerrain:
@@ -142,67 +473,95 @@ class GaitTask(BatchTask):
         return f'{super().signature} of {" / ".join(parts)}'
 
     def bind(self, world: World) -> None:
-        self.world = world
-        self.figure.bind(world)
-        self.gait.bind(world)
-        row, n = self.character.row, world.n
-        scope = f'{self.character.mjcf_model.model}/'
-        self._controls = world.control_addresses([scope + name for name in row.joints])
-        self._fall = np.array([self.gait.link[name] for name in row.fall_links])
-        self._stumble = np.array([
-            i for i, name in enumerate(row.links) if name not in row.stumble_exempt
-        ])  # fmt: skip
-        self._measured = np.zeros((n, sum(self.figure.blocks.values()) + 2))
-        self._columns = self._arrangements()
-        self._view = self._views()
-        self.observation = np.zeros((n, max(part.stop for part in self.blocks.values())))
-        self.reward = np.zeros(n)
-        self.reward_terms = np.zeros((n, len(self.reward_weights)))
-        self.failed, self.diverged = np.zeros(n, bool), np.zeros(n, bool)
-        self._fallen, self._stuck = np.zeros(n, bool), np.zeros(n, bool)
-        self._lasted, self._stumbled = np.zeros((2, n), int)  # control steps, of the last step
-        self._from = np.zeros(n)  # m; of the centre of mass, at the beginning of the step
-        self._age = np.zeros(n, int)  # control steps in the episode
-        self._down = np.zeros(n)  # running share of samples with a fall link on the ground
-        self._milestone = np.zeros((n, 2))  # m; root at the last test of progress
-        self._waiting = np.ones(n, bool)  # whether a gait's cycle is over and wants parameters
-        self._action = np.zeros((n, len(self.action_map)))
+        self.world, n = world, world.n
+        figure, gait = self.figure, self.gait
+        blocks = consecutive(figure.blocks)
+        figure.bind(world, blocks)
+        gait.bind(world)
+        parameters = gait.parameters
+        options = self._options(figure.body)
+        self.state = GaitTaskState(
+            action=np.zeros((n, len(self.action_map))),
+            going=np.zeros(n, bool),
+            waiting=np.zeros(n, bool),
+            lasted=np.zeros(n, int),
+            stumbled=np.zeros(n, int),
+            age=np.zeros(n, int),
+            start=np.zeros(n),
+            down=np.zeros(n),
+            milestone=np.zeros((n, 2)),
+            fell=np.zeros(n, bool),
+            stuck=np.zeros(n, bool),
+            duration=np.zeros(n),
+            stumbling=np.zeros(n),
+        )
+        size = max(part.stop for part in self.blocks.values())
+        self.outcome = outcome(n, size, len(parameters.reward))
+        self.saved = (self.state, gait.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': dict(zip(parameters.reward, self.reward_terms.T, strict=True)),
+            'fell': self.state.fell,
+            'stuck': self.state.stuck,
+            'diverged': self.outcome.diverged,
+            'distance': world.qpos[:, figure.pose_qpos[0]],
+            'duration': self.state.duration,
+            'stumbled': self.state.stumbling,
+        }
+        self.rules = Rules(
+            world.engine, figure.body, figure.ground, gait.rules, world.ctrl, options,
+            np.zeros((n, sum(figure.blocks.values()))), np.zeros(n, int), figure.measurement(),
+            self.state, self.outcome,
+        )  # fmt: skip
+        self._pack = packed(self.rules)
         self._start = self._start_pose()
 
-    def _views(self) -> SimpleNamespace:
-        blocks = consecutive(self.figure.blocks)
-        n, effectors = self.world.n, len(self.figure.effectors)
-        return self.figure.views(
-            self._measured, blocks, np.zeros((n, 2 * effectors)), np.zeros((n, 2))
+    def _options(self, body: PlanarBody) -> Options:
+        parameters, row = self.gait.parameters, self.character.row
+        scope = f'{self.character.mjcf_model.model}/'
+        controls = self.world.control_addresses([scope + name for name in row.joints])
+        fall = [self.gait.link[name] for name in row.fall_links]
+        stumble = [i for i, name in enumerate(row.links) if name not in row.stumble_exempt]
+        pitch = parameters.observe_pitch
+        return Options(
+            by_cycle=self.interface == 'parameters',
+            substeps=self._control_substeps,
+            centre=parameters.centre.copy(),
+            half_range=parameters.half_range[parameters.actions],
+            places=parameters.actions,
+            base_actions=parameters.base_actions,
+            controls=controls,
+            fall=np.array(fall),
+            stumble=np.array(stumble),
+            forward_only=parameters.forward_only,
+            backward_reward=parameters.backward_reward,
+            target_speed=float(parameters.target_speed),
+            weights=np.array([parameters.reward[name] for name in TERMS]),
+            columns=self._columns(body),
+            pitch=self.blocks['pose'].stop - 1 if pitch else -1,
+            pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
         )
 
-    def _arrangements(self) -> np.ndarray:
+    def _columns(self, body: PlanarBody) -> np.ndarray:
         """Columns of the measurement that make an observation, by stance leg, (2, size)."""
         links = self.character.row.links
-        count, name = len(links), self.character.row.name
-        pose = SAMPLES + 1 + 2 * np.arange(count)[:, None] + np.arange(2)
-        velocity = pose + 2 * count
-        last = SAMPLES + 1 + 4 * count  # pitch and its rate
-        order = np.arange(count)
+        order = np.arange(len(links))
         mirrored = order.copy()
         for right, left in self.character.row.mirror:
             i, j = links.index(right), links.index(left)
             mirrored[i], mirrored[j] = j, i
         arranged = []
-        for links_in_order in (order, mirrored):
-            columns = [np.arange(SAMPLES + 1), pose[links_in_order[1:]].ravel()]
-            columns.append(velocity[links_in_order].ravel())
-            arranged.append(np.concatenate(columns))
-        result = np.array(arranged)
-        if name == 'hopper':
-            pose_end = self.blocks['pose'].stop - 1
-            result[:, pose_end], result[:, -1] = last, last + 1
-        return result
+        for each in (order, mirrored):
+            pairs = 2 * each[:, None] + np.arange(2)
+            arranged.append(np.concatenate([
+                np.arange(SAMPLES) + body.terrain, [body.pose],
+                (pairs[1:] + body.pose + 1).ravel(), (pairs + body.velocity).ravel(),
+            ]))  # fmt: skip
+        return np.array(arranged)
 
     def _start_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pose and rates of the first instant, (1, D), and extents of the geoms, (1, 3, G)."""
         start, figure = self.gait.parameters.start, self.figure
-        pose, rates = np.zeros((2, 1, self.gait.dynamics.size))
+        pose, rates = np.zeros((2, 1, len(figure.pose_qpos)))
         pose[0, 1:3], rates[0, :3] = (start['height'], start['pitch']), start['velocity']
         for name, (angle, rate) in start['joints'].items():
             pose[0, 3 + self.gait.number[name]] = angle
@@ -214,16 +573,14 @@ class GaitTask(BatchTask):
         root = data.xpos[figure.links[0]][::2]
         return pose, rates, link_extents(model, data, figure.geoms, root)[None]
 
-    def begin_episodes(
-        self, rows: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
-        poses, rates, extents = (np.repeat(part, len(rows), axis=0) for part in self._start)
-        for i, (row, random_state) in enumerate(zip(rows.tolist(), random_states, strict=True)):
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        poses, rates, extents = (np.repeat(part, len(env_ids), axis=0) for part in self._start)
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             noise = self._noise * random_state.standard_normal((2, poses.shape[1] - 3))
             push = self._noise * random_state.standard_normal()
-            poses[i, 3:] += noise[0]
-            rates[i, 3:] += 10 * noise[1]
-            rates[i, 0] += 10 * push
+            poses[k, 3:] += noise[0]
+            rates[k, 3:] += 10 * noise[1]
+            rates[k, 0] += 10 * push
             strip = Strip(
                 self.arena.terrain,
                 drawn_seed(random_state),
@@ -231,148 +588,38 @@ class GaitTask(BatchTask):
                 spawn=self._spawn,
                 centre=UPSTREAM_CENTRE,
             )
-            self.arena.begin_episode(row, strip)
-        self.figure.place(rows, poses, rates, extents)
-        self.gait.begin(rows)
-        for of_row in (
-            self.failed, self.diverged, self._fallen, self._stuck, self.reward, self.reward_terms,
-            self._lasted, self._stumbled, self._age, self._down,
-        ):  # fmt: skip
-            of_row[rows] = 0
-        self._waiting[rows] = True
-        self._milestone[rows] = self.world.qpos[rows][:, self.figure.pose_qpos[:2]]
+            self.arena.begin_episode(i, strip)
+        self.figure.place(env_ids, poses, rates, extents)
+        self._observe(env_ids, True)
 
-    def act(self, action: np.ndarray) -> None:
-        self._action[...] = np.clip(action, -1, 1)
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        begin_steps(env_ids, action, self._pack)
 
-    def simulate(self, rows: np.ndarray | None = None) -> None:
-        """Runs each row to the end of its cycle, or for a frame."""
-        rows = np.arange(self.world.n) if rows is None else rows
-        if not len(rows):  # all have just begun an episode
-            return
-        self._lasted[rows] = self._stumbled[rows] = 0
-        self._from[rows] = self.gait.dynamics.com(rows)[:, 0]
-        self._parametrise(rows)
-        by_cycle = self.interface == 'parameters'
-        going = rows
-        for step in range(LONGEST_CYCLE * _FRAME_STEPS if by_cycle else _FRAME_STEPS):
-            if step % _FRAME_STEPS == 0:
-                self.arena.follow(self.world.qpos[going][:, self.figure.pose_qpos[:1]], going)
-            self.world.ctrl[going[:, None], self._controls] = self.gait.torques(going)
-            self.world.step(self._control_steps, None if len(going) == self.world.n else going)
-            ended = self.gait.advance(going)
-            self._account(going)
-            if self.watch is not None and self._age[0] % _FRAME_STEPS == 0:
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Runs each simulation to the end of its cycle, or for a frame."""
+        interruption = self.rules.interruption
+        while run(env_ids, self.watch is not None, self._pack):
+            leaving = env_ids[interruption[env_ids] == _GROUND]
+            if len(leaving):
+                self.figure.follow(leaving)
+            if self.watch is not None and (interruption[env_ids] == _LOOK).any():
                 self.watch()
-            over = self.failed[going]
-            if by_cycle:
-                over |= ended
-            elif ended.any():
-                self._waiting[going[ended]] = True
-                self._parametrise(going[ended])
-            if over.any():
-                going = going[~over]
-                if not len(going):
-                    break
 
-    def _parametrise(self, rows: np.ndarray) -> None:
-        """Gives the gait of rows the parameters that their actions mean."""
-        if self.interface == 'base_action':
-            rows = rows[self._waiting[rows]]
-            self._waiting[rows] = False
-            choice = self._action[rows].argmax(1)
-            self.gait.apply(rows, self.gait.parameters.base_actions[choice])
-        else:
-            self.gait.apply(rows, self.gait.parameters.vector(self._action[rows]))
-
-    def _account(self, rows: np.ndarray) -> None:
-        """Time, stumbling and falls after a control step of some rows."""
-        touching = self.gait.touching(rows)
-        self._lasted[rows] += 1
-        self._stumbled[rows] += touching[:, self._stumble].any(1)
-        self._age[rows] += 1
-        sampled = self._age[rows] % _SAMPLE_STEPS == 0
-        if not sampled.any():
-            return
-        rows = rows[sampled]
-        self._down[rows] *= FADING
-        self._down[rows] += SHARE * touching[sampled][:, self._fall].any(1)
-        x, z, pitch = self.figure.pose_qpos[:3]
-        turn = np.abs((self.world.qpos[rows, pitch] + np.pi) % (2 * np.pi) - np.pi)
-        self._fallen[rows] = (self._down[rows] > FALLEN) | (turn > TURNED)
-        if self.character.row.name in FORWARD_ONLY:
-            self._fallen[rows] |= self.world.qvel[rows, self.figure.pose_dof[0]] < 0
-        due = rows[self._age[rows] % _PATIENCE_STEPS == 0]
-        if len(due):
-            root = self.world.qpos[due][:, [x, z]]
-            self._stuck[due] = np.hypot(*(root - self._milestone[due]).T) < PROGRESS
-            self._milestone[due] = root
-        rates = self.world.qvel[rows][:, self.figure.pose_dof[3:]]
-        wild = ~(np.abs(rates) < MAX_JOINT_SPEED).all(1)
-        self.diverged[rows] = wild | self.world.diverged()[rows]
-        self.failed[rows] = self._fallen[rows] | self._stuck[rows] | self.diverged[rows]
-
-    def finish_step(self, stepped: np.ndarray | None = None) -> None:
-        rows = np.arange(self.world.n) if stepped is None else np.flatnonzero(stepped)
-        check_simulated(self._lasted[rows])
-        self.diverged[rows] |= self.world.diverged()[rows]
-        self.failed |= self.diverged
-        kept = self.observation[self.diverged]
-        self.observe()
-        self.observation[self.diverged] = kept  # the last finite one stands for what broke down
-        lasted = self._lasted[rows]
-        travelled = self.gait.dynamics.com(rows)[:, 0] - self._from[rows]
-        speed = travelled / (CONTROL_TIMESTEP * lasted)
-        target = self.gait.parameters.target_speed
-        terms = self.reward_terms
-        terms[rows, 0] = self.reward_weights['speed'] * np.exp(
-            -SPEED_SHARPNESS * (speed - target) ** 2
-        )
-        share = self._stumbled[rows] / lasted
-        terms[rows, 1] = self.reward_weights['stumble'] / (1 + STUMBLE_SHARPNESS * share)
-        if self.character.row.name in NO_REWARD_BACKWARDS:
-            terms[rows[speed < 0]] = 0.0
-        terms[self.failed] = 0.0
-        self.reward[...] = terms.sum(1)
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        check_simulated(self.state.lasted[env_ids])
+        if finish_steps(env_ids, self._pack):
+            finish_steps(self._widened(env_ids), self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
-        self.figure.measure(self._view)
-        measured = self._measured
-        measured[:, -2] = self.world.qpos[:, self.figure.pose_qpos[2]]
-        measured[:, -1] = self.world.qvel[:, self.figure.pose_dof[2]]
-        stance = getattr(self.gait, 'stance', None)
-        if stance is None:
-            measured.take(self._columns[0], 1, self.observation, 'clip')
-        else:
-            self.observation[...] = np.take_along_axis(measured, self._columns[stance], 1)
+        self._observe(self.world.all_ids if env_ids is None else env_ids, False)
 
-    def infos(self) -> dict[str, Any]:
-        """Reward terms, how it ended, distance in m, duration of the cycle in s, its stumbling."""
-        return {
-            'reward_terms': dict(zip(self.reward_weights, self.reward_terms.T.copy(), strict=True)),
-            'fell': self._fallen & ~self.diverged,
-            'stuck': self._stuck & ~self.diverged,
-            'diverged': self.diverged.copy(),
-            'distance': self.world.qpos[:, self.figure.pose_qpos[0]].copy(),
-            'duration': CONTROL_TIMESTEP * self._lasted,
-            'stumbled': CONTROL_TIMESTEP * self._stumbled,
-        }
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if observe_all(env_ids, fresh, self._pack):
+            observe_all(self._widened(env_ids), fresh, self._pack)
 
-    def get_state(self, row: int) -> dict[str, Any]:
-        return {
-            'arena': self.arena.state(row),
-            'gait': self.gait.get_state(row),
-            **{name: getattr(self, name)[row].copy() for name in _OF_ROWS},
-        }
-
-    def set_state(self, row: int, state: dict[str, Any]) -> None:
-        self.arena.restore(row, state['arena'])
-        self.gait.set_state(row, state['gait'])
-        for name in _OF_ROWS:
-            getattr(self, name)[row] = state[name]
-
-
-_OF_ROWS = (
-    'observation', 'reward', 'reward_terms', 'failed', 'diverged', '_lasted', '_stumbled', '_fallen',
-    '_stuck', '_from', '_age', '_down', '_milestone', '_waiting', '_action',
-)  # fmt: skip
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self.rules.found.waiting[env_ids]]
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting
