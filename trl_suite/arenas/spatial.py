@@ -12,11 +12,12 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.engine import World
+from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
 from trl_suite.terrain.ground import Random
 from trl_suite.terrain.spatial_ground import HALF, VERTICES
 from trl_suite.terrain.surroundings import ALL, Rows
+from trl_suite.util.compiled import packed
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
 BASE = 1.0  # m; of height fields, below their lowest point
@@ -132,6 +133,11 @@ class SpatialTerrain(composer.Arena):
         self._own = np.flatnonzero(own)
         for model in world.models:
             self._set_inertia(model)
+        placed = [*self.boxes[:1], *self.belts[:1], *(body.geom[0] for body in self.movers)]
+        placed += [geom for geom in (self.plane, self.field) if geom is not None]
+        geoms = world.geom_ids([geom.full_identifier for geom in placed])
+        self._placed = np.unique(world.models[0].geom_bodyid[geoms]).astype(int)
+        self._geoms = [packed(bounds.geoms(model)) for model in world.models]
 
     @property
     def grounds(self) -> list[Ground | None]:
@@ -275,7 +281,7 @@ class SpatialTerrain(composer.Arena):
             floor = min(floor, float(boxes.top.min()))
         for pool, used in ((self._pool, boxes), (self._belts, belts and belts.boxes)):
             count = 0
-            if used is not None:
+            if used is not None and len(used.top):
                 count = len(used.top)
                 part = slice(pool.start, pool.start + count)
                 _pose(model, part, used, level)
@@ -287,8 +293,7 @@ class SpatialTerrain(composer.Arena):
             cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
             east, north = belts.velocity.T
             run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
-        self._world.set_const(row)
-        self._set_inertia(model)
+        bounds.refresh_all(self._placed, self._geoms[row])
         if self._field >= 0:
             self._show(model)
 
