@@ -275,7 +275,9 @@ class Ground:
         for _ in range(TRIES):
             x, y = random.uniform(-span, span), random.uniform(-span, span)
             low, high = np.array([x - room, y - room]), np.array([x + room, y + room])
-            things = [layout.boxes_in(low, high)]
+            if not layout.is_clear(low, high):
+                continue
+            things = []
             if layout.belts is not None:
                 things.append(layout.belts.boxes)
             if layout.movers is not None:
