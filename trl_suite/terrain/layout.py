@@ -213,12 +213,12 @@ class Layout:
             raise ValueError('the function for boxes of a Layout must return finite Boxes')
         return found
 
-    def is_clear(self, low: np.ndarray, high: np.ndarray) -> bool:
+    def is_clear(self, low: tuple[float, float], high: tuple[float, float]) -> bool:
         """Whether no box touches a rectangle."""
         touched = getattr(self.boxes, 'touched', None)
         if touched is not None:
             return not touched(low, high)
-        return not self.boxes_in(low, high).touching(low, high).any()
+        return not self.boxes_in(np.array(low), np.array(high)).touching(low, high).any()
 
     def vertices(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Heights of the grid at vertices (i, j) * GRID, (len(i), len(j)).

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -301,10 +301,10 @@ class _Obstacles:
 
     def touched(self, low: Corner, high: Corner) -> bool:
         """Whether any touch a rectangle."""
-        return any(
-            _meeting(begin, end, *low, *high, None)
-            for begin, end, _ in self._tiles_near(low, high)
-        )  # fmt: skip
+        for begin, end, _ in self._tiles_near(low, high):
+            if _meeting(begin, end, *low, *high, None):
+                return True
+        return False
 
     def touching(self, low: Corner, high: Corner) -> Rectangles:
         """Low and high corners and heights of those that touch a rectangle, in order of drawing."""
@@ -317,15 +317,14 @@ class _Obstacles:
         begin, end, height = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return begin, end, height
 
-    def _tiles_near(self, low: Corner, high: Corner) -> Iterator[Rectangles]:
+    def _tiles_near(self, low: Corner, high: Corner) -> list[Rectangles]:
+        """The squares whose rectangles may touch one."""
         # They hang out of their square ahead and to the left only.
-        first, last = (
-            [math.floor((edge - overhang) / TILE + 0.5) for edge in corner]
-            for corner, overhang in ((low, self._largest), (high, 0.0))
-        )
-        for i in range(first[0], last[0] + 1):
-            for j in range(first[1], last[1] + 1):
-                yield self._tile((i, j))
+        begin = [math.floor((float(edge) - self._largest) / TILE + 0.5) for edge in low]
+        end = [math.floor(float(edge) / TILE + 0.5) + 1 for edge in high]
+        return [
+            self._tile((i, j)) for i in range(begin[0], end[0]) for j in range(begin[1], end[1])
+        ]
 
     def _tile(self, tile: tuple[int, int]) -> Rectangles:
         if tile not in self._tiles:
