@@ -231,7 +231,7 @@ def draw(
             fault = f'height of vertex {int(np.argmin(np.isfinite(heights)))} is not finite'
     if fault:
         raise ValueError(f'generator of terrain type {type_name!r}: {fault}')
-    return Profile(heights.astype(float, copy=False), vertical)
+    return Profile(np.ascontiguousarray(heights, float), np.ascontiguousarray(vertical))
 
 
 def cells(length: float) -> int:
