@@ -68,7 +68,9 @@ def refresh(body: int, geoms: Geoms) -> None:
                 geoms.geom_aabb[geom, k], geoms.geom_aabb[geom, 3 + k] = 0.0, size
                 total += size * size
             geoms.geom_rbound[geom] = math.sqrt(total)
-        geoms.geom_sameframe[geom] = _frame(geom, body, geoms)
+        geoms.geom_sameframe[geom] = _frame(
+            geom, body, geoms.geom_pos, geoms.geom_quat, geoms.body_ipos, geoms.body_iquat
+        )
     start = geoms.body_bvhadr[body]
     # Children come after their parents.
     for node in range(start + geoms.body_bvhnum[body] - 1, start - 1, -1):
@@ -76,9 +78,8 @@ def refresh(body: int, geoms: Geoms) -> None:
         if geom >= 0:
             _bound_geom(node, geom, body, geoms)
         else:
-            _bound_children(
-                node, start + geoms.bvh_child[node, 0], start + geoms.bvh_child[node, 1], geoms
-            )
+            left, right = start + geoms.bvh_child[node, 0], start + geoms.bvh_child[node, 1]
+            _bound_children(node, left, right, geoms.bvh_aabb)
 
 
 @compiled_loop
@@ -114,9 +115,8 @@ def _bound_geom(node: int, geom: int, body: int, geoms: Geoms) -> None:
 
 
 @compiled
-def _bound_children(node: int, left: int, right: int, geoms: Geoms) -> None:
+def _bound_children(node: int, left: int, right: int, bounds: np.ndarray) -> None:
     """Bounds what the bounds of two nodes hold."""
-    bounds = geoms.bvh_aabb
     for k in range(3):
         low = min(bounds[left, k] - bounds[left, 3 + k], bounds[right, k] - bounds[right, 3 + k])
         high = max(bounds[left, k] + bounds[left, 3 + k], bounds[right, k] + bounds[right, 3 + k])
@@ -124,9 +124,10 @@ def _bound_children(node: int, left: int, right: int, geoms: Geoms) -> None:
 
 
 @compiled
-def _frame(geom: int, body: int, geoms: Geoms) -> int:
+def _frame(
+    geom: int, body: int, pos: np.ndarray, quat: np.ndarray, ipos: np.ndarray, iquat: np.ndarray
+) -> int:
     """Which frame of its body that of a geom coincides with."""
-    pos, quat, ipos, iquat = geoms.geom_pos, geoms.geom_quat, geoms.body_ipos, geoms.body_iquat
     at_body, at_inertia, plus, minus, same, opposite = True, True, True, True, True, True
     for k in range(3):
         at_body &= abs(pos[geom, k]) < _SAME

@@ -309,9 +309,9 @@ def _rise_range(first: int, parameters: np.ndarray, bits: int) -> int:
     low, high = first + _RISES[0], first + _RISES[1]
     down = parameters[high] != 0.0 or parameters[high + 1] != 0.0
     if (parameters[low] != 0.0 or parameters[low + 1] != 0.0) != down:
-        _integer(0, 0, bits)
+        _integer(0.0, 0.0, bits)
         return high if down else low
-    return high if _integer(0, 1, bits) else low
+    return high if _integer(0.0, 1.0, bits) else low
 
 
 @compiled
@@ -323,26 +323,26 @@ def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs
 
 
 @compiled
-def _narrow_gaps(number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
     """A cluster of gaps with stepping stones between; all floors count from the same surface."""
-    spacing = _SPACING
-    low, high = max(1.0, parameters[_COUNTS]), max(1.0, parameters[_COUNTS + 1])
+    spacing = first + _SPACING
+    low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
     for _ in range(_integer(low, high, bits)):
         number = _add(number, _cells(_uniform(spacing, parameters, bits)), 0.0, runs)
-        width = _cells(_uniform(_NARROW_WIDTH, parameters, bits))
-        number = _add(number, width, _uniform(_DEPTH, parameters, bits), runs)
+        width = _cells(_uniform(first + _NARROW_WIDTH, parameters, bits))
+        number = _add(number, width, _uniform(first + _DEPTH, parameters, bits), runs)
         number = _add(number, 1, 0.0, runs)
-        spacing = _DISTANCE
+        spacing = first + _DISTANCE
     return number
 
 
 @compiled
-def _cliff(number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+def _cliff(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
     """One tall riser, broken by up to CliffMiniCountMax ledges at random heights."""
-    rise = _rise_range(0, parameters, bits)
-    tread = _uniform(_SPACING, parameters, bits)
+    rise = _rise_range(first, parameters, bits)
+    tread = _uniform(first + _SPACING, parameters, bits)
     total, level = _uniform(rise, parameters, bits), 0.0
-    for _ in range(_integer(0, parameters[_LEDGES], bits)):
+    for _ in range(_integer(0.0, parameters[first + _LEDGES], bits)):
         number = _add(number, _cells(tread), level, runs)
         level += (total - level) * random.draw(bits)
         number = _add(number, 1, level, runs)
@@ -355,14 +355,14 @@ def _cliff(number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
 def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
     first = 0
     if kind == _MIXED:
-        kind = _integer(_GAP, _WALL, bits)
+        kind = _integer(float(_GAP), float(_WALL), bits)
         first = _FIRST_STEP if kind == _STEP else _FIRST_WALL if kind == _WALL else 0
     if kind == _STEP:
         return _step(number, first, parameters, bits, runs)
     if kind == _NARROW_GAPS:
-        return _narrow_gaps(number, parameters, bits, runs)
+        return _narrow_gaps(number, first, parameters, bits, runs)
     if kind == _CLIFF:
-        return _cliff(number, parameters, bits, runs)
+        return _cliff(number, first, parameters, bits, runs)
     return _box(number, first, parameters, bits, runs)
 
 
