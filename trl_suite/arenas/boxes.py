@@ -245,7 +245,7 @@ def pose(
             thickness = min(TILTED_THICKNESS, LEAN * room / max(abs(sine), EPSILON))
         boxes.position[k, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
         boxes.position[k, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine
-        boxes.half_size[k, 0] = 0.5 * math.hypot(x1 - x0, z1 - z0)
+        boxes.half_size[k, 0] = 0.5 * np.hypot(x1 - x0, z1 - z0)
         boxes.half_size[k, 2] = 0.5 * thickness
         boxes.quaternion[k, 0] = math.cos(0.5 * angle[k])
         boxes.quaternion[k, 2] = -math.sin(0.5 * angle[k])
