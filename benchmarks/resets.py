@@ -8,8 +8,7 @@ clocks take time themselves; each is without the parts that it calls:
 * seeds: streams of random numbers for terrain and goals
 * drawing: what stands where, as arrays
 * start and goals: places that are clear, on a trail, or near
-* laying: windows of the ground for queries, and geoms
-* bounds: `World.set_const`, after which the engine knows where geoms are
+* laying: windows of the ground for queries, geoms and their bounds
 * physics: the engine's reset and forward
 * rest: the character's pose, observations, Python
 """
@@ -21,16 +20,15 @@ import collections
 import functools
 import json
 import pathlib
+import sys
 import time
 from typing import Any
 
 import numpy as np
 import tqdm
 
-from trl_suite import suite  # noqa: F401  registers environments
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.engine import World
-from trl_suite.tasks import high_level, imitation, imitation3d, tracking3d
 from trl_suite.terrain import Ground, Strip
 from trl_suite.terrain.layout import Layout
 from trl_suite.vector import VectorEnvironment
@@ -40,13 +38,11 @@ IDS = (
     'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Forest-v0',
 )  # fmt: skip
 PARTS = (
-    ('seeds', imitation, 'drawn_seed'), ('seeds', imitation3d, 'drawn_seed'),
-    ('seeds', tracking3d, 'drawn_seed'), ('seeds', high_level, 'drawn_seed'),
     ('drawing', Strip, '__init__'), ('drawing', Strip, 'window'), ('drawing', Ground, '__init__'),
     ('drawing', Layout, 'vertices'), ('drawing', Layout, 'boxes_in'),
     ('start and goals', Ground, 'spawn'), ('start and goals', Ground, 'goal'),
     ('laying', PlanarTerrain, 'begin_episode'), ('laying', SpatialTerrain, 'begin_episode'),
-    ('bounds', World, 'set_const'), ('physics', World, 'forward'), ('physics', World, 'reset'),
+    ('physics', World, 'forward'), ('physics', World, 'reset'),
 )  # fmt: skip
 
 
@@ -89,15 +85,17 @@ def measure(id_: str, num_envs: int, resets: int, repeats: int) -> dict[str, flo
 
     repeat()
     figures = {'reset': per_reset * repeat()}
-    clocks, originals = Clocks(), [getattr(owner, name) for _, owner, name in PARTS]
-    for part, owner, name in PARTS:
+    users = [module for module in sys.modules.values() if 'drawn_seed' in vars(module)]
+    parts = (*PARTS, *(('seeds', module, 'drawn_seed') for module in users))
+    clocks, originals = Clocks(), [getattr(owner, name) for _, owner, name in parts]
+    for part, owner, name in parts:
         setattr(owner, name, clocks.timed(part, getattr(owner, name)))
     try:
         begin = time.thread_time()
         repeat()
         total = time.thread_time() - begin
     finally:
-        for (_, owner, name), original in zip(PARTS, originals, strict=True):
+        for (_, owner, name), original in zip(parts, originals, strict=True):
             setattr(owner, name, original)
     clocks.spent['rest'] = total - sum(clocks.spent.values())
     environments.close()
