@@ -7,11 +7,13 @@ only, so the surface under a character does not change when the window of boxes 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from trl_suite.terrain import SPACING
+from trl_suite.util.compiled import compiled, compiled_inline
 
 PIECE = 4  # cells of the shortest tilted piece: 0.1 m
 DOUBLINGS = 3  # tilted pieces grow to at most PIECE * 2**DOUBLINGS cells: 0.8 m
@@ -22,9 +24,6 @@ OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
 LEAN = 0.9  # of the way to the next face; how far the lower end of a tilted box may lean out
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
 EPSILON = 1e-9
-_FRACTIONS = {
-    PIECE << i: np.arange(PIECE << i)[:, None] / (PIECE << i) for i in range(1, DOUBLINGS + 1)
-}
 
 
 class Boxes(NamedTuple):
@@ -35,50 +34,20 @@ class Boxes(NamedTuple):
     quaternion: np.ndarray  # (k, 4) w, x, y, z
 
 
-def _cuts(start: int, heights: np.ndarray, face: np.ndarray, tolerance: float) -> np.ndarray:
-    """Returns a mask over vertices: True where a piece ends and the next begins.
+class Pieces(NamedTuple):
+    """What a profile of m vertices is cut into; `number` of them, in order of x.
 
-    Args:
-      face: whether cell i, between vertices i - 1 and i, is a vertical face, shape (m + 1,).
+    Attributes:
+      number: how many there are.
+      level: whether all of them are level.
+      ends: numbers of the first and the last vertex of each, (2, m).
+      edges: x and z of the left and of the right edge of upper faces, m, then their slopes, (5, m).
     """
-    count = len(heights)
-    level = np.zeros(count + 1, dtype=bool)  # of cell i, between vertices i-1 and i
-    np.less(np.abs(heights[1:] - heights[:-1]), EPSILON, out=level[1:count])
-    level &= ~face
-    left, right = level[:count], level[1:]
-    cut = (left != right) | face[:count] | face[1:]
-    cut[0] = cut[-1] = True
-    sloped = ~(level | face)[1:count]
-    if not sloped.any():
-        return cut
-    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
-    cut[1:] |= face[: count - 1] & sloped
-    cut[:-1] |= face[2:] & sloped
-    mandatory = cut.copy()
-    offset = -start % PIECE
-    cut[offset::PIECE] |= ~(left & right)[offset::PIECE]
-    spans = (count - 1 - offset) // PIECE
-    # Of the spans of one length: whether nothing is cut inside.
-    whole = ~cut[offset : offset + spans * PIECE].reshape(spans, PIECE)[:, 1:].any(1)
-    for doubling in range(1, DOUBLINGS + 1):
-        half, span = PIECE << doubling - 1, PIECE << doubling
-        first_half, offset = offset, -start % span
-        spans = (count - 1 - offset) // span
-        if spans < 1 or not whole.any():
-            break
-        halves = whole[(offset - first_half) // half :][: 2 * spans]
-        whole = halves[::2] & halves[1::2]
-        middle = slice(offset + half, offset + spans * span, span)
-        # A span may be one piece if its halves are, nothing must be cut between them, and the
-        # profile stays close to the chord.
-        joint = (whole & cut[middle] & ~mandatory[middle]).nonzero()[0]
-        height = heights[offset : offset + spans * span].reshape(spans, span)[joint].T
-        first = height[:1]
-        rise = heights[offset + span :: span][joint] - first
-        stray = np.abs(height - (first + rise * _FRACTIONS[span])).max(0)
-        cut[offset + half + span * joint[stray < tolerance]] = False
-        whole &= ~cut[middle]
-    return cut
+
+    number: int
+    level: bool
+    ends: np.ndarray
+    edges: np.ndarray
 
 
 def from_profile(
@@ -96,74 +65,203 @@ def from_profile(
       Boxes whose upper faces follow the profile; their sides stand in the middle of the vertical
       cells.
     """
-    count = len(heights)
-    face = np.zeros(count + 1, dtype=bool)
-    face[1:count] = vertical[1:]
-    knots = _cuts(start, heights, face, tolerance).nonzero()[0]
-    a, b = knots[:-1], knots[1:]
-    faces = face.any()
-    if faces:
-        # A vertical cell is no piece, but its left vertex is one if the cell before is vertical too.
-        upright = face[b] & (b - a == 1)
-        lone = face[a] & upright
-        keep = ~upright | lone
-        a, b = a[keep], np.where(lone, a, b)[keep]
-    at_left, at_right = face[a], face[b + 1]
-    x0 = (start + a - 0.5 * at_left) * SPACING
-    x1 = (start + b + 0.5 * at_right) * SPACING
-    z0, z1 = heights[a], heights[b]
-    if faces:
-        # Posts are level; the height is that of the vertex at the face.
-        post = (b - a <= 1) & (at_left | at_right)
-        z0, z1 = np.where(post & at_right & ~at_left, z1, z0), np.where(post & at_left, z0, z1)
-    if np.abs(z1 - z0).max(initial=0) < EPSILON:
-        return _level(x0, x1, z0)
-    slope = (z1 - z0) / (x1 - x0)
-    tilted = np.abs(slope) > EPSILON
-
-    # At a valley both pieces run on below the surface of the other, so that a sliding foot meets
-    # no end face.
-    joined = (b[:-1] == a[1:]) & ~at_right[:-1]
-    valley = joined & (slope[1:] > slope[:-1] + EPSILON)
-    length = x1 - x0
-    overlap = np.minimum(OVERLAP, length)
-    run_on_right, run_on_left = np.zeros((2, len(a)))
-    run_on_right[:-1] = valley * overlap[1:]
-    run_on_left[1:] = valley * overlap[:-1]
-    x0, z0 = x0 - run_on_left, z0 - run_on_left * slope
-    x1, z1 = x1 + run_on_right, z1 + run_on_right * slope
-
-    angle = np.arctan(slope)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    thickness = np.where(tilted, TILTED_THICKNESS, LEVEL_THICKNESS)
-    if faces:
-        # The lower end of a tilted box leans out: to the right where the ground rises, else to the
-        # left. It must not come out of the next face on that side.
-        right_face = np.minimum.accumulate(np.where(at_right, x1, np.inf)[::-1])[::-1]
-        left_face = np.maximum.accumulate(np.where(at_left, x0, -np.inf))
-        room = LEAN * np.where(slope > 0, right_face - x1, x0 - left_face)
-        room /= np.maximum(np.abs(sine), EPSILON)
-        thickness = np.where(tilted, np.minimum(thickness, room), thickness)
-    position = np.zeros((len(a), 3))
-    position[:, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
-    position[:, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine
-    half_size = np.empty((len(a), 3))
-    half_size[:, 0] = 0.5 * np.hypot(x1 - x0, z1 - z0)
-    half_size[:, 1] = HALF_WIDTH
-    half_size[:, 2] = 0.5 * thickness
-    quaternion = np.zeros((len(a), 4))
-    quaternion[:, 0] = np.cos(0.5 * angle)
-    quaternion[:, 2] = -np.sin(0.5 * angle)
-    return Boxes(position, half_size, quaternion)
+    pieces = cut(start, heights, vertical, tolerance)
+    boxes = Boxes(*(np.zeros((pieces.number, size)) for size in (3, 3, 4)))
+    pose(pieces.number, pieces.level, vertical, pieces.ends, pieces.edges, angles(pieces), boxes)
+    return boxes
 
 
-def _level(x0: np.ndarray, x1: np.ndarray, z: np.ndarray) -> Boxes:
-    """Boxes whose upper faces lie at z between x0 and x1, m, shape (k,)."""
-    position, half_size = np.zeros((2, len(z), 3))
-    position[:, 0] = 0.5 * (x0 + x1)
-    position[:, 2] = z - 0.5 * LEVEL_THICKNESS
-    half_size[:, 0] = 0.5 * (x1 - x0)
-    half_size[:, 1:] = HALF_WIDTH, 0.5 * LEVEL_THICKNESS
-    quaternion = np.zeros((len(z), 4))
-    quaternion[:, 0] = 1
-    return Boxes(position, half_size, quaternion)
+def cut(
+    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float = TOLERANCE
+) -> Pieces:
+    """Cuts a window of a profile into pieces; arguments are those of `from_profile`."""
+    marks = np.empty((3, len(heights)), bool)
+    ends, edges = np.empty((2, len(heights)), int), np.empty((5, len(heights)))
+    _mark(start, heights, vertical, tolerance, marks)
+    count, level = _join(start, heights, vertical, marks, ends, edges)
+    return Pieces(count, level, ends, edges)
+
+
+def angles(pieces: Pieces) -> np.ndarray:
+    """Returns by how much upper faces of pieces are tilted, (number,) rad."""
+    slope = pieces.edges[4, : pieces.number]
+    # NumPy's own: the compiled one may differ in the last bit.
+    return slope if pieces.level else np.arctan(slope)
+
+
+@compiled_inline
+def _is_face(cell: int, vertical: np.ndarray) -> bool:
+    """Whether a cell, between vertices cell - 1 and cell, is a vertical face of the window."""
+    return 0 < cell < len(vertical) and vertical[cell]
+
+
+@compiled_inline
+def _is_level(cell: int, heights: np.ndarray, vertical: np.ndarray) -> bool:
+    """Whether a cell of the window is level."""
+    if not 0 < cell < len(heights) or vertical[cell]:
+        return False
+    return abs(heights[cell] - heights[cell - 1]) < EPSILON
+
+
+@compiled
+def _mark(
+    start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float, marks: np.ndarray
+) -> None:
+    """Marks the vertices where a piece ends and the next begins: the first of the marks, (3, m)."""
+    cuts, mandatory, whole = marks[0], marks[1], marks[2]
+    count, any_sloped = len(heights), False
+    for i in range(count):
+        left, right = _is_level(i, heights, vertical), _is_level(i + 1, heights, vertical)
+        before, after = _is_face(i, vertical), _is_face(i + 1, vertical)
+        cuts[i] = left != right or before or after or i == 0 or i == count - 1
+        any_sloped |= i > 0 and not (left or before)
+    if not any_sloped:
+        return
+    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
+    for i in range(1, count):
+        if not (_is_level(i, heights, vertical) or vertical[i]):
+            cuts[i] |= _is_face(i - 1, vertical)
+            cuts[i - 1] |= _is_face(i + 1, vertical)
+    for i in range(count):
+        mandatory[i] = cuts[i]
+    offset = -start % PIECE
+    for i in range(offset, count, PIECE):
+        level = _is_level(i, heights, vertical) and _is_level(i + 1, heights, vertical)
+        cuts[i] |= not level
+    # Of the spans of one length: whether nothing is cut inside.
+    for k in range((count - 1 - offset) // PIECE):
+        whole[k] = True
+        for i in range(offset + k * PIECE + 1, offset + (k + 1) * PIECE):
+            whole[k] &= not cuts[i]
+    for doubling in range(1, DOUBLINGS + 1):
+        half, span = PIECE << (doubling - 1), PIECE << doubling
+        first_half, offset = offset, -start % span
+        skipped = (offset - first_half) // half
+        for k in range((count - 1 - offset) // span):
+            # A span may be one piece if its halves are, nothing must be cut between them, and the
+            # profile stays close to the chord.
+            first = offset + k * span
+            middle = first + half
+            whole[k] = whole[skipped + 2 * k] and whole[skipped + 2 * k + 1]
+            if whole[k] and cuts[middle] and not mandatory[middle]:
+                cuts[middle] = _stray(first, span, heights) >= tolerance
+            whole[k] &= not cuts[middle]
+
+
+@compiled_inline
+def _stray(first: int, span: int, heights: np.ndarray) -> float:
+    """How far a profile strays from the chord of a span, m."""
+    most, rise = 0.0, heights[first + span] - heights[first]
+    for k in range(span):
+        most = max(most, abs(heights[first + k] - (heights[first] + rise * (k / span))))
+    return most
+
+
+@compiled
+def _join(
+    start: int,
+    heights: np.ndarray,
+    vertical: np.ndarray,
+    marks: np.ndarray,
+    ends: np.ndarray,
+    edges: np.ndarray,
+) -> tuple[int, bool]:
+    """Finds the pieces between the marks; returns how many there are, and whether all are level."""
+    count, begin, steepest = 0, 0, 0.0
+    for end in range(1, len(heights)):
+        if not marks[0, end]:
+            continue
+        a, b = begin, end
+        begin = end
+        if b - a == 1 and _is_face(b, vertical):
+            # A vertical cell is no piece, but its left vertex is one if the cell before is vertical
+            # too.
+            if not _is_face(a, vertical):
+                continue
+            b = a
+        at_left, at_right = _is_face(a, vertical), _is_face(b + 1, vertical)
+        z0, z1 = heights[a], heights[b]
+        if b - a <= 1 and (at_left or at_right):
+            # Posts are level; the height is that of the vertex at the face.
+            if at_left:
+                z1 = z0
+            else:
+                z0 = z1
+        ends[0, count], ends[1, count] = a, b
+        edges[0, count] = (start + a - (0.5 if at_left else 0.0)) * SPACING
+        edges[1, count] = z0
+        edges[2, count] = (start + b + (0.5 if at_right else 0.0)) * SPACING
+        edges[3, count] = z1
+        edges[4, count] = (z1 - z0) / (edges[2, count] - edges[0, count])
+        steepest = max(steepest, abs(z1 - z0))
+        count += 1
+    return count, steepest < EPSILON
+
+
+@compiled
+def pose(
+    count: int,
+    level: bool,
+    vertical: np.ndarray,
+    ends: np.ndarray,
+    edges: np.ndarray,
+    angle: np.ndarray,
+    boxes: Boxes,
+) -> None:
+    """Writes the boxes of pieces over the first of some boxes; their edges are changed.
+
+    Args:
+      count: number of pieces.
+      level, ends, edges: of the pieces.
+      vertical: of the profile.
+      angle: of the pieces, see `angles`.
+      boxes: `count` of them or more.
+    """
+    if not level:
+        _run_on(count, vertical, ends, edges)
+    right_face = math.inf
+    for k in range(count - 1, -1, -1):  # room to the right, kept in the half size for now
+        if _is_face(ends[1, k] + 1, vertical):
+            right_face = min(right_face, edges[2, k])
+        boxes.half_size[k, 2] = right_face - edges[2, k]
+    left_face = -math.inf
+    for k in range(count):
+        x0, z0, x1, z1 = edges[0, k], edges[1, k], edges[2, k], edges[3, k]
+        if _is_face(ends[0, k], vertical):
+            left_face = max(left_face, x0)
+        boxes.position[k, 1] = boxes.quaternion[k, 1] = boxes.quaternion[k, 3] = 0.0
+        boxes.half_size[k, 1] = HALF_WIDTH
+        if level:
+            boxes.position[k, 0], boxes.position[k, 2] = 0.5 * (x0 + x1), z0 - 0.5 * LEVEL_THICKNESS
+            boxes.half_size[k, 0], boxes.half_size[k, 2] = 0.5 * (x1 - x0), 0.5 * LEVEL_THICKNESS
+            boxes.quaternion[k, 0], boxes.quaternion[k, 2] = 1.0, 0.0
+            continue
+        slope, sine, cosine = edges[4, k], math.sin(angle[k]), math.cos(angle[k])
+        thickness = LEVEL_THICKNESS
+        if abs(slope) > EPSILON:
+            # The lower end of a tilted box leans out: to the right where the ground rises, else to
+            # the left. It must not come out of the next face on that side.
+            room = boxes.half_size[k, 2] if slope > 0 else x0 - left_face
+            thickness = min(TILTED_THICKNESS, LEAN * room / max(abs(sine), EPSILON))
+        boxes.position[k, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
+        boxes.position[k, 2] = 0.5 * (z0 + z1) - 0.5 * thickness * cosine
+        boxes.half_size[k, 0] = 0.5 * np.hypot(x1 - x0, z1 - z0)
+        boxes.half_size[k, 2] = 0.5 * thickness
+        boxes.quaternion[k, 0] = math.cos(0.5 * angle[k])
+        boxes.quaternion[k, 2] = -math.sin(0.5 * angle[k])
+
+
+@compiled
+def _run_on(count: int, vertical: np.ndarray, ends: np.ndarray, edges: np.ndarray) -> None:
+    """Has pieces run on below each other at valleys, so that a sliding foot meets no end face."""
+    length = edges[2, 0] - edges[0, 0]  # of a piece as it was cut
+    for k in range(count - 1):
+        following = edges[2, k + 1] - edges[0, k + 1]
+        joined = ends[1, k] == ends[0, k + 1] and not _is_face(ends[1, k] + 1, vertical)
+        if joined and edges[4, k + 1] > edges[4, k] + EPSILON:
+            right, left = min(OVERLAP, following), min(OVERLAP, length)
+            edges[2, k] += right
+            edges[3, k] += right * edges[4, k]
+            edges[0, k + 1] -= left
+            edges[1, k + 1] -= left * edges[4, k + 1]
+        length = following

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dm_control import composer, mjcf
 
 from trl_suite.arenas import boxes, stage
+from trl_suite.arenas.boxes import Boxes
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.engine import World
+from trl_suite.engine import World, bounds
 from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain, planar_ground
 from trl_suite.terrain.planar_ground import PlanarGround
-from trl_suite.util.compiled import compiled
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
 ADVANCE = 6.0  # m; travel after which the window is laid anew
@@ -26,6 +27,13 @@ _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEA
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
 _CELLS_PER_METRE = 1 / SPACING
 _REACH = 0.5 * ADVANCE + SPACING  # m; from the centre of a window to where it is laid anew
+
+
+class Pool(NamedTuple):
+    """The boxes of one simulation, and what the engine knows of them."""
+
+    boxes: Boxes
+    geoms: bounds.Geoms
 
 
 class PlanarTerrain(composer.Arena):
@@ -63,12 +71,18 @@ class PlanarTerrain(composer.Arena):
         # Geoms of one body are neighbours in the model.
         first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         pool = slice(first, first + len(self.boxes))
-        self._placed = [
-            (model.geom_pos[pool], model.geom_size[pool], model.geom_quat[pool])
+        self._pools = [
+            packed(
+                Pool(
+                    Boxes(model.geom_pos[pool], model.geom_size[pool], model.geom_quat[pool]),
+                    bounds.geoms(model),
+                )
+            )
             for model in world.models
         ]
         self.strips: list[Strip | None] = [None] * world.n
         self.ground = planar_ground.empty(world.n, _WINDOW, _REACH)
+        self._ground = packed(self.ground)
         self._numbers = np.arange(world.n)
 
     def begin_episode(self, row: int, strip: Strip) -> None:
@@ -161,38 +175,68 @@ class PlanarTerrain(composer.Arena):
         """Realises the strip around a vertex as boxes."""
         strip = self.strips[row]
         assert strip is not None
-        start, ground = centre - _BEHIND, self.ground
+        start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
-        ground.centre[row] = centre * SPACING
-        ground.is_wide[row] = False
-        if (
-            ground.start[row] == start
-            and (ground.heights[row] == heights).all()
-            and (ground.vertical[row] == vertical).all()
-        ):
+        if is_laid(row, centre, heights, vertical, self._ground):
             return  # as on flat ground: the boxes lie already
         tolerance = boxes.TOLERANCE
-        pieces = boxes.from_profile(start, heights, vertical, tolerance)
-        while len(pieces.position) > len(self.boxes):  # coarser, rather than with holes
+        pieces = boxes.cut(start, heights, vertical, tolerance)
+        while pieces.number > len(self.boxes):  # coarser, rather than with holes
             tolerance *= 2
             if tolerance > COARSEST:
                 raise ValueError(
-                    f'terrain {self.terrain.name!r} needs {len(pieces.position)} boxes for '
+                    f'terrain {self.terrain.name!r} needs {pieces.number} boxes for '
                     f'{BEHIND + AHEAD:g} m, where {PROBES} draws led to expect no more than '
                     f'{len(self.boxes)}: its features must be spread more evenly'
                 )
-            pieces = boxes.from_profile(start, heights, vertical, tolerance)
-        ground.start[row], ground.vertical[row] = start, vertical
-        ground.heights[row] = heights
-        np.subtract(heights[1:], heights[:-1], out=ground.rises[row, :-1])
-        count = len(pieces.position)
-        position, half_size, quaternion = self._placed[row]
-        position[:count], position[count:] = (
-            pieces.position, ((centre + _AHEAD) * SPACING, 0, PARKED),
+            pieces = boxes.cut(start, heights, vertical, tolerance)
+        lay(
+            row, centre, heights, vertical, pieces.number, pieces.level, pieces.ends, pieces.edges,
+            boxes.angles(pieces), self._ground, self._pools[row],
         )  # fmt: skip
-        half_size[:count], half_size[count:] = pieces.half_size, 0.1
-        quaternion[:count] = pieces.quaternion
-        self._world.set_const(row)
+
+
+@compiled_loop
+def is_laid(
+    i: int, centre: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarGround
+) -> bool:
+    """Moves the window of a simulation; returns whether it holds these vertices already."""
+    ground.centre[i] = centre * SPACING
+    ground.is_wide[i] = False
+    if ground.start[i] != centre - _BEHIND:
+        return False
+    for k in range(len(heights)):
+        if ground.heights[i, k] != heights[k] or ground.vertical[i, k] != vertical[k]:
+            return False
+    return True
+
+
+@compiled_loop
+def lay(
+    i: int,
+    centre: int,
+    heights: np.ndarray,
+    vertical: np.ndarray,
+    count: int,
+    level: bool,
+    ends: np.ndarray,
+    edges: np.ndarray,
+    angle: np.ndarray,
+    ground: PlanarGround,
+    pool: Pool,
+) -> None:
+    """Puts vertices into the window of a simulation, and poses the boxes of their pieces."""
+    ground.start[i] = centre - _BEHIND
+    for k in range(len(heights)):
+        ground.heights[i, k], ground.vertical[i, k] = heights[k], vertical[k]
+        if k > 0:
+            ground.rises[i, k - 1] = heights[k] - heights[k - 1]
+    boxes.pose(count, level, vertical, ends, edges, angle, pool.boxes)
+    position, half_size = pool.boxes.position, pool.boxes.half_size
+    for k in range(count, len(position)):  # those that are not needed
+        position[k, 0], position[k, 1], position[k, 2] = (centre + _AHEAD) * SPACING, 0.0, PARKED
+        half_size[k, 0] = half_size[k, 1] = half_size[k, 2] = 0.1
+    bounds.refresh(0, pool.geoms)
 
 
 @compiled
@@ -225,7 +269,7 @@ def _pool_size(terrain: Terrain) -> int:
     for blend in range(max(1, len(terrain.parameter_sets))):
         for k in windows:
             window = Strip(terrain, abs(k), blend=blend).window(k * _WINDOW, _WINDOW)
-            most = max(most, len(boxes.from_profile(k * _WINDOW, *window).position))
+            most = max(most, boxes.cut(k * _WINDOW, *window).number)
     return round(SPARE * most) + PROBES
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,12 +13,12 @@ from dm_control import composer, mjcf
 
 from trl_suite.arenas import stage
 from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
-from trl_suite.engine import World
+from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
 from trl_suite.terrain.ground import Random
 from trl_suite.terrain.spatial_ground import HALF, VERTICES, SpatialGround, keep_moving
 from trl_suite.terrain.surroundings import ALL, Rows
-from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
 BASE = 1.0  # m; of height fields, below their lowest point
@@ -25,7 +26,9 @@ FOOT = 0.5  # m; how deep boxes are let into a plane
 THICKNESS = 2.0  # m; of boxes without a plane under them
 DRIVE = 1e6  # kg; inertia of moving boxes along their way: nothing that they meet stops them
 SIZE = 0.1  # m; half sides of unused boxes
-SHADES = np.array([[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]])  # of boxes, by turns of 0.5 m along x
+SHADES = np.array(
+    [[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]], np.float32
+)  # of boxes, by turns of 0.5 m along x
 
 
 class SpatialTerrain(composer.Arena):
@@ -134,6 +137,11 @@ class SpatialTerrain(composer.Arena):
         self._own = np.flatnonzero(own)
         for model in world.models:
             self._set_inertia(model)
+        placed = [*self.boxes[:1], *self.belts[:1], *(body.geom[0] for body in self.movers)]
+        placed += [geom for geom in (self.plane, self.field) if geom is not None]
+        geoms = world.geom_ids([geom.full_identifier for geom in placed])
+        self._placed = np.unique(world.models[0].geom_bodyid[geoms]).astype(int)
+        self._geoms = [packed(bounds.geoms(model)) for model in world.models]
 
     @property
     def grounds(self) -> list[Ground | None]:
@@ -275,10 +283,9 @@ class SpatialTerrain(composer.Arena):
             floor = min(floor, float(boxes.top.min()))
         for pool, used in ((self._pool, boxes), (self._belts, belts and belts.boxes)):
             count = 0
-            if used is not None:
+            if used is not None and len(used.top):
                 count = len(used.top)
-                part = slice(pool.start, pool.start + count)
-                _pose(model, part, used, level)
+                _pose(model, pool.start, used, level)
             unused = slice(pool.start + count, pool.stop)
             model.geom_pos[unused] = x + HALF, y, floor + PARKED
             model.geom_size[unused] = SIZE
@@ -287,8 +294,7 @@ class SpatialTerrain(composer.Arena):
             cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
             east, north = belts.velocity.T
             run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
-        self._world.set_const(row)
-        self._set_inertia(model)
+        bounds.refresh_all(self._placed, self._geoms[row])
         if self._field >= 0:
             self._show(model)
 
@@ -343,30 +349,53 @@ def _range(world: World, geoms: list[mjcf.Element]) -> slice:
     return slice(first, first + len(geoms))
 
 
-def _pose(model: mujoco.MjModel, part: slice, boxes: Boxes, level: float | None) -> None:
+def _pose(model: mujoco.MjModel, first: int, boxes: Boxes, level: float | None) -> None:
     """Gives geoms the upper faces of boxes, and sides that reach below them."""
-    angle = np.arctan(boxes.slope)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    thickness = np.full(len(angle), THICKNESS)
-    if level is not None:
-        thickness = np.maximum((boxes.top - level + FOOT) / cosine, FOOT)
-    # A tilted box lies below its upper face along the normal of it.
-    aside, yaw = 0.5 * thickness * sine, boxes.yaw
-    position = model.geom_pos[part]
-    position[:, 0] = boxes.position[:, 0] + aside * np.cos(yaw)
-    position[:, 1] = boxes.position[:, 1] + aside * np.sin(yaw)
-    position[:, 2] = boxes.top - 0.5 * thickness * cosine
-    size = model.geom_size[part]
-    size[:, 0], size[:, 1] = boxes.half_size[:, 0] / cosine, boxes.half_size[:, 1]
-    size[:, 2] = 0.5 * thickness
-    model.geom_rgba[part] = SHADES[np.floor(2 * boxes.position[:, 0]).astype(int) % 2]
-    # Turned about z by the yaw after it was turned about y by minus the angle.
-    half_yaw, half_angle = 0.5 * yaw, 0.5 * angle
-    quaternion = model.geom_quat[part]
-    quaternion[:, 0] = np.cos(half_yaw) * np.cos(half_angle)
-    quaternion[:, 1] = np.sin(half_yaw) * np.sin(half_angle)
-    quaternion[:, 2] = -np.cos(half_yaw) * np.sin(half_angle)
-    quaternion[:, 3] = np.sin(half_yaw) * np.cos(half_angle)
+    # NumPy's own: the compiled one may differ in the last bit.
+    angle = np.arctan(boxes.slope) if boxes.slope.any() else boxes.slope
+    _write_boxes(
+        *boxes[:4], angle, np.nan if level is None else level, first, SHADES, model.geom_pos,
+        model.geom_size, model.geom_quat, model.geom_rgba,
+    )  # fmt: skip
+
+
+@compiled
+def _write_boxes(
+    middle: np.ndarray,
+    half_size: np.ndarray,
+    yaw: np.ndarray,
+    top: np.ndarray,
+    angle: np.ndarray,
+    level: float,
+    first: int,
+    shades: np.ndarray,
+    geom_pos: np.ndarray,
+    geom_size: np.ndarray,
+    geom_quat: np.ndarray,
+    geom_rgba: np.ndarray,
+) -> None:
+    """Poses geoms from the first on; the level is NaN if there is none."""
+    for k in range(len(top)):
+        geom, half_yaw, half_angle = first + k, 0.5 * yaw[k], 0.5 * angle[k]
+        cosine, sine = math.cos(angle[k]), math.sin(angle[k])
+        thickness = THICKNESS
+        if not math.isnan(level):
+            thickness = max((top[k] - level + FOOT) / cosine, FOOT)
+        # A tilted box lies below its upper face along the normal of it.
+        aside = 0.5 * thickness * sine
+        geom_pos[geom, 0] = middle[k, 0] + aside * math.cos(yaw[k])
+        geom_pos[geom, 1] = middle[k, 1] + aside * math.sin(yaw[k])
+        geom_pos[geom, 2] = top[k] - 0.5 * thickness * cosine
+        geom_size[geom, 0], geom_size[geom, 1] = half_size[k, 0] / cosine, half_size[k, 1]
+        geom_size[geom, 2] = 0.5 * thickness
+        # Turned about z by the yaw after it was turned about y by minus the angle.
+        geom_quat[geom, 0] = math.cos(half_yaw) * math.cos(half_angle)
+        geom_quat[geom, 1] = math.sin(half_yaw) * math.sin(half_angle)
+        geom_quat[geom, 2] = -math.cos(half_yaw) * math.sin(half_angle)
+        geom_quat[geom, 3] = math.sin(half_yaw) * math.cos(half_angle)
+        shade = math.floor(2 * middle[k, 0]) % 2
+        for channel in range(4):
+            geom_rgba[geom, channel] = shades[shade, channel]
 
 
 def _paint(root: mjcf.RootElement) -> None:

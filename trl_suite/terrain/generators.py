@@ -28,12 +28,14 @@ import dataclasses
 import math
 import numbers
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from trl_suite.errors import unknown
+from trl_suite.util import random
+from trl_suite.util.compiled import compiled, compiled_inline
 
 SPACING = 0.025  # m between vertices
 STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
@@ -229,7 +231,7 @@ def draw(
             fault = f'height of vertex {int(np.argmin(np.isfinite(heights)))} is not finite'
     if fault:
         raise ValueError(f'generator of terrain type {type_name!r}: {fault}')
-    return Profile(heights.astype(float, copy=False), vertical)
+    return Profile(np.ascontiguousarray(heights, float), np.ascontiguousarray(vertical))
 
 
 def cells(length: float) -> int:
@@ -237,106 +239,182 @@ def cells(length: float) -> int:
     return math.ceil(length / SPACING - 1e-9)
 
 
-# Features: each draws one and returns its level runs, (number of vertices, height) in order.
+# Features: each draws one and writes its level runs, number of vertices and height, in order.
 # Heights count from the ground before the feature; the last run is the ground after it.
 
-Runs = list[tuple[int, float]]
-Feature = Callable[[Parameters, np.random.Generator], Runs]
+
+class Runs(NamedTuple):
+    """Room for level runs."""
+
+    counts: np.ndarray
+    levels: np.ndarray
 
 
-def _uniform(parameters: Parameters, name: str, rng: np.random.Generator) -> float:
-    low, high = parameters[name + 'Min'], parameters[name + 'Max']
-    return low + (high - low) * rng.random()
+# Features, and where their parameters begin among those of the type. A Max follows its Min.
+_GAP, _STEP, _WALL, _MIXED, _NARROW_GAPS, _CLIFF = range(6)
+_MIXTURE: Parameters = {**GAPS, **WALLS, **STEPS}
+_SPACING, _WIDTH, _TOP = (list(GAPS).index(f'Gap{name}Min') for name in ('Spacing', 'W', 'H'))
+_RISES = list(STEPS).index('StepH0Min'), list(STEPS).index('StepH1Min')
+_DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
+    list(NARROW_GAPS).index(f'NarrowGap{name}Min') for name in ('Dist', 'W', 'Depth', 'Count')
+)
+_LEDGES = list(CLIFFS).index('CliffMiniCountMax')
+_FIRST_WALL, _FIRST_STEP = len(GAPS), len(GAPS) + len(WALLS)
+_NAMES = tuple(tuple(names) for names in (GAPS, STEPS, WALLS, _MIXTURE, NARROW_GAPS, CLIFFS))
+_MOST_RUNS = 3 * round(_COUNT[1]) + 3  # of a feature
 
 
-def _integer(low: float, high: float, rng: np.random.Generator) -> int:
+@compiled_inline
+def _cells(length: float) -> int:
+    return math.ceil(length / SPACING - 1e-9)
+
+
+@compiled_inline
+def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
+    """Draws from the range of a parameter."""
+    return parameters[of] + (parameters[of + 1] - parameters[of]) * random.draw(bits)
+
+
+@compiled_inline
+def _integer(low: float, high: float, bits: int) -> int:
     """Draws an integer, both ends included; blended counts are truncated here, at their use."""
-    low, high = int(low), int(high)
-    return low + int((high - low + 1) * rng.random())
+    first, last = int(low), int(high)
+    return first + int((last - first + 1) * random.draw(bits))
 
 
-def _box(parameters: Parameters, name: str, height: str, rng: np.random.Generator) -> Runs:
-    spacing = cells(_uniform(parameters, name + 'Spacing', rng))
-    width = cells(_uniform(parameters, name + 'W', rng))
-    return [(spacing, 0.0), (width, _uniform(parameters, height, rng)), (1, 0.0)]
+@compiled_inline
+def _add(number: int, count: int, level: float, runs: Runs) -> int:
+    """Adds a run to those there are; returns their new number."""
+    runs.counts[number], runs.levels[number] = count, level
+    return number + 1
 
 
-def _rise_range(parameters: Parameters, name: str, rng: np.random.Generator) -> str:
+@compiled
+def _box(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    """A gap or a wall, whose parameters begin at the first; returns the new number of runs."""
+    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
+    width = _cells(_uniform(first + _WIDTH, parameters, bits))
+    number = _add(number, spacing, 0.0, runs)
+    number = _add(number, width, _uniform(first + _TOP, parameters, bits), runs)
+    return _add(number, 1, 0.0, runs)
+
+
+@compiled
+def _rise_range(first: int, parameters: np.ndarray, bits: int) -> int:
     """Returns which of two ranges of a signed rise is drawn from.
 
     A range whose ends are both 0 is switched off; of two that are on, a coin decides. So direction
     comes from the numbers alone: with two positive ranges the ground only ascends.
     """
-    ranges = [name + '0', name + '1']
-    enabled = [key for key in ranges if parameters[key + 'Min'] or parameters[key + 'Max']]
-    choices = enabled or ranges
-    return choices[_integer(0, len(choices) - 1, rng)]
+    low, high = first + _RISES[0], first + _RISES[1]
+    down = parameters[high] != 0.0 or parameters[high + 1] != 0.0
+    if (parameters[low] != 0.0 or parameters[low + 1] != 0.0) != down:
+        _integer(0.0, 0.0, bits)
+        return high if down else low
+    return high if _integer(0.0, 1.0, bits) else low
 
 
-def _gap(parameters: Parameters, rng: np.random.Generator) -> Runs:
-    return _box(parameters, 'Gap', 'GapH', rng)
+@compiled
+def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    rise = _rise_range(first, parameters, bits)
+    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
+    number = _add(number, spacing, 0.0, runs)
+    return _add(number, 1, _uniform(rise, parameters, bits), runs)
 
 
-def _wall(parameters: Parameters, rng: np.random.Generator) -> Runs:
-    return _box(parameters, 'Wall', 'WallH', rng)
-
-
-def _step(parameters: Parameters, rng: np.random.Generator) -> Runs:
-    key = _rise_range(parameters, 'StepH', rng)
-    spacing = cells(_uniform(parameters, 'StepSpacing', rng))
-    return [(spacing, 0.0), (1, _uniform(parameters, key, rng))]
-
-
-def _mixed(parameters: Parameters, rng: np.random.Generator) -> Runs:
-    return (_gap, _step, _wall)[_integer(0, 2, rng)](parameters, rng)
-
-
-def _narrow_gaps(parameters: Parameters, rng: np.random.Generator) -> Runs:
+@compiled
+def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
     """A cluster of gaps with stepping stones between; all floors count from the same surface."""
-    runs: Runs = []
-    spacing = 'NarrowGapSpacing'
-    low, high = (max(1, parameters['NarrowGapCount' + end]) for end in ('Min', 'Max'))
-    for _ in range(_integer(low, high, rng)):
-        runs.append((cells(_uniform(parameters, spacing, rng)), 0.0))
-        width = cells(_uniform(parameters, 'NarrowGapW', rng))
-        runs += [(width, _uniform(parameters, 'NarrowGapDepth', rng)), (1, 0.0)]
-        spacing = 'NarrowGapDist'
-    return runs
+    spacing = first + _SPACING
+    low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
+    for _ in range(_integer(low, high, bits)):
+        number = _add(number, _cells(_uniform(spacing, parameters, bits)), 0.0, runs)
+        width = _cells(_uniform(first + _NARROW_WIDTH, parameters, bits))
+        number = _add(number, width, _uniform(first + _DEPTH, parameters, bits), runs)
+        number = _add(number, 1, 0.0, runs)
+        spacing = first + _DISTANCE
+    return number
 
 
-def _cliff(parameters: Parameters, rng: np.random.Generator) -> Runs:
+@compiled
+def _cliff(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
     """One tall riser, broken by up to CliffMiniCountMax ledges at random heights."""
-    key = _rise_range(parameters, 'CliffH', rng)
-    tread = _uniform(parameters, 'CliffSpacing', rng)
-    total = _uniform(parameters, key, rng)
-    runs: Runs = []
-    level = 0.0
-    for _ in range(_integer(0, parameters['CliffMiniCountMax'], rng)):
-        runs.append((cells(tread), level))
-        level += (total - level) * rng.random()
-        runs.append((1, level))
+    rise = _rise_range(first, parameters, bits)
+    tread = _uniform(first + _SPACING, parameters, bits)
+    total, level = _uniform(rise, parameters, bits), 0.0
+    for _ in range(_integer(0.0, parameters[first + _LEDGES], bits)):
+        number = _add(number, _cells(tread), level, runs)
+        level += (total - level) * random.draw(bits)
+        number = _add(number, 1, level, runs)
         tread = LEDGE
-    return [*runs, (cells(tread), level), (1, total)]
+    number = _add(number, _cells(tread), level, runs)
+    return _add(number, 1, total, runs)
 
 
-def _repeat(
-    feature: Feature, parameters: Parameters, length: float, rng: np.random.Generator
-) -> Profile:
+@compiled
+def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    first = 0
+    if kind == _MIXED:
+        kind = _integer(float(_GAP), float(_WALL), bits)
+        first = _FIRST_STEP if kind == _STEP else _FIRST_WALL if kind == _WALL else 0
+    if kind == _STEP:
+        return _step(number, first, parameters, bits, runs)
+    if kind == _NARROW_GAPS:
+        return _narrow_gaps(number, first, parameters, bits, runs)
+    if kind == _CLIFF:
+        return _cliff(number, first, parameters, bits, runs)
+    return _box(number, first, parameters, bits, runs)
+
+
+@compiled
+def _draw_features(
+    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, counts: np.ndarray,
+    levels: np.ndarray,
+) -> tuple[int, int]:  # fmt: skip
+    """Draws features until no vertices are missing, or no room is left.
+
+    Returns:
+      The number of runs there are then, and how many vertices are missing.
+    """
+    runs = Runs(counts, levels)
+    base = levels[number - 1] if number else 0.0
+    while missing > 0 and number + _MOST_RUNS <= len(counts):
+        before, number = number, _draw_feature(kind, number, parameters, bits, runs)
+        for k in range(before, number):
+            levels[k] += base
+            missing -= counts[k]
+        base = levels[number - 1]
+    return number, missing
+
+
+@compiled
+def _spread(
+    number: int, counts: np.ndarray, levels: np.ndarray, heights: np.ndarray, vertical: np.ndarray
+) -> None:
+    """Writes the vertices of runs: their height changes at vertical faces only, where a run begins."""
+    i, before = 0, 0.0
+    for k in range(number):
+        for j in range(i, i + counts[k]):
+            heights[j], vertical[j] = levels[k], False
+        if i < len(vertical):  # a run may have no vertices
+            vertical[i] = levels[k] != before
+        i, before = i + counts[k], levels[k]
+
+
+def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Repeats a feature until the length is reached; every one has at least one vertex."""
-    counts: list[int] = []
-    levels: list[float] = []
-    missing, base = cells(length), 0.0
-    while missing > 0:
-        for count, level in feature(parameters, rng):
-            counts.append(count)
-            levels.append(base + level)
-            missing -= count
-        base = levels[-1]
-    # Ground of level runs changes its height at vertical faces only, where a run begins.
-    ends = np.cumsum(counts)
-    vertical = np.zeros(ends[-1], dtype=bool)
-    vertical[ends - counts] = np.not_equal(levels, [0.0, *levels[:-1]])
-    return Profile(np.repeat(levels, counts), vertical)
+    wanted = missing = cells(length)
+    values = np.array([parameters[name] for name in _NAMES[kind]], float)
+    bits, number = random.address(rng), 0
+    counts, levels = np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing)
+    while True:
+        number, missing = _draw_features(kind, missing, number, values, bits, counts, levels)
+        if missing <= 0:
+            break
+        counts, levels = np.resize(counts, 2 * len(counts)), np.resize(levels, 2 * len(levels))
+    heights, vertical = np.empty(wanted - missing), np.empty(wanted - missing, bool)
+    _spread(number, counts, levels, heights, vertical)
+    return Profile(heights, vertical)
 
 
 # Overlays: added over the vertices of a stretch.
@@ -356,16 +434,21 @@ def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) 
     changes, thresholds = rng.random((2, count))
     changes *= abs(parameters['SlopeDeltaRange'])
     thresholds = low + (high - low) * thresholds
-    offsets = np.fromiter(_walk(changes.tolist(), thresholds.tolist()), float, count).cumsum()
-    return Profile(profile.heights + offsets * SPACING, profile.vertical)
+    heights = np.empty(count)
+    _walk(profile.heights, changes, thresholds, heights)
+    return Profile(heights, profile.vertical)
 
 
-def _walk(changes: list[float], thresholds: list[float]) -> Iterator[float]:
-    # Plain floats: a walk that looks at its own last value cannot be vectorised.
-    slope = 0.0
-    for change, threshold in zip(changes, thresholds, strict=True):
-        slope = slope - change if slope > threshold else slope + change
-        yield slope
+@compiled
+def _walk(
+    heights: np.ndarray, changes: np.ndarray, thresholds: np.ndarray, sloped: np.ndarray
+) -> None:
+    """Adds a walk of the slope to heights."""
+    slope = offset = 0.0
+    for k in range(len(heights)):
+        slope = slope - changes[k] if slope > thresholds[k] else slope + changes[k]
+        offset += slope
+        sloped[k] = heights[k] + offset * SPACING
 
 
 @register('var2d_flat')
@@ -394,23 +477,23 @@ def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> P
 @register('var2d_cliffs', CLIFFS)
 def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
     """Tall risers broken by ledges."""
-    return _repeat(_cliff, parameters, length, rng)
+    return _repeat(_CLIFF, parameters, length, rng)
 
 
-def _register_feature(name: str, feature: Feature, defaults: Parameters) -> None:
+def _register_feature(name: str, kind: int, defaults: Parameters) -> None:
     """Registers a feature twice: on level ground and on rolling ground."""
 
     @register(f'var2d_{name}', defaults)
     def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-        return _repeat(feature, parameters, length, rng)
+        return _repeat(kind, parameters, length, rng)
 
     @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
     def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _sloped(level(parameters, length, rng), parameters, rng)
 
 
-_register_feature('gaps', _gap, GAPS)
-_register_feature('walls', _wall, WALLS)
-_register_feature('steps', _step, STEPS)
-_register_feature('mixed', _mixed, {**GAPS, **WALLS, **STEPS})
-_register_feature('narrow_gaps', _narrow_gaps, NARROW_GAPS)
+_register_feature('gaps', _GAP, GAPS)
+_register_feature('walls', _WALL, WALLS)
+_register_feature('steps', _STEP, STEPS)
+_register_feature('mixed', _MIXED, _MIXTURE)
+_register_feature('narrow_gaps', _NARROW_GAPS, NARROW_GAPS)

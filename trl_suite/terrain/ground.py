@@ -211,7 +211,7 @@ class Ground:
             x, y = trail.start[k] + random.uniform() * (trail.end[k] - trail.start[k])
             return float(x), float(y), float(trail.heading[k])
         if layout.place == 'clear':
-            x, y = self._clear(random, START_ROOM, None)
+            x, y, _ = self._clear(random, START_ROOM, None)
             return x, y, random.uniform(-math.pi, math.pi)
         return 0.0, 0.0, 0.0
 
@@ -262,27 +262,31 @@ class Ground:
                 trail.start[k] + along + aside * np.array([-math.sin(heading), math.cos(heading)])
             )
         elif layout.place == 'clear':
-            x, y = self._clear(random, layout.goal_room, movers)
+            x, y, found = self._clear(random, layout.goal_room, movers)
+            if found and layout.grid is None and layout.level is not None:
+                return np.array([x, y, layout.level])
         elif rule == 'hike':
             x, y = root + [random.uniform(-GOAL_SPREAD, GOAL_SPREAD) for _ in range(2)]
         else:
             x, y = root[0] + random.uniform(distance, GOAL_SPREAD), 0.0
         return np.array([x, y, float(self.height(x, y, movers))])
 
-    def _clear(self, random: Random, room: float, movers: np.ndarray | None) -> tuple[float, float]:
-        """Draws a place whose surroundings are free of boxes and belts."""
+    def _clear(
+        self, random: Random, room: float, movers: np.ndarray | None
+    ) -> tuple[float, float, bool]:
+        """Draws a place whose surroundings are free of boxes and belts; tells whether it found one."""
         layout, span = self.layout, self.layout.span
+        others = [] if layout.belts is None else [layout.belts.boxes]
+        if layout.movers is not None:
+            others.append(self.movers(movers))
         for _ in range(TRIES):
             x, y = random.uniform(-span, span), random.uniform(-span, span)
-            low, high = np.array([x - room, y - room]), np.array([x + room, y + room])
-            things = [layout.boxes_in(low, high)]
-            if layout.belts is not None:
-                things.append(layout.belts.boxes)
-            if layout.movers is not None:
-                things.append(self.movers(movers))
-            if not any(boxes.touching(low, high).any() for boxes in things):
-                return x, y
-        return 0.0, 0.0
+            low, high = (x - room, y - room), (x + room, y + room)
+            if layout.is_clear(low, high) and not any(
+                boxes.touching(low, high).any() for boxes in others
+            ):
+                return x, y, True
+        return 0.0, 0.0, False
 
 
 def triangles(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -7,11 +7,14 @@ what lies there. A generator returns a `Layout`; what is endless it gives as fun
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+from trl_suite.util.compiled import compiled
 
 GRID = 0.2  # m between the vertices of a height grid; vertex i stands at i * GRID
 TURN_DISTANCE = 5.0  # m; only farther than that from the character do moving boxes turn round
@@ -39,8 +42,12 @@ class Boxes(NamedTuple):
 
     def touching(self, low: npt.ArrayLike, high: npt.ArrayLike) -> np.ndarray:
         """Which boxes touch a rectangle, (k,) bool; turned ones by the rectangle around them."""
-        extent = self.extent()
-        return ((self.position + extent >= low) & (self.position - extent <= high)).all(1)
+        found = np.empty(len(self.top), bool)
+        position, half_size, yaw = (np.ascontiguousarray(part, float) for part in self[:3])
+        _touching(
+            position, half_size, yaw, *np.broadcast_to(low, 2), *np.broadcast_to(high, 2), found
+        )
+        return found
 
     def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Height of every box's upper face at points (m,), (m, k); -inf beside it."""
@@ -71,6 +78,29 @@ def boxes(
     half_sizes, (yaws, tops, slopes) = np.empty_like(position), np.empty((3, len(position)))
     half_sizes[...], yaws[:], tops[:], slopes[:] = half_size, yaw, top, slope
     return Boxes(position, half_sizes, yaws, tops, slopes)
+
+
+@compiled
+def _touching(
+    position: np.ndarray,
+    half_size: np.ndarray,
+    yaw: np.ndarray,
+    low_x: float,
+    low_y: float,
+    high_x: float,
+    high_y: float,
+    found: np.ndarray,
+) -> None:
+    """Finds out which boxes touch a rectangle."""
+    for k in range(len(yaw)):
+        x, y = position[k, 0], position[k, 1]
+        cosine, sine = abs(math.cos(yaw[k])), abs(math.sin(yaw[k]))
+        length, width = half_size[k, 0], half_size[k, 1]
+        along, across = cosine * length + sine * width, sine * length + cosine * width
+        found[k] = (
+            x + along >= low_x and y + across >= low_y
+            and x - along <= high_x and y - across <= high_y
+        )  # fmt: skip
 
 
 NO_BOXES = boxes(np.zeros((0, 2)), (0, 0), 0)
@@ -149,7 +179,8 @@ class Layout:
         their heights, (k, m); linear on two triangles per cell, whose common edge runs from the
         back left to the front right corner. None for none.
       boxes: `Boxes`, or a function from two corners of a rectangle, (2,) each, to the boxes that
-        touch it. It must give the same boxes however it is asked.
+        touch it. It must give the same boxes however it is asked. It may have a method `touched` of
+        the same arguments, which tells faster whether there are any.
       belts: running surfaces.
       movers: moving boxes; they stand on the level.
       trail: the path that spawn and goals keep to, if place is 'trail'.
@@ -181,6 +212,13 @@ class Layout:
         if not isinstance(found, Boxes) or not all(np.isfinite(part).all() for part in found):
             raise ValueError('the function for boxes of a Layout must return finite Boxes')
         return found
+
+    def is_clear(self, low: tuple[float, float], high: tuple[float, float]) -> bool:
+        """Whether no box touches a rectangle."""
+        touched = getattr(self.boxes, 'touched', None)
+        if touched is not None:
+            return not touched(low, high)
+        return not self.boxes_in(np.array(low), np.array(high)).touching(low, high).any()
 
     def vertices(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Heights of the grid at vertices (i, j) * GRID, (len(i), len(j)).

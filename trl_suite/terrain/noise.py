@@ -7,8 +7,11 @@ the octaves are those of the original Terrain RL Simulator.
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
+
+from trl_suite.util.compiled import compiled, compiled_inline
 
 TILE = 256  # points of the tile along each axis; the last equals the first
 PERIOD = 16  # lattice cells over the tile
@@ -62,7 +65,7 @@ def tile() -> np.ndarray:
 
 @functools.cache
 def _single() -> np.ndarray:
-    return tile().astype(np.float32)
+    return np.ascontiguousarray(tile().T, np.float32)
 
 
 @functools.cache
@@ -84,24 +87,76 @@ def grid(
     Returns:
       Heights in m, shape (k, m), in single precision.
     """
-    noise = _single()
-    heights = np.full((len(x), len(y)), -amplitude * OCTAVES.sum(), np.float32)
-    for octave, factor in zip(2 * amplitude * OCTAVES, frequency * FREQUENCIES, strict=True):
-        i, f = _cell(x * factor + offset[0])
-        j, g = _cell(y * factor + offset[1])
-        lines = noise.take(i, 0, mode='clip')
-        rise = noise.take(i + 1, 0, mode='clip')
-        rise -= lines
-        rise *= f[:, None]
-        lines += rise
-        lines *= np.float32(octave)
-        left = lines.take(j, 1, mode='clip')
-        rise = lines.take(j + 1, 1, mode='clip')
-        rise -= left
-        rise *= g
-        heights += left
-        heights += rise
+    x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
+    heights = np.empty((len(x), len(y)), np.float32)
+    amplitudes, factors = 2 * amplitude * OCTAVES, frequency * FREQUENCIES
+    room = _Room(
+        np.empty(len(x), np.int32), np.empty(len(x), np.float32),
+        np.empty((TILE, len(x)), np.float32), np.empty((len(y), len(x)), np.float32),
+    )  # fmt: skip
+    lowest = np.float32(-amplitude * OCTAVES.sum())
+    _sum_octaves(
+        x, y, offset, lowest, amplitudes.astype(np.float32), factors, _single(), room, heights
+    )
     return heights
+
+
+class _Room(NamedTuple):
+    """Arrays to work in, of the lines of a grid along y."""
+
+    cells: np.ndarray  # of the tile, that they lie in
+    shares: np.ndarray  # where in them
+    crossings: np.ndarray  # heights where they cross lines of the tile
+    heights: np.ndarray  # of the grid, so that neighbours along x are neighbours in memory
+
+
+@compiled
+def _sum_octaves(
+    x: np.ndarray,
+    y: np.ndarray,
+    offset: np.ndarray,
+    lowest: np.float32,
+    amplitudes: np.ndarray,
+    factors: np.ndarray,
+    noise: np.ndarray,
+    room: _Room,
+    heights: np.ndarray,
+) -> None:
+    """Writes the sum of the octaves on a grid; `noise` is the tile along y, then along x."""
+    cells, shares, crossings, found = room.cells, room.shares, room.crossings, room.heights
+    for b in range(len(y)):
+        for a in range(len(x)):
+            found[b, a] = lowest
+    for octave in range(len(factors)):
+        factor, amplitude = factors[octave], amplitudes[octave]
+        for a in range(len(x)):
+            cells[a], shares[a] = _cell(x[a] * factor + offset[0])
+        first, last = TILE, 0
+        for b in range(len(y)):
+            cell, _ = _cell(y[b] * factor + offset[1])
+            first, last = min(first, cell), max(last, cell + 1)
+        for j in range(first, last + 1):
+            for a in range(len(x)):
+                near = noise[j, cells[a]]
+                rise = (noise[j, cells[a] + 1] - near) * shares[a]
+                crossings[j, a] = (near + rise) * amplitude
+        for b in range(len(y)):
+            cell, share = _cell(y[b] * factor + offset[1])
+            for a in range(len(x)):
+                left = crossings[cell, a]
+                rise = (crossings[cell + 1, a] - left) * share
+                found[b, a] = (found[b, a] + left) + rise
+    for a in range(len(x)):
+        for b in range(len(y)):
+            heights[a, b] = found[b, a]
+
+
+@compiled_inline
+def _cell(position: float) -> tuple[int, np.float32]:
+    """Number of the tile's cell at a position in tiles, and where in the cell it lies."""
+    position = position % 1.0 * (TILE - 1)
+    cell = min(int(position), TILE - 2)
+    return cell, np.float32(position - cell)
 
 
 def above(x: float, y: float, offset: np.ndarray, frequency: float) -> bool:
@@ -120,10 +175,3 @@ def above(x: float, y: float, offset: np.ndarray, frequency: float) -> bool:
         if abs(total) > octave:  # more than all further octaves together
             break
     return total > 0
-
-
-def _cell(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of the tile's cell at positions in tiles, and where in the cell they lie."""
-    position = position % 1.0 * (TILE - 1)
-    cell = np.minimum(position.astype(int), TILE - 2)
-    return cell, (position - cell).astype(np.float32)

@@ -44,6 +44,7 @@ from trl_suite.terrain.layout import (
     boxes,
 )
 from trl_suite.terrain.trail import AMPLITUDE, FREQUENCY, Trail
+from trl_suite.util.compiled import compiled
 
 TILE = 80.0  # m; side of the squares in which obstacles are drawn; one is centred on the origin
 CLEAR = 2.0  # m; half side of the square about the origin that obstacles leave clear
@@ -81,6 +82,7 @@ IDLE = {
 }  # fmt: skip
 
 Corner = np.ndarray | tuple[float, float]
+Rectangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # low and high corners, heights
 Function3D = Callable[[Parameters, np.random.Generator], Layout]
 
 
@@ -289,23 +291,42 @@ class _Obstacles:
     def __init__(self, parameters: Parameters, rng: np.random.Generator) -> None:
         self._parameters = parameters
         self._key = rng.integers(2**32, size=4).tolist()
-        self._tiles: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._tiles: dict[tuple[int, int], Rectangles] = {}
         self._largest = max(parameters['ObstacleWidth0'], parameters['ObstacleWidth1'])
 
-    def touching(
-        self, low: np.ndarray, high: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Low and high corners and heights of those that touch a rectangle, in order of drawing."""
-        # They hang out of their square ahead and to the left only.
-        first = np.floor((np.asarray(low) - self._largest) / TILE + 0.5).astype(int).tolist()
-        last = np.floor(np.asarray(high) / TILE + 0.5).astype(int).tolist()
-        columns, rows = (range(a, b + 1) for a, b in zip(first, last, strict=True))
-        found = [self._tile((i, j)) for i in columns for j in rows]
-        begin, end, height = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        near = np.flatnonzero(_meeting(begin, end, low, high))
-        return begin[near], end[near], height[near]
+    def __call__(self, low: np.ndarray, high: np.ndarray) -> Boxes:
+        """Those that touch a rectangle as boxes."""
+        begin, end, height = self.touching(low, high)
+        return boxes(0.5 * (begin + end), 0.5 * (end - begin), height)
 
-    def _tile(self, tile: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def touched(self, low: Corner, high: Corner) -> bool:
+        """Whether any touch a rectangle."""
+        for begin, end, _ in self._tiles_near(low, high):
+            if _meeting(begin, end, *low, *high, None):
+                return True
+        return False
+
+    def touching(self, low: Corner, high: Corner) -> Rectangles:
+        """Low and high corners and heights of those that touch a rectangle, in order of drawing."""
+        found = []
+        for parts in self._tiles_near(low, high):
+            near = _select(*parts[:2], low, high)
+            found.append(tuple(part[near] for part in parts))
+        if len(found) == 1:
+            return found[0]
+        begin, end, height = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return begin, end, height
+
+    def _tiles_near(self, low: Corner, high: Corner) -> list[Rectangles]:
+        """The squares whose rectangles may touch one."""
+        # They hang out of their square ahead and to the left only.
+        begin = [math.floor((float(edge) - self._largest) / TILE + 0.5) for edge in low]
+        end = [math.floor(float(edge) / TILE + 0.5) + 1 for edge in high]
+        return [
+            self._tile((i, j)) for i in range(begin[0], end[0]) for j in range(begin[1], end[1])
+        ]
+
+    def _tile(self, tile: tuple[int, int]) -> Rectangles:
         if tile not in self._tiles:
             parameters = self._parameters
             # Numbers of squares as naturals: 0, 1, -1, 2, ... -> 0, 2, 1, 4, ...
@@ -320,7 +341,7 @@ class _Obstacles:
                 corner = TILE * (np.array(tile) - 0.5 + shares[0])
                 begin[missing] = corner
                 end[missing] = corner + _between(parameters, 'ObstacleWidth', shares[1])
-                missing = np.flatnonzero(_meeting(begin, end, (-CLEAR, -CLEAR), (CLEAR, CLEAR)))
+                missing = _select(begin, end, (-CLEAR, -CLEAR), (CLEAR, CLEAR))
                 if not len(missing):
                     break
             height[missing] = 0.0
@@ -335,20 +356,41 @@ def obstacles(parameters: Parameters, rng: np.random.Generator) -> Layout:
     if parameters['ObstacleDensity'] > DENSE:
         return Layout(level=None, grid=_rubble(drawn))
 
-    def blocks(low: np.ndarray, high: np.ndarray) -> Boxes:
-        begin, end, height = drawn.touching(low, high)
-        return boxes(0.5 * (begin + end), 0.5 * (end - begin), height)
-
-    return Layout(boxes=blocks, place='clear', span=PLACE_SPAN['obstacles3d'])
+    return Layout(boxes=drawn, place='clear', span=PLACE_SPAN['obstacles3d'])
 
 
-def _meeting(begin: np.ndarray, end: np.ndarray, low: Corner, high: Corner) -> np.ndarray:
-    """Which upright rectangles, from corners `begin` to `end` (k, 2), meet another one, (k,) bool."""
-    found = begin[:, 0] <= high[0]
-    found &= begin[:, 1] <= high[1]
-    found &= end[:, 0] >= low[0]
-    found &= end[:, 1] >= low[1]
-    return found
+def _select(begin: np.ndarray, end: np.ndarray, low: Corner, high: Corner) -> np.ndarray:
+    """Numbers of the upright rectangles that meet another one."""
+    numbers = np.empty(len(begin), int)
+    return numbers[: _meeting(begin, end, *low, *high, numbers)]
+
+
+@compiled
+def _meeting(
+    begin: np.ndarray,
+    end: np.ndarray,
+    low_x: float,
+    low_y: float,
+    high_x: float,
+    high_y: float,
+    numbers: np.ndarray | None,
+) -> int:
+    """Which upright rectangles, from corners `begin` to `end` (k, 2), meet another one.
+
+    Returns:
+      How many, whose numbers are written; without numbers, 1 if there is any.
+    """
+    count = 0
+    for k in range(len(begin)):
+        if (
+            begin[k, 0] <= high_x and begin[k, 1] <= high_y
+            and end[k, 0] >= low_x and end[k, 1] >= low_y
+        ):  # fmt: skip
+            if numbers is None:
+                return 1
+            numbers[count] = k
+            count += 1
+    return count
 
 
 def _rubble(drawn: _Obstacles) -> GridFunction:

@@ -15,12 +15,12 @@ from trl_suite.terrain.generators import (
     LONGEST,
     SPACING,
     STEEP,
-    Profile,
     cells,
     draw,
     flat,
 )
 from trl_suite.terrain.parameters import Terrain
+from trl_suite.util.compiled import compiled
 
 STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
 PAD_END = 1.0  # m; the flat start ends here
@@ -230,30 +230,27 @@ class Strip:
 
     def _extend(self, low: int, high: int) -> None:
         """Draws stretches until the vertices from low to high are there."""
-        heights, vertical = [self._heights], [self._vertical]
-        end, height = self._low + len(self._heights) - 1, self._heights[-1]
+        end = self._low + len(self._heights) - 1
         if self._line is not None:
             self._extend_line(min(low, self._low), max(high, end))
             return
+        start, right, left = self._low, [], []
         while end < high:
-            profile = self._stretch(end, 0)
-            heights.append(height + profile.heights)
-            vertical.append(profile.vertical)
-            height = heights[-1][-1]
-            end += len(profile.heights)
-        start, height = self._low, self._heights[0]
+            right.append(self._stretch(end, 0))
+            end += right[-1][0] + len(right[-1][1])
         while start > low:
-            profile = self._stretch(start - cells(STRETCH), 1)
-            # The last vertex comes to lie on the first one there is; the ground that the profile is
-            # appended to, at height 0, becomes the new first vertex.
-            ground = np.concatenate(([0.0], profile.heights))
-            heights.insert(0, ground[:-1] - ground[-1] + height)
-            vertical.insert(0, profile.vertical)
-            height = heights[0][0]
-            start -= len(profile.heights)
-        if len(heights) > 1:
-            self._low = start
-            self._heights, self._vertical = np.concatenate(heights), np.concatenate(vertical)
+            left.append(self._stretch(start - cells(STRETCH), 1))
+            start -= left[-1][0] + len(left[-1][1])
+        if not (right or left):
+            return
+        heights, vertical = np.empty(end - start + 1), np.empty(end - start, bool)
+        first, last = self._low - start, self._low - start + len(self._vertical)
+        heights[first : last + 1], vertical[first:last] = self._heights, self._vertical
+        for stretch in right:
+            last = _append(last, *stretch, heights, vertical)
+        for stretch in left:
+            first = _prepend(first, *stretch, heights, vertical)
+        self._low, self._heights, self._vertical = start, heights, vertical
 
     def _extend_line(self, low: int, high: int) -> None:
         """Takes the vertices from low to high that are missing, and some more, from the line."""
@@ -268,21 +265,60 @@ class Strip:
             self._heights = np.concatenate(parts)
             self._vertical = np.abs(np.diff(self._heights)) > STEEP * SPACING
 
-    def _stretch(self, begin: int, side: int) -> Profile:
-        """Draws a stretch that begins at a vertex; if it covers x = 0, after flat ground."""
+    def _stretch(self, begin: int, side: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """Draws a stretch that begins at a vertex.
+
+        Returns:
+          How many level vertices come first, some if it covers x = 0; heights and vertical faces of
+          those that follow, as of a `Profile`.
+        """
         generator = GENERATORS.get(self.type)
         if generator is not None and generator.function is flat:
             # Without the streams, which take longer to make than the ground.
             profile = flat(self.parameters, STRETCH, _UNUSED)
         else:
             profile = draw(self.type, self.parameters, STRETCH, self._streams[side])
-        if not begin <= 0 < begin + cells(STRETCH):
-            return profile
-        pad = min(cells(STRETCH), cells(PAD_END) - begin)
-        return Profile(
-            np.concatenate((np.zeros(pad), profile.heights)),
-            np.concatenate((np.zeros(pad, dtype=bool), profile.vertical)),
-        )
+        pad = 0
+        if begin <= 0 < begin + cells(STRETCH):
+            pad = min(cells(STRETCH), cells(PAD_END) - begin)
+        return pad, profile.heights, profile.vertical
+
+
+@compiled
+def _append(
+    last: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
+    vertical: np.ndarray,
+) -> int:  # fmt: skip
+    """Writes a stretch behind the last vertex there is; returns which is the last one then."""
+    base = heights[last]
+    for k in range(pad):
+        heights[last + 1 + k], vertical[last + k] = base, False
+    last += pad
+    for k in range(len(more)):
+        heights[last + 1 + k], vertical[last + k] = base + more[k], faces[k]
+    return last + len(more)
+
+
+@compiled
+def _prepend(
+    first: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
+    vertical: np.ndarray,
+) -> int:  # fmt: skip
+    """Writes a stretch before the first vertex there is, on which its last one comes to lie.
+
+    The ground that it is appended to, at height 0, becomes the new first vertex, which is returned.
+    """
+    height, end = heights[first], more[-1]
+    first -= pad + len(more)
+    for k in range(pad + 1):
+        heights[first + k] = -end + height
+    for k in range(pad):
+        vertical[first + k] = False
+    for k in range(len(more) - 1):
+        heights[first + pad + 1 + k] = more[k] - end + height
+    for k in range(len(more)):
+        vertical[first + pad + k] = faces[k]
+    return first
 
 
 def seed_sequence(

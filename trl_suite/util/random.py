@@ -5,7 +5,9 @@
     uniform(3, 0.2, 0.7, streams.state)  # what np.random.default_rng(...).uniform(0.2, 0.7) gives
 
 The numbers are those of `numpy.random.Generator` to the last bit, so a stream may be used from Python
-and from compiled functions by turns.
+and from compiled functions by turns. So may a Generator of NumPy's, whatever its bits come from:
+
+    draw(address(rng))  # what rng.random() gives
 
 Source: NumPy's `PCG64` (M. E. O'Neill, 'PCG', 2014) and its ziggurat for the normal distribution.
 """
@@ -13,6 +15,7 @@ Source: NumPy's `PCG64` (M. E. O'Neill, 'PCG', 2014) and its ziggurat for the no
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -129,6 +132,61 @@ random = Compiled(_random, _random_native)
 def uniform(i: int, low: float, high: float, state: np.ndarray) -> float:
     """Draws from [low, high), as `Generator.uniform(low, high)`."""
     return low + (high - low) * random(i, state)
+
+
+class _Bits(ctypes.Structure):
+    """NumPy's bitgen_t."""
+
+    _fields_ = [
+        ('state', ctypes.c_void_p), ('next_uint64', ctypes.c_void_p),
+        ('next_uint32', ctypes.c_void_p), ('next_double', ctypes.c_void_p),
+        ('next_raw', ctypes.c_void_p),
+    ]  # fmt: skip
+
+
+_DRAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
+_capsule_address = ctypes.pythonapi.PyCapsule_GetPointer
+_capsule_address.restype, _capsule_address.argtypes = ctypes.c_void_p, (
+    ctypes.py_object, ctypes.c_char_p,
+)  # fmt: skip
+
+
+def address(generator: np.random.Generator) -> int:
+    """Returns where the bits of a generator come from, for `draw`; it must be kept alive."""
+    return _capsule_address(generator.bit_generator.capsule, b'BitGenerator')
+
+
+def _draw_native() -> Callable[..., Any]:
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
+
+    @intrinsic
+    def next_double(typing: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            word = ir.IntType(64)
+            fields = builder.inttoptr(args[0], word.as_pointer())
+            place = builder.gep(fields, [ir.Constant(word, _Bits.next_double.offset // 8)])
+            function = ir.FunctionType(ir.DoubleType(), [word]).as_pointer()
+            return builder.call(
+                builder.inttoptr(builder.load(place), function), [builder.load(fields)]
+            )
+
+        return types.float64(types.int64), generate
+
+    def draw(bits: int) -> float:
+        return next_double(bits)  # type: ignore[call-arg]
+
+    return draw
+
+
+def _draw(bits: int) -> float:
+    """Draws from [0, 1), as `random()` of the generator whose `address` is given."""
+    found = _Bits.from_address(bits)
+    return _DRAW(found.next_double)(found.state)
+
+
+draw = Compiled(_draw, _draw_native)
 
 
 def _words_native() -> Callable[..., Any]:
