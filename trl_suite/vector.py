@@ -188,8 +188,8 @@ class VectorEnvironment:
 
         Args:
           action: (n, k) in [-1, 1], clipped there.
-          rows: numbers of rows, or a mask (n,) bool; None for all. The others do not move, and have
-            reward 0.
+          rows: numbers of rows, or a mask (n,) bool; None for all. The others do not move; their
+            reward and its terms are 0, and all else in `info` is of their last step.
 
         Raises:
           ValueError: an action of another shape, or with NaN or infinity; the row is named.
@@ -214,11 +214,12 @@ class VectorEnvironment:
             self._begin(resetting)
         task.step(action, env_ids)
         self._steps[env_ids] += 1
-        reward, terminated = task.reward.copy(), task.failed.copy()
+        reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
         if len(env_ids) < self.num_envs:
             resting = np.ones(self.num_envs, bool)
             resting[env_ids] = False
-            reward[resting], terminated[resting] = 0.0, False
+            for each in (reward, terminated, *info.get('reward_terms', {}).values()):
+                each[resting] = 0
         truncated = np.zeros(self.num_envs, bool)
         if self.step_limit is not None:
             truncated[asked] = self._steps[asked] >= self.step_limit
@@ -226,7 +227,6 @@ class VectorEnvironment:
             truncated[asked] |= world.time[asked] >= self.time_limit
         truncated &= ~terminated
         ended[asked] = terminated[asked] | truncated[asked]
-        info = task.info()
         if self.autoreset == 'same_step':
             info['ended'] = ended.copy()
             if ended.any():
