@@ -4,9 +4,10 @@
 
 Prints, on one thread, per 1/30 s of one simulation and resets included:
 
-- the footstep environment driven by the shipped controller: its time, and the share of `Batch.step`;
-- each high-level environment under small random actions: its time as a multiple of that, and the share
-  of `Batch.step`, which counts more where boxes move or stand about.
+- the footstep environment driven by the shipped controller: its time;
+- each high-level environment under small random actions: its time as a multiple of that.
+
+What the physics takes of it, `benchmarks/engine_share.py` prints.
 """
 
 import argparse
@@ -24,17 +25,15 @@ WARM = 2  # steps; the first ones are cold
 
 
 def measured(environments, act, frames, seconds):
-    """Steps for some seconds; returns s per frame of a simulation, and the share of the physics."""
+    """Steps for some seconds; returns s per frame of a simulation."""
     observation = environments.reset()
     for _ in range(WARM):
         observation = environments.step(act(observation)).observation
-    physics, count = bench.counted(environments), 0
-    begin = time.perf_counter()
+    count, begin = 0, time.perf_counter()
     while time.perf_counter() - begin < seconds:
         observation = environments.step(act(observation)).observation
         count += frames(environments)
-    total = time.perf_counter() - begin
-    return total / count, physics.seconds / total
+    return (time.perf_counter() - begin) / count
 
 
 def footsteps(rows, seconds):
@@ -61,14 +60,12 @@ def main():
     parser.add_argument('--rows', type=int, default=64)
     parser.add_argument('--seconds', type=float, default=4.0, help='per measurement')
     arguments = parser.parse_args()
-    base, share = footsteps(arguments.rows, arguments.seconds)
-    print(f'{llc.DEFAULT}: {1e6 * base:.0f} us, {share:.2f} of it in Batch.step')
+    base = footsteps(arguments.rows, arguments.seconds)
+    print(f'{llc.DEFAULT}: {1e6 * base:.0f} us')
     for id_ in arguments.ids:
-        cost, share = high_level(id_, arguments.rows, arguments.seconds)
-        print(
-            f'{id_}: {cost / base:.2f} times as much, {share:.2f} of it in Batch.step', flush=True
-        )
-    again, _ = footsteps(arguments.rows, arguments.seconds)
+        cost = high_level(id_, arguments.rows, arguments.seconds)
+        print(f'{id_}: {cost / base:.2f} times as much', flush=True)
+    again = footsteps(arguments.rows, arguments.seconds)
     print(f'the first measurement again: {again / base:.2f} times as much')
 
 

@@ -4,10 +4,12 @@
 
 Prints, under random actions, resets included:
 
-- our vector environment by rows and threads: control steps per second; the share of the time that
-  `Batch.step` takes in the same run (1 would mean that nothing but physics costs); cost of a reset;
+- our vector environment by rows and threads: control steps per second; what one thread does of them,
+  us per row and control step; cost of a reset; and the speed-up that 16 and 64 cores would give, by
+  Amdahl's law from the part that one thread does;
 - memory per row: what fresh processes with 16 and with 1024 rows differ by;
-- raw `Batch.step` and raw `mj_step` of the same model, and our single environment;
+- MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and our single
+  environment;
 - the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
   async) and EnvPool, each as a fraction of the raw `mj_step` rate of its own model with as many
   physics steps, so that models of different cost compare. EnvPool 1.2.5 has MuJoCo 3.6.0 inside;
@@ -42,15 +44,16 @@ def resident():
 
 
 def ours(id_, rows, threads, seconds):
-    """Our vector environment: rate, share of physics, reset cost; and the rate of raw Batch.step."""
+    """Our vector environment: rate, serial part, reset cost, projection; and the rate of MuJoCo alone."""
     found = bench.vector(id_, rows, threads, seconds)
     result = {
         'control steps per second': round(found['control']),
-        'share of Batch.step': round(found['share'], 3),
+        'serial, us per row': round(found['serial'], 3),
         'reset, ms per row': round(found['reset'], 3),
         'share of resets': round(found['resets'], 3),
+        'projection': bench.projection(found, threads),
     }
-    return result, found['batch'] / SUBSTEPS
+    return result, found['engine'] / SUBSTEPS
 
 
 def footprint(id_, rows):
@@ -180,21 +183,21 @@ def main():
     parser.add_argument('--rows', type=int, nargs='*', default=ROWS)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
-    figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'raw Batch.step': {}}
+    figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'engine alone': {}}
     figures['memory per row, kB'] = {}
     for id_ in IDS:
         figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
         print(id_, figures['single'][id_])
         figures['memory per row, kB'][id_] = round(memory(id_) / 1e3)
         print(f'  memory per row: {figures["memory per row, kB"][id_]} kB')
-        figures['ours'][id_], figures['raw Batch.step'][id_] = {}, {}
+        figures['ours'][id_], figures['engine alone'][id_] = {}, {}
         for threads in THREADS:
             for rows in arguments.rows:
                 name = f'{rows} rows, {threads} threads'
                 found, speed = ours(id_, rows, threads, arguments.seconds)
                 figures['ours'][id_][name] = found
-                figures['raw Batch.step'][id_][name] = round(speed)
-                print(f'  {name}: {found}, raw Batch.step {speed:.0f}/s', flush=True)
+                figures['engine alone'][id_][name] = round(speed)
+                print(f'  {name}: {found}, the engine alone {speed:.0f}/s', flush=True)
     if not arguments.no_peers:
         figures['peers'] = peers(arguments.seconds)
         for name, value in figures['peers'].items():

@@ -418,7 +418,7 @@ def readme() -> str:
     found, (start, end) = speeds(), SPEED
     cells = []
     for id, alone in found['single'].items():
-        own, raw = found['ours'][id], found['raw Batch.step'][id]
+        own, raw = found['ours'][id], found['engine alone'][id]
         one, two = (f'256 rows, {threads} threads' for threads in (1, 2))
         cells.append((
             f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / alone["raw mj_step"]:.2f})',
@@ -431,7 +431,7 @@ def readme() -> str:
     said = (
         'Control steps per second (of 10 physics steps) under random actions, resets with new terrain '
         'included if there are 256; in brackets the share of what raw MuJoCo does with the same model, '
-        '`mj_step` for one, `Batch.step` for 256 (above 1: without resets bodies lie on the ground, '
+        '`mj_step` for one, MuJoCo on the same threads for 256 (above 1: without resets bodies lie on the ground, '
         f'where steps cost more). By `python benchmarks/vector_environment.py`, on {MACHINE}.'
     )
     before, _, rest = (DOCS / README).read_text(encoding='utf-8').partition(start)
@@ -444,8 +444,8 @@ def speed_page() -> str:
     cells = [
         (
             f'`{id}`', setting, own['control steps per second'],
-            f'{own["control steps per second"] / found["raw Batch.step"][id][setting]:.2f}',
-            f'{own["share of Batch.step"]:.2f}', f'{own["reset, ms per row"]:.2f}',
+            f'{own["control steps per second"] / found["engine alone"][id][setting]:.2f}',
+            f'{own["serial, us per row"]:.2f}', f'{own["reset, ms per row"]:.2f}',
             f'{own["share of resets"]:.2f}',
         )
         for id, settings in found['ours'].items()
@@ -466,10 +466,11 @@ def speed_page() -> str:
         '## One environment',
         table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per row of many'), single),
         '## Many at once',
-        'Resets with new terrain included. *Ratio* is to what `mujoco.batch.Batch.step` alone does with '
-        'the same model, rows and threads; it may be above 1, as without resets bodies lie on the '
-        'ground, where steps cost more. *Physics* and *resets* are shares of our time.',
-        table(('environment', '', 'control steps per s', 'ratio', 'physics', 'a reset, ms', 'resets'), cells),
+        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, rows '
+        'and threads; it may be above 1, as without resets bodies lie on the ground, where steps cost '
+        'more. *Serial* is what one thread does of a control step while the others wait, in us per row; '
+        '*resets* is their share of the time.',
+        table(('environment', '', 'control steps per s', 'ratio', 'serial', 'a reset, ms', 'resets'), cells),
         '![Rates by rows and threads](../benchmarks/vector_environment.png)',
         '## Other libraries',
         'In the same run, as a share of the `mj_step` rate of their own models; none of them has terrain.',

@@ -82,6 +82,16 @@ class DoctorTest(CommandTest):
         self.assertStartsWith(found.text, '2 of 8 cores usable')
         self.assertIn('num_threads=2', found.remedy)
 
+    def test_where_compiled_code_is_kept(self):
+        found = doctor.compiled_code()
+        self.assertEqual(found.state, doctor.OK)
+        self.assertIn(str(doctor.compiled.cache_folder()), found.text)
+        self.assertRegex(found.text, r': \d+ files, \d+\.\d MB$')
+        with mock.patch.object(doctor.compiled, 'cache_folder', return_value=None):
+            found = doctor.compiled_code()
+        self.assertEqual(found.state, doctor.NOTE)
+        self.assertIn('NUMBA_CACHE_DIR', found.remedy)
+
     def test_exit_status(self):
         good, bad = doctor.Finding('ok', 'fine'), doctor.Finding('FAILED', 'no engine', 'mend it')
         for found, status, last in (
@@ -104,8 +114,9 @@ class BenchTest(CommandTest):
         found = json.loads(pathlib.Path('bench.json').read_text())
         self.assertIn(found['machine'], out)
         self.assertIn(f'mujoco {machine.version("mujoco")}', found['machine'])
-        self.assertBetween(found['share of the physics'], 0.1, 1)
-        for name in ('ratio to Batch.step', 'ratio to mj_step', 'reset', 'single environment'):
+        self.assertGreater(found['projection']['64'], found['projection']['16'])
+        self.assertBetween(found['projection']['16'], 1, 16)
+        for name in ('ratio to the engine', 'ratio to mj_step', 'serial', 'single environment'):
             self.assertGreater(found[name], 0, name)
 
     def test_counts_physics_steps(self):

@@ -11,7 +11,7 @@ whatever the number of rows and threads, and whenever rows are reset.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -180,7 +180,7 @@ class VectorEnvironment:
         if seed is not None:
             self.seed(seed, numbers)
         self._fresh = False
-        self._begin(numbers)
+        self._share(self._begin, numbers)
         return self._observation()
 
     def step(self, action: np.ndarray, rows: np.ndarray | Sequence[int] | None = None) -> Step:
@@ -203,16 +203,18 @@ class VectorEnvironment:
         task, world, ended = self._task, self._world, self._ended
         assert world is not None
         asked = world.all_ids if rows is None else self._numbers(rows)
-        env_ids = asked
-        resetting = asked[ended[asked]]
-        if len(resetting):
-            if self.autoreset == 'disabled':
-                raise RuntimeError(
-                    f'row {resetting[0]} has ended; reset it, or choose another autoreset'
-                )
-            env_ids = asked[~ended[asked]]
-            self._begin(resetting)
-        task.step(action, env_ids)
+        resetting, env_ids = asked[ended[asked]], asked[~ended[asked]]
+        if len(resetting) and self.autoreset == 'disabled':
+            raise RuntimeError(
+                f'row {resetting[0]} has ended; reset it, or choose another autoreset'
+            )
+
+        def work(part: np.ndarray) -> None:
+            over = np.isin(part, resetting)
+            self._begin(part[over])
+            task.step(action, part[~over])
+
+        self._share(work, asked)
         self._steps[env_ids] += 1
         reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
         if len(env_ids) < self.num_envs:
@@ -231,7 +233,7 @@ class VectorEnvironment:
             info['ended'] = ended.copy()
             if ended.any():
                 info['final_observation'] = self._observation()
-                self._begin(ended.nonzero()[0])
+                self._share(self._begin, ended.nonzero()[0])
         reward = reward.astype(self.dtype, copy=False)
         return Step(self._observation(), reward, terminated, truncated, info)
 
@@ -335,6 +337,14 @@ class VectorEnvironment:
             'a live batch cannot be pickled; pickle what made it (id, num_envs, seed) and '
             'get_state(), and build it again where it is needed'
         )
+
+    def _share(self, work: Callable[[np.ndarray], None], rows: np.ndarray) -> None:
+        """Has the threads do some work, each for a part of the rows."""
+        assert self._world is not None
+        if self._task.in_parts:
+            self._world.share(work, rows)
+        else:
+            work(rows)
 
     def _begin(self, rows: np.ndarray) -> None:
         if not len(rows):

@@ -185,12 +185,12 @@ class SpatialTerrain(composer.Arena):
 
     def height(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
         """Heights of the surface in m at points (rows, k) m, within 12 m of the characters."""
-        self._look()
+        self._look(rows)
         return self.surroundings.height(x, y, rows)
 
     def surface_velocity(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
         """Horizontal velocities of the surface in m/s at points (rows, k) m, (rows, k, 2)."""
-        self._look()
+        self._look(rows)
         return self.surroundings.velocity(x, y, rows)
 
     def height_map(
@@ -201,7 +201,7 @@ class SpatialTerrain(composer.Arena):
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Heights around characters, (rows, 1024) m; see `Surroundings.height_map`."""
-        self._look()
+        self._look(rows)
         return self.surroundings.height_map(xy, heading, rows, out)
 
     def velocity_map(
@@ -212,7 +212,7 @@ class SpatialTerrain(composer.Arena):
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Velocities of the surface, (rows, 2048) m/s; see `Surroundings.velocity_map`."""
-        self._look()
+        self._look(rows)
         return self.surroundings.velocity_map(xy, heading, rows, out)
 
     def goal(
@@ -224,17 +224,19 @@ class SpatialTerrain(composer.Arena):
         distance: float = 1.0,
     ) -> np.ndarray:
         """Draws a goal for one simulation, clear of boxes as they now stand; see `Ground.goal`."""
-        self._look()
+        self._look(row)
         ground = self.grounds[row]
         assert ground is not None
         movers = None
         if ground.layout.movers is not None:
-            movers = self.surroundings.centres(ALL)[row, : len(ground.layout.movers.speed)]
+            movers = self.surroundings.centres(np.array([row]))[
+                0, : len(ground.layout.movers.speed)
+            ]
         return ground.goal(random, root, rule, distance=distance, movers=movers)
 
     def state(self, row: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
-        self._look()
+        self._look(row)
         return {**self.surroundings.state(row), 'begin': self._begin[row].copy()}
 
     def restore(self, row: int, state: Mapping[str, Any]) -> None:
@@ -246,10 +248,11 @@ class SpatialTerrain(composer.Arena):
             self._place(row)
             self._realise(row)
 
-    def _look(self) -> None:
-        """Sees where the physics has taken moving boxes."""
+    def _look(self, rows: Rows | int) -> None:
+        """Sees where the physics has taken moving boxes of some simulations."""
         if len(self._qpos):
-            np.add(self._begin, self._world.qpos[:, self._qpos], out=self.surroundings.way)
+            moved = self._world.qpos[rows][..., self._qpos]
+            self.surroundings.way[rows] = self._begin[rows] + moved
 
     def _realise(self, row: int) -> None:
         """Poses geoms as the window says."""

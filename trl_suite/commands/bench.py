@@ -28,6 +28,7 @@ SECONDS = 2.0  # per measurement
 WARM = 4 / 3  # s of simulated time; most rows have fallen once by then
 RESET = 30  # calls between two resets of what is stepped raw, a second of simulated time
 ROUNDS = 8  # in which environment and raw batch take turns: machines are now faster, now slower
+PROJECTED = (16, 64)  # cores
 DRAWN = 100  # random actions, which are repeated
 
 
@@ -73,24 +74,18 @@ def warmed(id: str, rows: int, threads: int) -> tuple[VectorEnvironment, Iterato
     environments = VectorEnvironment(id, rows, threads, seed=0)
     environments.reset()
     drawn = actions(-1, 1, (rows, len(environments.action_map)))
-    physics = counted(environments)
-    while physics.items * environments.task.physics_timestep < WARM * rows:
+    while physics_steps(environments) * environments.task.physics_timestep < WARM * rows:
         environments.step(next(drawn))
     return environments, drawn
 
 
-def counted(environments: VectorEnvironment) -> Stopwatch:
-    """Has the time and number of all physics steps added up from now on, those of each row."""
-    world: Any = environments._world
-    step = type(world).step.__get__(world)
-    world.step = Stopwatch(
-        step, lambda n, r=None: n * (environments.num_envs if r is None else len(r))
-    )
-    return world.step
+def physics_steps(environments: VectorEnvironment) -> int:
+    """Returns how many physics steps the rows have taken, in all."""
+    return int(environments.task.world.engine.steps.sum())
 
 
 def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
-    """Measures the vector environment, and `mujoco.batch.Batch.step` of the same model.
+    """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
     Args:
       id: of the environment.
@@ -99,15 +94,20 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
       seconds: for the environment, and as many for the raw batch.
 
     Returns:
-      'control' and 'physics': steps per second of all rows; 'batch': physics steps per second of the
-      raw batch, terrains included, whose bodies are never reset; 'share': of the time that is spent in
-      `Batch.step`; 'resets': share of resets; 'reset': ms per row.
+      'control' and 'physics': steps per second of all rows; 'engine': physics steps per second of
+      MuJoCo alone, terrains included, whose bodies are never reset; 'serial': us per row and control
+      step in which one thread works; 'resets': share of the threads' time that resets take; 'reset': ms
+      per row.
     """
+    threads = threads or machine.cores()
     environments, drawn = warmed(id, rows, threads)
     others, _ = warmed(id, rows, threads)
     world: Any = others._world
-    physics, begin = counted(environments), Stopwatch(environments._begin, len)
+    begin = Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
+    parallel = Stopwatch(environments._share, lambda *_: rows)
+    environments._share = parallel  # type: ignore[method-assign]
+    before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
     directly = acts_directly(others, world.models[0])  # else raw bodies are limp
 
@@ -116,19 +116,40 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
         world.share(lambda part: world.step(substeps, part), world.all_ids)
 
     control = Stopwatch(lambda: environments.step(next(drawn)), lambda: rows)
-    batch = Stopwatch(step, lambda: rows * substeps)
+    alone = Stopwatch(step, lambda: rows * substeps)
     for _ in range(ROUNDS):
-        for turn in (control, batch):
+        for turn in (control, alone):
             rate(turn, seconds / ROUNDS)
+    physics = physics_steps(environments) - before
     environments.close()
     others.close()
     return {
         'control': control.items / control.seconds,
-        'physics': physics.items / control.seconds,
-        'batch': batch.items / batch.seconds,
-        'share': physics.seconds / control.seconds,
+        'physics': physics / control.seconds,
+        'engine': alone.items / alone.seconds,
+        'serial': 1e6 * (control.seconds - parallel.seconds) / control.items,
         'reset': 1e3 * begin.seconds / max(1, begin.items),
-        'resets': begin.seconds / control.seconds,
+        'resets': begin.seconds / (threads * control.seconds),
+    }
+
+
+def projection(found: dict[str, float], threads: int) -> dict[str, float]:
+    """Returns the speed-up over one core that more cores would give, by Amdahl's law.
+
+    Args:
+      found: what `vector` measured.
+      threads: with how many.
+
+    Returns:
+      Number of cores -> how many times as many control steps per second as one core. Only what one
+      thread does is counted against it, not caches and memory that the cores share.
+    """
+    total = 1e6 / found['control']  # us per row and control step
+    serial = found['serial']
+    parallel = threads * (total - serial)
+    return {
+        str(cores): round((serial + parallel) / (serial + parallel / cores), 1)
+        for cores in PROJECTED
     }
 
 
@@ -215,8 +236,10 @@ def bench(
 
     Returns:
       What JSON can hold: 'machine', 'id', 'rows', 'threads'; 'control steps per second' of all rows,
-      and of a 'single environment'; 'ratio to Batch.step' and 'ratio to mj_step' (on one thread) of
-      the physics steps per second; 'share of the physics' in the time; 'reset' (ms per row).
+      and of a 'single environment'; 'ratio to the engine' (MuJoCo alone on as many
+      threads) and 'ratio to mj_step' (on one thread) of the physics steps per second; 'serial' (us per
+      row and control step); 'reset' (ms per row); and 'projection': the speed-up that 16 and 64 cores
+      would give, by Amdahl's law from the part that one thread does.
 
     Raises:
       ValueError: unknown id, or numbers out of range.
@@ -228,9 +251,10 @@ def bench(
     return {
         'machine': machine.sentence(), 'id': id, 'rows': rows, 'threads': threads,
         'control steps per second': round(many['control']),
-        'ratio to Batch.step': round(many['physics'] / many['batch'], 3),
+        'ratio to the engine': round(many['physics'] / many['engine'], 3),
         'ratio to mj_step': round(many['physics'] / one['mj_step'], 3),
-        'share of the physics': round(many['share'], 3), 'reset': round(many['reset'], 3),
+        'serial': round(many['serial'], 3), 'reset': round(many['reset'], 3),
+        'projection': projection(many, threads),
         'single environment': round(one['environment']),
     }  # fmt: skip
 
@@ -246,10 +270,15 @@ def run(arguments: argparse.Namespace) -> None:
     print(f'  on {result["machine"]}')
     for name, text in (
         ('control steps', f'{result["control steps per second"]} per second, resets included'),
-        ('physics', f'{result["ratio to Batch.step"]:.2f} of the rate of raw mujoco.batch.Batch.step'),
+        ('physics', f'{result["ratio to the engine"]:.2f} of the rate of MuJoCo alone on these threads'),
         ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
-        ('', f'{result["share of the physics"]:.0%} of the time is physics'),
+        ('serial', f'{result["serial"]:.2f} us per row and control step in one thread'),
         ('reset', f'{result["reset"]:.2f} ms per row'),
+        (
+            'projected',
+            ', '.join(f'{v:.3g} times on {k} cores' for k, v in result['projection'].items())
+            + " of one core's rate, by Amdahl's law",
+        ),
         ('alone', f'{result["single environment"]} control steps per second in a single environment'),
     ):  # fmt: skip
         print(f'  {name:<14} {text}')

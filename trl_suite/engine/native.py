@@ -35,6 +35,7 @@ class Engine(NamedTuple):
       sizes: numbers in each field, (F,).
       written: how many fields, the first ones, tasks may write.
       time: simulated time, (n,) s.
+      steps: physics steps that were taken since the world was made, (n,).
       timestep: duration of a physics step, s.
     """
 
@@ -47,6 +48,7 @@ class Engine(NamedTuple):
     sizes: np.ndarray
     written: int
     time: np.ndarray
+    steps: np.ndarray
     timestep: float
 
 
@@ -200,6 +202,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     call(engine.functions[STEP1], model, data)
     for _ in range(nstep):  # as MuJoCo does, number by number
         engine.time[i] += engine.timestep
+    engine.steps[i] += nstep
     read(i, engine)
 
 

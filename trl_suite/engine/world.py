@@ -114,6 +114,7 @@ class World:
             sizes=np.array([array[0].size for array in arrays[: len(mirrored)]], np.int64),
             written=len(WRITABLE),
             time=np.zeros(self.n),
+            steps=np.zeros(self.n, int),
             timestep=models[0].opt.timestep,
         )
         self.pack = packed(self.engine)
@@ -184,7 +185,7 @@ class World:
           Exception: the first one that the work raised; the other parts are finished.
         """
         threads = min(self._num_threads, max(1, len(env_ids) // LEAST))
-        if threads == 1:
+        if threads == 1 or not len(env_ids):
             work(env_ids)
             return
         if self._pool is None:

@@ -116,9 +116,11 @@ class Composed(Task):
         self.failed[env_ids] = self.diverged[env_ids] = False
         self._write(env_ids)
 
+    in_parts = False  # functions of the user's read all simulations
+
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
-        self.task.step(action, env_ids)
+        self.world.share(lambda part: self.task.step(action, part), env_ids)
         self._finish(env_ids)
 
     # Of a plain composer.Environment, which calls these one by one.

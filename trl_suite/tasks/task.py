@@ -106,9 +106,8 @@ class Task(composer.Task):
     simulations. A task of the user's may do the same with plain NumPy.
 
     An environment calls `bind` once, `reset` for simulations that begin an episode, and `step` for
-    those that take a step. A step is `apply_action`, `simulate` and `finish_step`, which the threads
-    call for parts of the simulations: each must touch the simulations that it is given, and no
-    others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
+    those that take a step, which is `apply_action`, `simulate` and `finish_step`. Threads call these
+    for parts of the simulations: each must touch the simulations that it is given, and no others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
     the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
 
     Attributes:
@@ -127,6 +126,7 @@ class Task(composer.Task):
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
     fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
+    in_parts = True  # whether threads may each be given a part of the simulations
     _begun = False  # whether no step was taken since composer's reset
 
     # What a family implements.
@@ -160,13 +160,9 @@ class Task(composer.Task):
           action: of all simulations, (n, k), in [-1, 1]; those of the others do not count.
           env_ids: sorted numbers of the simulations that take a step.
         """
-
-        def advance(part: np.ndarray) -> None:
-            self.apply_action(action, part)
-            self.simulate(part)
-            self.finish_step(part)
-
-        self.world.share(advance, env_ids)
+        self.apply_action(action, env_ids)
+        self.simulate(env_ids)
+        self.finish_step(env_ids)
 
     def simulate(self, env_ids: np.ndarray) -> None:
         """Advances the physics of some simulations by one control step."""
