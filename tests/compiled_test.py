@@ -136,15 +136,18 @@ class FunctionTest(parameterized.TestCase):
         self.assertEqual(twice.__name__, 'twice')
 
     def test_long_compilations_are_announced_on_a_terminal(self):
-        for terminal, seconds, lines in ((True, 0.2, 2), (True, 0.0, 0), (False, 0.2, 0)):
-            stream = io.StringIO()
+        for terminal, seconds, lines in (
+            (True, (0.2,), 1), (True, (0.06, 0.06, 0.2), 1), (True, (0.0, 0.0), 0), (False, (0.2,), 0),
+        ):  # fmt: skip
+            stream, announcer = io.StringIO(), module._Announcer()
             stream.isatty = lambda terminal=terminal: terminal
             with (
                 unittest.mock.patch.object(module, 'PATIENCE', 0.1),
                 contextlib.redirect_stderr(stream),
-                module.announcing('the test'),
             ):
-                time.sleep(seconds)
+                for each in seconds:
+                    with announcer.compiling():
+                        time.sleep(each)
             self.assertLen(stream.getvalue().splitlines(), lines)
 
 

@@ -17,9 +17,11 @@ import os
 import platform
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 
 from trl_suite.commands import machine
+from trl_suite.util import compiled
 
 BACKENDS = ('egl', 'osmesa', 'glfw')
 OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
@@ -59,6 +61,8 @@ _RUN = """
 import json, time
 from trl_suite import suite
 environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', {'random': 0})
+environment.reset()
+environment.step(environment.task.clip_action(0))  # on a new machine, rules are compiled
 time_step, steps, begin = environment.reset(), 0, time.perf_counter()
 while time.perf_counter() - begin < 1.0:
     if time_step.last():
@@ -97,6 +101,7 @@ def findings() -> Iterator[Finding]:
     yield from versions()
     yield from extras()
     yield cores()
+    yield compiled_code()
     works = []
     for name, finding in backends():
         yield finding
@@ -144,6 +149,21 @@ def cores() -> Finding:
     if usable == all_:
         return Finding(OK, f'{text}; num_threads=0 starts as many threads')
     return Finding(NOTE, text, f'num_threads=0 takes all {all_}: give num_threads={usable}')
+
+
+def compiled_code() -> Finding:
+    """Where the machine code of the rules is kept, and how much of it there is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        folder = compiled.cache_folder()
+    if folder is None:
+        return Finding(
+            NOTE, 'no folder for compiled code can be written: every process compiles anew',
+            'set NUMBA_CACHE_DIR to a folder that can be written',
+        )  # fmt: skip
+    sizes = [path.stat().st_size for path in folder.rglob('*') if path.is_file()]
+    text = f'compiled code in {folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB'
+    return Finding(OK, text)
 
 
 def backends() -> Iterator[tuple[str, Finding]]:

@@ -114,7 +114,11 @@ class Compiled:
                 numba.config.CACHE_DIR = before
 
     def __call__(self, *args: Any) -> Any:
-        return self.entry(*args)
+        entry = self._made.get(True)
+        if entry is not None:
+            return entry(*args)
+        with _announcer.compiling():  # at the first call
+            return self.entry(*args)
 
 
 def compiled(function: Callable[..., Any]) -> Compiled:
@@ -221,25 +225,36 @@ def _forget(folder: pathlib.Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
 
 
-@contextmanager
-def announcing(what: str) -> Iterator[None]:
-    """Says on a terminal that something is being compiled, if it takes longer than `PATIENCE`."""
+class _Announcer:
+    """Says on a terminal, once in a process, that compiling takes long."""
 
-    def announce() -> None:
-        print(
-            f'trl_suite: compiling {what}, once for this machine ...', file=sys.stderr, flush=True
-        )
+    def __init__(self) -> None:
+        self.spent, self.told = 0.0, False
+        self._lock = threading.Lock()
 
-    if not sys.stderr.isatty():
-        yield
-        return
-    timer = threading.Timer(PATIENCE, announce)
-    timer.daemon = True
-    begun = time.monotonic()
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-        if time.monotonic() - begun > PATIENCE:
-            print(f'trl_suite: compiled in {time.monotonic() - begun:.0f} s', file=sys.stderr)
+    @contextmanager
+    def compiling(self) -> Iterator[None]:
+        """Counts the time that is spent inside; tells of it once it is longer than `PATIENCE`."""
+        timer = threading.Timer(max(PATIENCE - self.spent, 0.0), self._tell)
+        timer.daemon = True
+        begun = time.monotonic()
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            self.spent += time.monotonic() - begun
+
+    def _tell(self) -> None:
+        with self._lock:
+            told, self.told = self.told, True
+        if not told and sys.stderr.isatty():
+            print(
+                'trl_suite: compiling for this machine, once; the first steps of each kind of '
+                'environment take some seconds',
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+_announcer = _Announcer()
