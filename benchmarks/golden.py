@@ -2,7 +2,7 @@
 
     python benchmarks/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
     python benchmarks/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
-    python benchmarks/golden.py store tests/golden.json          what tests/golden_test.py expects
+    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  what the test expects
 
 Only the public interface is used, so that one version of the suite can record and another compare;
 PYTHONPATH chooses which. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'. Cases:
@@ -476,13 +476,15 @@ def summarised(id_):
     return suite.make(id_, {'random': 0, **options})
 
 
-def store(path):
+def store(path, pattern=''):
     """Writes summaries; each has the steps up to which small changes of the actions do not matter.
 
-    Of some seeds the first is taken with which that is all of them, or else most.
+    Of some seeds the first is taken with which that is all of them, or else most. With a pattern the
+    other environments keep what is stored.
     """
-    stored = {}
-    for id_ in tqdm(suite.ALL_IDS, mininterval=5):
+    file = pathlib.Path(path)
+    stored = json.loads(file.read_text()) if pattern else {}
+    for id_ in tqdm(fnmatch.filter(suite.ALL_IDS, f'*{pattern}*'), mininterval=5):
         environment, best, wanted = summarised(id_), 0, len(LONG if is_long(id_) else STEPS)
         for seed in range(SEEDS):
             expected, count = summary(id_, seed, 0.0, environment), wanted
@@ -498,7 +500,7 @@ def store(path):
                 break
         environment.close()
     lines = ',\n'.join(f' {json.dumps(id_)}: {json.dumps(value)}' for id_, value in stored.items())
-    pathlib.Path(path).write_text(f'{{\n{lines}\n}}\n')
+    file.write_text(f'{{\n{lines}\n}}\n')
 
 
 def agreeing(expected, found):
@@ -517,7 +519,7 @@ def main():
     parser.add_argument('--filter', default='', metavar='PATTERN')
     arguments = parser.parse_args()
     if arguments.command == 'store':
-        store(arguments.file)
+        store(arguments.file, arguments.filter)
     elif arguments.command == 'record':
         record(arguments.file, arguments.filter)
     else:

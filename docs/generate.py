@@ -408,6 +408,9 @@ def terrain_index() -> str:
 # Speed
 
 
+PROJECTED = '1024 rows, 2 threads'
+
+
 def speeds() -> dict[str, Any]:
     path = DOCS.parent / 'benchmarks' / 'vector_environment.json'
     return json.loads(path.read_text(encoding='utf-8'))
@@ -458,6 +461,10 @@ def speed_page() -> str:
         )
         for id, own in found['single'].items()
     ]  # fmt: skip
+    projected = [
+        (f'`{id}`', *(f'{share:g}' for share in settings[PROJECTED]['projection'].values()))
+        for id, settings in found['ours'].items()
+    ]
     return page(
         'Speed',
         f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random; a '
@@ -472,6 +479,11 @@ def speed_page() -> str:
         '*resets* is their share of the time.',
         table(('environment', '', 'control steps per s', 'ratio', 'serial', 'a reset, ms', 'resets'), cells),
         '![Rates by rows and threads](../benchmarks/vector_environment.png)',
+        '## More cores',
+        "A projection, not a measurement: how many times one core's rate 1024 simulations would reach, by "
+        "Amdahl's law from what one thread does alone (*serial* above). Memory and caches that cores share "
+        'are left out. `trl-suite bench ID` prints the same of your machine.',
+        table(('environment', '16 cores', '64 cores'), projected),
         '## Other libraries',
         'In the same run, as a share of the `mj_step` rate of their own models; none of them has terrain.',
         table(('', 'share'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
