@@ -330,8 +330,12 @@ class DisabledTest(parameterized.TestCase):
             print(hashlib.sha256(b''.join(array.tobytes() for array in found)).hexdigest())
     """
 
-    @parameterized.parameters('PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped2D_LLC_Flat_Step-v0')
-    def test_planar(self, id_):
+    @parameterized.parameters(
+        'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped2D_LLC_Flat_Step-v0', 'FSM_Hopper2D_Terrain_Gaps-v0',
+        'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_LLC_Symetric_Step-v0',
+        'PD_Biped3D_HLC_DynamicsObstacles-v0', 'PD_Biped3D_Terrain_Soccer_Hard-v0',
+    )  # fmt: skip
+    def test_the_same_numbers(self, id_):
         found = [
             subprocess.run(
                 [sys.executable, '-c', textwrap.dedent(self.SCRIPT), id_], capture_output=True,

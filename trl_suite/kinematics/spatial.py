@@ -14,10 +14,11 @@ import numpy as np
 
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
-from trl_suite.engine import World
+from trl_suite.engine import World, native
+from trl_suite.engine.native import Engine
 from trl_suite.motion import quaternion
 from trl_suite.terrain import spatial_ground
-from trl_suite.terrain.spatial_ground import SAMPLES, SpatialGround
+from trl_suite.terrain.spatial_ground import SAMPLES, SpatialGround, see_movers
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
 CLEARANCE = 0.001  # m; left under every link at the start
@@ -297,6 +298,75 @@ def measure_all(env_ids: np.ndarray, measured: Measured) -> None:
         measure(i, measured.body, measured.state, measured.ground, measured.found)
 
 
+class Corners(NamedTuple):
+    """Corners of the boxes of a character.
+
+    Attributes:
+      bodies: which link each is on, (C,).
+      places: in the frame of the link, (C, 3) m.
+    """
+
+    bodies: np.ndarray
+    places: np.ndarray
+
+
+@compiled
+def put_down(
+    i: int, row: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
+    measured: Measured, engine: Engine,
+) -> None:  # fmt: skip
+    """Puts the character of simulation i on the ground; see `SpatialFigure.place`, whose row it is."""
+    body, physics, ground = measured.body, measured.state, measured.ground
+    for k in range(len(body.qpos)):
+        physics.qpos[i, body.qpos[k]] = poses[row, k]
+    for k in range(len(body.dof)):
+        physics.qvel[i, body.dof[k]] = rates[row, k]
+    angle = spawns[row, 2]
+    cosine, sine = math.cos(angle), math.sin(angle)
+    x, y = poses[row, 0], poses[row, 1]
+    x, y = spawns[row, 0] + (cosine * x - sine * y), spawns[row, 1] + (sine * x + cosine * y)
+    see_movers(i, physics.qpos, ground)
+    z = poses[row, 2] + spatial_ground.height(i, x, y, ground)
+    columns = body.qpos
+    physics.qpos[i, columns[0]], physics.qpos[i, columns[1]] = x, y
+    physics.qpos[i, columns[2]] = z
+    half_cosine, half_sine = math.cos(angle / 2), math.sin(angle / 2)
+    q_w, q_x, q_y, q_z = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
+    physics.qpos[i, columns[3]] = half_cosine * q_w - half_sine * q_z
+    physics.qpos[i, columns[4]] = half_cosine * q_x - half_sine * q_y
+    physics.qpos[i, columns[5]] = half_cosine * q_y + half_sine * q_x
+    physics.qpos[i, columns[6]] = half_cosine * q_z + q_w * half_sine
+    v_x, v_y = rates[row, 0], rates[row, 1]
+    physics.qvel[i, body.dof[0]] = cosine * v_x - sine * v_y
+    physics.qvel[i, body.dof[1]] = sine * v_x + cosine * v_y
+    native.forward(i, engine)
+
+    depth = -math.inf
+    for k in range(len(corners.bodies)):
+        link = corners.bodies[k]
+        w, a = physics.xquat[i, link, 0], physics.xquat[i, link, 1]
+        b, c = physics.xquat[i, link, 2], physics.xquat[i, link, 3]
+        x, y, z = corners.places[k, 0], corners.places[k, 1], corners.places[k, 2]
+        across_x, across_y = 2 * (b * z - c * y), 2 * (c * x - a * z)
+        across_z = 2 * (a * y - b * x)
+        at_x = physics.xpos[i, link, 0] + ((x + w * across_x) + (b * across_z - c * across_y))
+        at_y = physics.xpos[i, link, 1] + ((y + w * across_y) + (c * across_x - a * across_z))
+        at_z = physics.xpos[i, link, 2] + ((z + w * across_z) + (a * across_y - b * across_x))
+        depth = max(depth, spatial_ground.height(i, at_x, at_y, ground) - at_z)
+    physics.qpos[i, columns[2]] += max(depth + CLEARANCE, 0.0)
+    native.forward(i, engine)
+
+
+@compiled_loop
+def put_down_all(
+    env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray,
+    corners: Corners, measured: Measured, engine: Engine,
+) -> None:  # fmt: skip
+    """Puts characters on the ground; takes packs."""
+    for row in range(len(env_ids)):
+        put_down(env_ids[row], row, poses, rates, spawns, corners, measured, engine)
+
+
 class SpatialFigure:
     """One character in every simulation of a world.
 
@@ -382,13 +452,14 @@ class SpatialFigure:
         self.found = measurement(world.n, self.body)
         self._pack = packed(Measured(self.body, self.state, self.ground, self.found))
         geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
-        self._bodies = model.geom_bodyid[geoms]
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
         boxes = model.geom_aabb[geoms, None]  # middle and half sides, in the geoms' frames
         corners = quaternion.rotate(
             model.geom_quat[geoms, None], boxes[..., :3] + signs * boxes[..., 3:]
         )
-        self._corners = model.geom_pos[geoms, None] + corners  # (G, 8, 3), in the links' frames
+        corners += model.geom_pos[geoms, None]  # in the links' frames
+        bodies = np.repeat(model.geom_bodyid[geoms], 8).astype(int)
+        self._corners = packed(Corners(bodies, corners.reshape(-1, 3)))
 
     @property
     def ground(self) -> SpatialGround:
@@ -419,24 +490,8 @@ class SpatialFigure:
           rates: their velocities, (m, columns of a velocity).
           spawns: where the origin is put: x, y in m, and by how much it is turned, rad, (m, 3).
         """
-        world, angle = self._world, spawns[:, 2]
-        poses, rates = poses.copy(), rates.copy()
-        poses[:, :2] = spawns[:, :2] + quaternion.turned(poses[:, :2], angle)
-        poses[:, 3:7] = quaternion.multiply(quaternion.about_z(angle), poses[:, 3:7])
-        rates[:, :2] = quaternion.turned(rates[:, :2], angle)
-        poses[:, 2] += self.arena.height(poses[:, :1], poses[:, 1:2], env_ids)[:, 0]
-        world.qpos[env_ids[:, None], self.pose_qpos] = poses
-        world.qvel[env_ids[:, None], self.pose_dof] = rates
-        world.forward(env_ids)
-        bodies = (env_ids[:, None], self._bodies)
-        corners = world.xpos[bodies][:, :, None] + quaternion.rotate(
-            world.xquat[bodies][:, :, None], self._corners
-        )
-        x, y, z = corners.reshape(len(env_ids), -1, 3).transpose(2, 0, 1)
-        depth = self.arena.height(x, y, env_ids) - z
-        lift = np.maximum(depth.max(1) + CLEARANCE, 0)
-        world.qpos[env_ids, self.pose_qpos[2]] += lift
-        world.forward(env_ids)
+        world = self._world
+        put_down_all(env_ids, poses, rates, spawns, self._corners, self._pack, world.pack)
 
 
 def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
