@@ -192,7 +192,13 @@ class World:
             self._pool = concurrent.futures.ThreadPoolExecutor(self._num_threads, 'trl_suite')
         parts = np.array_split(env_ids, min(CHUNKS * threads, max(1, len(env_ids) // LEAST)))
         running = [self._pool.submit(work, part) for part in parts]
-        concurrent.futures.wait(running)
+        try:
+            concurrent.futures.wait(running)
+        except BaseException:  # a keyboard interrupt: nothing may go on behind the caller's back
+            for each in running:
+                each.cancel()
+            concurrent.futures.wait(running)
+            raise
         for each in running:
             each.result()
 

@@ -165,7 +165,6 @@ def measure(
     found.pose[i, 0] = root_z - under
 
     speed_x = speed_y = speed_z = 0.0
-    features = 0
     for k in range(len(body.links)):
         link = body.links[k]
         centre_x, centre_y = state.xipos[i, link, 0], state.xipos[i, link, 1]

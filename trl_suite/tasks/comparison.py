@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,14 +50,18 @@ def comparison(
     weights, ball = character.row.weights, character.spherical
     joints = np.asarray(weights[1:])
     numbers = np.array(list(terms.values()))
-    columns: Any = [reference.columns[name].start for name in Comparison._fields[1:10]]
-    return Comparison(  # type: ignore[call-arg]
-        reference.tracks,
-        *columns,
-        np.concatenate([weights[:1], joints[ball], joints[~ball]]),
-        np.concatenate([np.full(3, weights[0]), np.repeat(joints, character.dofs)]),
-        numbers[:, 0].copy(), numbers[:, 1].copy(),
+    names = (
+        'rotations', 'angles', 'rates', 'effectors', 'com_velocity', 'height', 'heading', 'root',
+        'positions',
     )  # fmt: skip
+    return Comparison(
+        tracks=reference.tracks,
+        pose_weights=np.concatenate([weights[:1], joints[ball], joints[~ball]]),
+        rate_weights=np.concatenate([np.full(3, weights[0]), np.repeat(joints, character.dofs)]),
+        term_weights=numbers[:, 0].copy(),
+        term_scales=numbers[:, 1].copy(),
+        **{name: reference.columns[name].start for name in names},
+    )
 
 
 # Of simulation i and a moment of the reference (see `moment`).

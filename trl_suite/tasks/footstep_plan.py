@@ -52,8 +52,12 @@ def footstep_plan(n: int) -> FootstepPlan:
 
 
 @compiled
-def switches(i: int, phase: float, found: SpatialMeasurement, plan: FootstepPlan) -> bool:
-    """Whether stance switches at this phase; then notes how well the foot has met its place."""
+def update_stance(i: int, phase: float, found: SpatialMeasurement, plan: FootstepPlan) -> bool:
+    """Switches the stance foot if the phase says so, and records how well the other has landed.
+
+    Returns:
+      Whether it switched.
+    """
     stance = 1 if phase >= 0.5 else 0
     if stance == plan.stance[i]:
         return False

@@ -40,7 +40,7 @@ from trl_suite.tasks.footstep_plan import (
     observe_plan,
     plan_markers,
     plan_mirror,
-    switches,
+    update_stance,
 )
 from trl_suite.tasks.goals import GOAL_COLOUR, flag
 from trl_suite.tasks.plans import ROOT_TURN_LIMIT, Plans, Pushes, options
@@ -130,7 +130,7 @@ def land(i: int, rules: FootstepRules) -> bool:
     if breaks_down(i, common):
         return False
     measure(i, common)
-    plan.landed[i] = switches(i, common.clock.phase[i], common.found, plan)
+    plan.landed[i] = update_stance(i, common.clock.phase[i], common.found, plan)
     if plan.landed[i] and plan.landing_error[i] > rules.largest_miss:
         state.missed[i] = common.clock.steps[i] > state.excused[i]
     return plan.landed[i]

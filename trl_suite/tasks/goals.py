@@ -36,11 +36,11 @@ def goals(n: int) -> Goals:
 
 
 def set_goal(
-    env_id: int, place: np.ndarray, count: int, random: np.random.Generator, found: Goals
+    env_id: int, place: np.ndarray, count: int, random: np.random.Generator, goals: Goals
 ) -> None:
     """Sets a goal (3,) m at a control step of the episode, and draws how long it lasts."""
-    found.place[env_id] = place
-    found.due[env_id] = count + round(random.uniform(*GOAL_LASTS) / CONTROL_TIMESTEP)
+    goals.place[env_id] = place
+    goals.due[env_id] = count + round(random.uniform(*GOAL_LASTS) / CONTROL_TIMESTEP)
 
 
 def flag(goal: Any) -> Marker:

@@ -43,7 +43,7 @@ from trl_suite.tasks.footstep_plan import (
     observe_plan,
     plan_markers,
     plan_mirror,
-    switches,
+    update_stance,
 )
 from trl_suite.tasks.footsteps import TYPICAL_POSES, pose_of_step, straight_step
 from trl_suite.tasks.goals import Goals, flag, goals, set_goal
@@ -74,8 +74,8 @@ from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 INTERFACES = ('plan', 'frame')
 SIGHTS = ('height', 'velocity')
-# What action 0 means, in step lengths, and what 1 adds: x and y of both landing places, m; turn of the
-# heading, rad.
+# The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
+# m, and turn of the heading, rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
 PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
 PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
@@ -154,7 +154,7 @@ class PlanningRules(NamedTuple):
 
 
 # A step of simulation i: `begin_step`, then for every control step inside of it actions of the
-# footstep controller, physics and `account`; then `score`, the next goal if one is wanted, `finish`.
+# footstep controller, physics and `finish_control_step`; then `score`, the next goal if one is wanted, `finish`.
 
 
 @compiled
@@ -204,19 +204,24 @@ def observe_low(i: int, rules: PlanningRules) -> None:
 
 
 @compiled
-def account(i: int, rules: PlanningRules) -> bool:
-    """Landings and falls after a control step; returns whether the step goes on."""
+def finish_control_step(i: int, rules: PlanningRules) -> bool:
+    """Finishes a control step inside of a step: clock, divergence, measurement, falls, landings.
+
+    What the footstep controller is to see next is written if the step goes on, which is returned.
+    """
     common, state, outcome = rules.common, rules.state, rules.common.outcome
     tick(i, common)
     state.lasted[i] += 1
-    breaks_down(i, common)
+    if breaks_down(i, common):
+        outcome.failed[i] = state.over[i] = True
+        return False
     measure(i, common)
     count, found = common.clock.steps[i], common.found
     if count % SAMPLE_FRAMES == 0:
         state.down[i] *= FADING
         state.down[i] += SHARE * found.fallen[i]
-    outcome.failed[i] = state.down[i] > FALLEN or outcome.diverged[i]
-    if not outcome.diverged[i] and switches(i, common.clock.phase[i], found, rules.plan):
+    outcome.failed[i] = state.down[i] > FALLEN
+    if update_stance(i, common.clock.phase[i], found, rules.plan):
         rules.plan.landed[i] = True
     follow(i, count, found.com, rules.trace)
     state.over[i] = (
@@ -233,9 +238,11 @@ def score(i: int, rules: PlanningRules) -> bool:
     """Writes the reward terms; returns whether a goal or a place of the ball is to be drawn."""
     common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
     found, terms = common.found, common.outcome.reward_terms
-    measure(i, common)
-    seconds = CONTROL_TIMESTEP * max(state.lasted[i], 1)
-    state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
+    seconds = CONTROL_TIMESTEP * state.lasted[i]
+    state.duration[i] = seconds
+    goals.wanted[i] = ball.wanted[i] = False
+    if common.outcome.diverged[i]:
+        return False
     if rules.with_ball:
         state.speed[i] = dribble(
             i, 0, 1.0, seconds, goals.place, common.physics, found, rules.ball, terms
@@ -250,7 +257,6 @@ def score(i: int, rules: PlanningRules) -> bool:
         worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
         terms[i, SPEED], terms[i, ON_FEET] = (1 - UPRIGHT) * worth, UPRIGHT
         state.speed[i] = speed
-    goals.wanted[i] = ball.wanted[i] = False
     if common.outcome.failed[i]:
         return False
     count = common.clock.steps[i]
@@ -327,11 +333,11 @@ def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
 
 
 @compiled_loop
-def account_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
     """Accounts for a control step; returns how many steps go on."""
     going = 0
     for i in env_ids:
-        going += account(i, rules)
+        going += finish_control_step(i, rules)
     return going
 
 
@@ -410,8 +416,8 @@ class HighLevel(SpatialTask):
           steps: library of single steps of this character, for the first pose and the clock.
           ball: a ball of the arena that is to be dribbled; its ground must be level.
           controller: the footstep controller: what `trl_suite.controllers.llc.load` takes.
-          interface: 'plan', or 'frame': a step is 1/30 s, and behind the plan, which counts when it
-            begins a footstep, an action has that of the footstep controller.
+          interface: 'plan', or 'frame': a step is one control step of 1/30 s, and an action is the plan
+            followed by the joint action. A plan takes effect only in a step that begins a footstep.
           sight: which maps are observed, of 'height' and 'velocity'.
           step_length: of the steps that action 0 means, m.
           target_speed: m/s towards the goal, of walker and ball, from which on the reward is full.
@@ -461,6 +467,8 @@ class HighLevel(SpatialTask):
         )  # fmt: skip
         self.controller = llc.load(controller)
         self.controller.check(self)
+        # A function of the user's is called by one thread, for all simulations that go on.
+        self.in_parts = self.controller.policy is not None
         self.interface, self.sight, self.step_length = interface, sight, step_length
         self._target_speed, self._goal_reached = float(target_speed), float(goal_reached)
         self._goal_distance = goal_distance
@@ -533,13 +541,14 @@ class HighLevel(SpatialTask):
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         low = self._full
-        places: Any = [starts.get(name, -1) for name in PlanningRules._fields[8:14]]
-        rules = PlanningRules(  # type: ignore[call-arg]
-            common, self.plan, self.goals, self.state, self.trace, low['contact'].start,
-            low['plan'].start, self.interface == 'plan',
-            *places,
-            self.action_map.centre, self.action_map.half_range, self._target_speed,
-            self._goal_reached, self.ball is not None, balls,
+        names = 'terrain', 'surface', 'pose', 'velocity', 'target', 'low_level'
+        rules = PlanningRules(
+            common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
+            contact=low['contact'].start, plan_block=low['plan'].start,
+            by_plan=self.interface == 'plan', plan_offset=self.action_map.centre,
+            plan_scale=self.action_map.half_range, target_speed=self._target_speed,
+            goal_reached=self._goal_reached, with_ball=self.ball is not None, ball=balls,
+            **{name: starts.get(name, -1) for name in names},
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._low_action = np.zeros((n, len(self.joint_map)))
@@ -640,7 +649,7 @@ class HighLevel(SpatialTask):
             if act_all(going, self._low_action, self._common_pack):
                 self._lay_ground(going, self._common)
             self.world.step(self._frame, going)
-            count = account_all(going, self._pack)
+            count = finish_control_steps(going, self._pack)
             if self.watch is not None:
                 self.watch()
             if not count:

@@ -445,7 +445,7 @@ class Imitation(Task):
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if apply_actions(env_ids, action, self._pack):
-            # Ground ahead is laid before the physics, so that its pictures are current after it.
+            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
             self.figure.follow(env_ids[self._found.leaving[env_ids]])
 
     def finish_step(self, env_ids: np.ndarray) -> None:

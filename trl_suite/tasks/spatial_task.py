@@ -137,9 +137,9 @@ class SpatialRules(NamedTuple):
 
 @compiled
 def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
-    """Drives the joints and keeps boxes moving; returns whether ground must be laid before.
+    """Drives the joints and keeps boxes moving; returns whether a window of ground must be laid.
 
-    Ground ahead is laid before the physics, so that its pictures are current after it.
+    Ground is laid before the physics, so that what is rendered afterwards is up to date.
     """
     given = rules.given
     left = given.mirrored and rules.full[i, given.phase] >= 0.5
@@ -154,7 +154,11 @@ def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
 
 @compiled
 def prepare_ground(i: int, rules: SpatialRules) -> bool:
-    """Keeps boxes moving before a control step; returns whether ground must be laid instead."""
+    """Keeps boxes moving before a control step.
+
+    Returns:
+      Whether the window of ground must be laid anew; who lays it keeps boxes moving as well.
+    """
     root = rules.body.links[0]
     x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
     rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)

@@ -48,8 +48,8 @@ class Outcome(NamedTuple):
       reward: (n,).
       reward_terms: its parts, weighted, (n, terms); 0 after a reset.
       failed: whether the episode has ended with discount 0, (n,) bool.
-      diverged: whether that was since the physics broke down, (n,) bool.
-      fell: whether that was for another reason, (n,) bool.
+      diverged: whether that was because the physics became unstable, (n,) bool.
+      fell: whether it failed without that: a fall, or a foot that missed its place, (n,) bool.
     """
 
     observation: np.ndarray
@@ -106,8 +106,14 @@ class Task(composer.Task):
     simulations. A task of the user's may do the same with plain NumPy.
 
     An environment calls `bind` once, `reset` for simulations that begin an episode, and `step` for
-    those that take a step, which is `apply_action`, `simulate` and `finish_step`. Threads call these
-    for parts of the simulations: each must touch the simulations that it is given, and no others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
+    those that take a step. A step is
+
+    1. `apply_action`: writes controls from actions, which it clips, and lays ground ahead;
+    2. `simulate`: advances the physics;
+    3. `finish_step`: clock, divergence, measurement, reward, failure, observation, in this order.
+
+    Threads call `reset` and `step` for parts of the simulations: each must touch the simulations that
+    it is given, and no others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
     the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
 
     Attributes:
@@ -210,7 +216,7 @@ class Task(composer.Task):
 
     @property
     def diverged(self) -> np.ndarray:
-        """Whether it has since the physics broke down, (n,) bool."""
+        """Whether it has because the physics became unstable, (n,) bool."""
         return self.outcome.diverged
 
     @property
@@ -327,7 +333,7 @@ def start_phases(
         pairs = np.asarray(option, float)
     except (TypeError, ValueError):
         pairs = np.empty(0)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or not (
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs) or not (
         (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()
         and pairs[0, 0] >= 0 and pairs[-1, 1] <= 1
     ):  # fmt: skip

@@ -377,7 +377,7 @@ class Walk(Task):
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if self._act(env_ids, action, self._pack):
-            # Ground ahead is laid before the physics, so that its pictures are current after it.
+            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
             leaving = env_ids[self._leaving[env_ids]]
             if isinstance(self.arena, SpatialTerrain):
                 self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.metadata
 import os
 import pathlib
 import shutil
@@ -43,7 +44,6 @@ from typing import Any
 PATIENCE = 2.0  # s; compiling that takes longer is announced on a terminal
 UNUSED = 30 * 86400.0  # s; folders of other sources that nobody used for so long are removed
 _PREFIX = 'trl_suite-'
-_MARK = b'@compiled'
 
 
 class Compiled:
@@ -205,12 +205,14 @@ def _user_cache() -> str:
 
 @functools.cache
 def fingerprint() -> str:
-    """Returns a name for the state of all sources that hold compiled functions."""
-    digest = hashlib.sha256()
-    for path in sorted(pathlib.Path(__file__).parents[1].rglob('*.py')):
-        source = path.read_bytes()
-        if _MARK in source:
-            digest.update(path.name.encode() + b'\0' + source)
+    """Returns a name for all that the machine code depends on: the package's sources, and MuJoCo.
+
+    All sources, since compiled functions hold constants from modules that have none of their own.
+    """
+    digest = hashlib.sha256(importlib.metadata.version('mujoco').encode())
+    root = pathlib.Path(__file__).parents[1]
+    for path in sorted(root.rglob('*.py')):
+        digest.update(f'\0{path.relative_to(root)}\0'.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
