@@ -292,7 +292,7 @@ class DynamicsTest(parameterized.TestCase):
 
     def mover(self, stage, k):
         around = stage.arena.surroundings
-        stage.arena._look()
+        stage.arena._look(0)
         speed = around.speed[0, k] * around.direction[0, k]
         return around.centres()[0, k], speed * around.axis[0, k], around.half_size[0, k]
 
@@ -359,7 +359,7 @@ class DynamicsTest(parameterized.TestCase):
             kinematic.turn(xy)
             kinematic.way += kinematic.direction * kinematic.speed / 30
             stage.run(1 / 30, xy)
-        stage.arena._look()
+        stage.arena._look(0)
         np.testing.assert_allclose(stage.arena.surroundings.way, kinematic.way, atol=2e-3)
         np.testing.assert_array_equal(stage.arena.surroundings.direction, kinematic.direction)
         self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some turned
@@ -373,14 +373,14 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage('dynamic_obstacles3d', (7,), load=BALL)
         stage.world.reset(stage.rows)  # as placing a character does
         stage.world.forward(stage.rows)
-        stage.arena._look()
+        stage.arena._look(0)
         before = stage.arena.surroundings.centres()[0]
         movers = stage.arena.grounds[0].layout.movers
         begin = movers.start + movers.phase[:, None] * (movers.end - movers.start)
         np.testing.assert_allclose(before, begin, atol=1e-12)
         stage.put((0, 0, 50))
         stage.run(0.5, np.full((1, 2), 0.0))
-        stage.arena._look()
+        stage.arena._look(0)
         moved = np.linalg.norm(stage.arena.surroundings.centres()[0] - before, axis=1)
         np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
         self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
