@@ -40,6 +40,20 @@ class PinTest(absltest.TestCase):
         self.assertIn("'dm-control>=1.0.50'", required)
 
 
+class DiscoveryTest(absltest.TestCase):
+    """Python's own runner finds the tests."""
+
+    def test_unittest_runs_what_is_not_slow(self):
+        fast, slow = 'test_engine_pair', 'test_long_random_rollout'
+        done = subprocess.run(
+            [sys.executable, '-m', 'unittest', '-v', '-k', fast, '-k', slow],
+            capture_output=True, text=True, cwd=CHECKOUT, timeout=300,
+        )  # fmt: skip
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn(f'{fast} (tests.package_test.PinTest', done.stderr)
+        self.assertNotIn(slow, done.stderr)
+
+
 class ImportTest(absltest.TestCase):
     """Importing is quick, quiet and needs no display."""
 
