@@ -137,9 +137,8 @@ class WheelTest(absltest.TestCase):
             shutil.copytree(
                 CHECKOUT / name, source / name, ignore=shutil.ignore_patterns('__pycache__')
             )
-        for name in ('setup.py', 'pyproject.toml', 'README.md'):
-            if (CHECKOUT / name).exists():
-                shutil.copy(CHECKOUT / name, source / name)
+        for name in ('setup.py', 'pyproject.toml', 'README.md', 'LICENSE', 'NOTICE'):
+            shutil.copy(CHECKOUT / name, source / name)
         self.run_quietly(
             sys.executable, '-m', 'build', '--wheel', '--outdir', wheels, source, cwd=work
         )
@@ -200,6 +199,9 @@ class WheelTest(absltest.TestCase):
         self.assertEqual(
             {path.name for path in (installed / 'xml').glob('*.xml')},
             {path.name for path in (CHECKOUT / 'xml').glob('*.xml')},
+        )
+        self.assertEqual(
+            {path.name for path in target.glob('*.dist-info/licenses/*')}, {'LICENSE', 'NOTICE'}
         )
         top = {path.name for path in target.iterdir()}
         self.assertNotIn('tests', top)
