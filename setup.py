@@ -1,5 +1,7 @@
 """Packages of trl_suite, with the data folders xml/, mocap/ and trained/ inside the wheel."""
 
+import pathlib
+
 from setuptools import find_packages, setup
 
 TORCH = 'torch>=2.4,<2.14'
@@ -9,6 +11,22 @@ setup(
     name='trl_suite',
     version='0.1.0',
     description='Terrain RL Simulator on MuJoCo: locomotion over random terrain, as a suite',
+    long_description=pathlib.Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    author='The trl_suite developers',
+    license_expression='Apache-2.0',
+    keywords=['reinforcement learning', 'locomotion', 'MuJoCo', 'dm_control', 'benchmark'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Topic :: Scientific/Engineering :: Artificial Intelligence',
+        'Topic :: Scientific/Engineering :: Physics',
+        'Typing :: Typed',
+    ],
     python_requires='>=3.11',
     packages=[
         *find_packages(include=['trl_suite', 'trl_suite.*']),
@@ -74,7 +92,7 @@ setup(
             TORCH,
         ],
         'docs': ['mkdocs>=1.6,<2'],
-        'dev': ['ruff==0.17.5', 'mypy==2.4.1'],
+        'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'import-linter==2.16'],
     },
     entry_points={'console_scripts': ['trl-suite = trl_suite.cli:main']},
 )

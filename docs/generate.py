@@ -13,6 +13,7 @@ import argparse
 import json
 import pathlib
 import re
+import statistics
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
@@ -61,7 +62,10 @@ DRAWN = {  # beside the physics, and by which rules
         'hike', 'soccer', 'journey', 'ball_journey',
     ),
 }  # fmt: skip
-README, SPEED = '../README.md', ('<!-- speed, written by docs/generate.py -->', '<!-- /speed -->')
+README = '../README.md'
+# What encloses the tables in the README that are written here.
+SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
+SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
 MACHINE = (  # of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
@@ -144,6 +148,7 @@ def home() -> str:
         table(
             ('guide', ''),
             (
+                ('[Guide](guide.md)', 'commands, combinations, footstep plans, pictures, training'),
                 ('[Notebooks](../colab/README.md)', 'with pictures: first steps, training, and most of what follows'),
                 ('[Make your own](make_your_own.md)', 'characters, terrains, tasks'),
                 ('[Make your own: clips](make_your_own_clips.md)', 'from motion files'),
@@ -417,9 +422,47 @@ def speeds() -> dict[str, Any]:
 
 
 def readme() -> str:
-    """README.md with its table of speeds."""
-    found, (start, end) = speeds(), SPEED
+    """README.md with its tables."""
+    text = (DOCS / README).read_text(encoding='utf-8')
+    for (start, end), written in ((SOLVED, solved()), (SPEED, speed())):
+        before, _, rest = text.partition(start)
+        text = f'{before}{start}\n{written}\n{end}{rest.partition(end)[2]}'
+    return text
+
+
+def solved() -> str:
+    """How well the shipped policies do, by family."""
     cells = []
+    for domain in FAMILIES:
+        rows = [row for row in catalogue.ROWS if row.domain == domain]
+        entries = filter(None, (gallery.record(row.id) for row in rows))
+        found = [
+            next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
+            for entry in entries
+        ]
+        middle = {
+            name: statistics.median(each[name] for each in found)
+            for name in ('fraction', 'full', 'distance')
+        }
+        # A gait has no reward that ends with a limit: what counts is how far it comes.
+        gaits = all(row.rules == 'gait' for row in rows)
+        cells.append((
+            f'`{domain}`', f'{len(found)} of {len(rows)}',
+            *(('–', '–') if gaits else (f'{middle["fraction"]:.2f}', f'{middle["full"]:.0%}')),
+            f'{middle["distance"]:.0f} m',
+        ))  # fmt: skip
+    said = (
+        'The median over the shipped policies of a family, each run without noise for 50 '
+        'episodes: the return over its maximum, the share of episodes that lasted to the end, and '
+        'the mean distance.'
+    )
+    header = ('family', 'trained', 'return', 'complete', 'distance')
+    return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
+
+
+def speed() -> str:
+    """The rates of a few environments."""
+    found, cells = speeds(), []
     for id, alone in found['single'].items():
         own, raw = found['ours'][id], found['engine alone'][id]
         one, two = (f'256 rows, {threads} threads' for threads in (1, 2))
@@ -437,9 +480,7 @@ def readme() -> str:
         '`mj_step` for one, MuJoCo on the same threads for 256 (above 1: without resets bodies lie on the ground, '
         f'where steps cost more). By `python benchmarks/vector_environment.py`, on {MACHINE}.'
     )
-    before, _, rest = (DOCS / README).read_text(encoding='utf-8').partition(start)
-    after = rest.partition(end)[2]
-    return f'{before}{start}\n{textwrap.fill(said, 100)}\n\n{table(header, cells)}\n{end}{after}'
+    return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
 
 
 def speed_page() -> str:

@@ -120,7 +120,9 @@ def main() -> None:
     parser.add_argument('--json', type=pathlib.Path)
     arguments = parser.parse_args()
     policy = (
-        policies.load(arguments.policy) if arguments.policy else policies.reference(arguments.id)
+        policies.load(arguments.policy)
+        if arguments.policy
+        else suite.reference_policy(arguments.id)
     )
     found = {}
     for name in arguments.only:

@@ -784,11 +784,15 @@ class ProgramTest(CommandTest):
 
 
 class ReadmeTest(CommandTest):
-    text = (pathlib.Path(__file__).parents[1] / 'README.md').read_text(encoding='utf-8')
+    """What the README and the guide show."""
 
-    @parameterized.parameters(*range(len(re.findall('```python', text))))
-    def test_code_runs(self, i):
-        code = re.findall(r'```python\n(.*?)```', self.text, re.DOTALL)[i]
+    text = ''.join(
+        (pathlib.Path(__file__).parents[1] / name).read_text(encoding='utf-8')
+        for name in ('README.md', 'docs/guide.md')
+    )
+
+    @parameterized.parameters(*re.findall(r'```python\n(.*?)```', text, re.DOTALL))
+    def test_code_runs(self, code):
         done = subprocess.run(
             [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=False
         )

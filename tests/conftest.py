@@ -1,8 +1,6 @@
-"""Chooses how to render before any test imports dm_control; spares the garbage collector."""
+"""Spares the garbage collector."""
 
 import gc
-
-import trl_suite  # noqa: F401
 
 
 def pytest_collection_finish():

@@ -801,6 +801,8 @@ class ControllerTest(FolderTest):
 
     def test_unknown(self):
         with self.assertRaisesRegex(ValueError, f"did you mean '{llc.DEFAULT}'"):
+            started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
+        with self.assertRaisesRegex(FileNotFoundError, llc.DEFAULT):
             llc.load('PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
             llc.load('FSM_Goat2D_Terrain_Cliffs-v0')  # gaits of the goat are not trained

@@ -40,6 +40,20 @@ class PinTest(absltest.TestCase):
         self.assertIn("'dm-control>=1.0.50'", required)
 
 
+class DiscoveryTest(absltest.TestCase):
+    """Python's own runner finds the tests."""
+
+    def test_unittest_runs_what_is_not_slow(self):
+        fast, slow = 'test_engine_pair', 'test_long_random_rollout'
+        done = subprocess.run(
+            [sys.executable, '-m', 'unittest', '-v', '-k', fast, '-k', slow],
+            capture_output=True, text=True, cwd=CHECKOUT, timeout=300,
+        )  # fmt: skip
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn(f'{fast} (tests.package_test.PinTest', done.stderr)
+        self.assertNotIn(slow, done.stderr)
+
+
 class ImportTest(absltest.TestCase):
     """Importing is quick, quiet and needs no display."""
 
@@ -123,9 +137,8 @@ class WheelTest(absltest.TestCase):
             shutil.copytree(
                 CHECKOUT / name, source / name, ignore=shutil.ignore_patterns('__pycache__')
             )
-        for name in ('setup.py', 'pyproject.toml', 'README.md'):
-            if (CHECKOUT / name).exists():
-                shutil.copy(CHECKOUT / name, source / name)
+        for name in ('setup.py', 'pyproject.toml', 'README.md', 'LICENSE', 'NOTICE'):
+            shutil.copy(CHECKOUT / name, source / name)
         self.run_quietly(
             sys.executable, '-m', 'build', '--wheel', '--outdir', wheels, source, cwd=work
         )
@@ -186,6 +199,9 @@ class WheelTest(absltest.TestCase):
         self.assertEqual(
             {path.name for path in (installed / 'xml').glob('*.xml')},
             {path.name for path in (CHECKOUT / 'xml').glob('*.xml')},
+        )
+        self.assertEqual(
+            {path.name for path in target.glob('*.dist-info/licenses/*')}, {'LICENSE', 'NOTICE'}
         )
         top = {path.name for path in target.iterdir()}
         self.assertNotIn('tests', top)

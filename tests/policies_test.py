@@ -428,18 +428,17 @@ class ReferenceTest(FolderTest):
         self.assertEqual(policies.available(), ())
         policies.save(make(id=dog), self.folder / f'{dog}.npz')
         policies.save(make(id=GAPS), self.folder / f'{GAPS}.npz')
-        policies.save(make(), self.folder / 'something.npz')  # no environment
         self.assertEqual(policies.available(), (GAPS, dog))
+        self.assertEqual(policies.reference(dog).id, dog)
         for id_ in (dog, 'plaid/dog_gaps'):
-            self.assertEqual(policies.reference(id_).id, dog)
             self.assertEqual(suite.reference_policy(id_).id, dog)
             self.assertEqual(trl_suite.reference_policy(id_).id, dog)
         with self.assertRaisesRegex(FileNotFoundError, f'closest that have one: {dog}, {GAPS}'):
             policies.reference('PD_Dog2D_Steps_Terrain-v0')
         with self.assertRaisesRegex(ValueError, "unknown environment 'x'"):
-            policies.reference('x')
+            suite.reference_policy('x')
         with self.assertRaisesRegex(ValueError, "did you mean 'plaid/dog_gaps'"):
-            policies.reference('plaid/dog_gap')
+            suite.reference_policy('plaid/dog_gap')
 
     def test_none_at_all(self):
         with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; nor for any other"):

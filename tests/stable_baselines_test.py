@@ -1,14 +1,16 @@
 """Stable-Baselines3's interface, against its own vector environment of single ones."""
 
+import importlib.util
 import tempfile
+import unittest
 import warnings
 
 import gymnasium
 import numpy as np
-import pytest
 from absl.testing import parameterized
 
-pytest.importorskip('stable_baselines3', reason='needs stable-baselines3', exc_type=ImportError)
+if importlib.util.find_spec('stable_baselines3') is None:
+    raise unittest.SkipTest('needs stable-baselines3')
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env

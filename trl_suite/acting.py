@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite import errors, policies
+from trl_suite import catalogue, errors, policies
 
 if TYPE_CHECKING:
     import dm_env
@@ -29,8 +29,15 @@ def check(name: str) -> str:
 
 
 def trained(name: str, id: str) -> policies.Policy:
-    """Returns the policy shipped for an environment, 'reference', or one from a file."""
-    return policies.reference(id) if name == 'reference' else policies.load(name)
+    """Returns the policy shipped for an environment, 'reference', or one from a file.
+
+    Args:
+      name: 'reference', or an .npz file.
+      id: of the environment, or an alias.
+    """
+    if name == 'reference':
+        return policies.reference(catalogue.find(id).id)
+    return policies.load(name)
 
 
 def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Policy:
@@ -39,7 +46,7 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
     Args:
       name: one of `POLICIES`, or an .npz file.
       environment: which it acts in.
-      id: of the environment.
+      id: of the environment, or an alias.
       seed: of 'random'.
 
     Returns:

@@ -64,7 +64,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, resources
+from trl_suite import resources
 from trl_suite.files import check_path, existing, replacing
 from trl_suite.network import ACTIVATIONS, Policy, placed
 from trl_suite.symmetry import Mirror
@@ -196,31 +196,28 @@ def reference(id: str) -> Policy:
     """Returns the policy shipped for an environment.
 
     Args:
-      id: id of the environment, or an alias ('plaid/dog_gaps').
+      id: id of the environment; `suite.reference_policy` takes aliases, too.
 
     Raises:
-      ValueError: unknown id; the message has the closest matches.
       FileNotFoundError: no policy is shipped for it; the message has the closest that have one.
     """
-    row = catalogue.find(id)
     shipped = available()
-    if row.id not in shipped:
-        near = difflib.get_close_matches(row.id, shipped, n=3, cutoff=0)
+    if id not in shipped:
+        near = difflib.get_close_matches(id, shipped, n=3, cutoff=0)
         raise FileNotFoundError(
-            f'no policy is shipped for {row.id!r}; '
+            f'no policy is shipped for {id!r}; '
             + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
         )
-    path = resources.directory('trained') / f'{row.id}.npz'
+    path = resources.directory('trained') / f'{id}.npz'
     policy = load(path)
-    if policy.id != row.id:
-        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {row.id!r}")
+    if policy.id != id:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {id!r}")
     return policy
 
 
 def available() -> tuple[str, ...]:
-    """Returns the ids of the environments that have a shipped policy, as the catalogue has them."""
-    files = {path.stem for path in resources.directory('trained').glob('*.npz')}
-    return tuple(id for id in catalogue.BY_ID if id in files)
+    """Returns the ids of the environments that have a shipped policy, sorted."""
+    return tuple(sorted(path.stem for path in resources.directory('trained').glob('*.npz')))
 
 
 def _small(value: Any) -> Any:

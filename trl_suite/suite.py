@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -101,6 +100,9 @@ def _hike(row: Row, options: dict[str, Any], with_ball: bool = False) -> Task:
         raise ValueError(
             f'{row.task}: a footstep controller drives joints by position, not by {row.actuation}'
         )
+    controller = options.get('controller')
+    if isinstance(controller, str) and not controller.endswith('.npz'):
+        options['controller'] = find(controller).id  # of an alias, too
     steps = row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
     arena = _spatial(row)
     ball = Ball(arena) if with_ball else None
@@ -222,7 +224,7 @@ def reference_policy(id: str) -> policies.Policy:
       ValueError: unknown id; the message has the closest matches.
       FileNotFoundError: none is shipped for it; the message has the closest that have one.
     """
-    return policies.reference(id)
+    return policies.reference(find(id).id)
 
 
 def build(
@@ -417,9 +419,3 @@ def build_row(
     environment = Environment(task, **options)
     environment._recipe = (build_row, (row, task_kwargs, environment_kwargs))
     return environment
-
-
-def __getattr__(name: str) -> Any:
-    if name == 'sequences':  # it runs environments, and so imports this module
-        return importlib.import_module('trl_suite.sequences')
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

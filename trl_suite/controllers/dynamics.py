@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from trl_suite.characters import Character
@@ -73,7 +72,7 @@ def skeleton(character: Character, world: World) -> Skeleton:
         for k in range(start, start + model.M_rownnz[row]):
             places[row, model.M_colind[k]] = places[model.M_colind[k], row] = k
     joint, body = model.dof_jntid[dof].astype(int), model.dof_bodyid[dof].astype(int)
-    hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    hinge = np.arange(len(names)) >= 2  # all but root_x and root_z
     moves = np.zeros((model.nbody, len(names)), bool)
     for link in links:  # the joints on its way to the root turn it
         above = link

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, characters, policies
+from trl_suite import characters, policies
 
 DEFAULT = 'PD_Biped3D_LLC_General_Step-v0'  # whose reference policy is taken
 
@@ -89,12 +89,12 @@ def load(source: str | os.PathLike[str] | Function = DEFAULT) -> Controller:
     """Returns a low-level controller.
 
     Args:
-      source: id or alias of an environment whose reference policy is meant, path of a policy (a
-        PathLike, or a string that ends in .npz), a `Policy`, or any function from observations
-        (n, size) to actions (n, k).
+      source: id of an environment whose reference policy is meant, path of a policy (a PathLike,
+        or a string that ends in .npz), a `Policy`, or any function from observations (n, size) to
+        actions (n, k).
 
     Raises:
-      ValueError: an unknown id, or a broken file; see `policies.load`.
+      ValueError: a broken file; see `policies.load`.
       FileNotFoundError: there is no such file, or no policy is shipped for the id.
     """
     if isinstance(source, Controller):
@@ -103,4 +103,4 @@ def load(source: str | os.PathLike[str] | Function = DEFAULT) -> Controller:
         return Controller(source, getattr(source, '__name__', type(source).__name__))
     if isinstance(source, os.PathLike) or str(source).endswith('.npz'):
         return Controller(policies.load(source), repr(os.fspath(source)))
-    return Controller(policies.reference(catalogue.find(source).id), repr(source))
+    return Controller(policies.reference(source), repr(source))

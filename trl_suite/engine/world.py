@@ -208,6 +208,21 @@ class World:
             self._pool.shutdown()
             self._pool = None
 
+    def posed(self, qpos: np.ndarray, pose: np.ndarray) -> mujoco.MjData:
+        """Returns data of the first model in a pose, with the places of its bodies and geoms.
+
+        It is apart from the simulations: for what is measured once.
+
+        Args:
+          qpos: addresses in qpos, (k,); elsewhere the model's reference stays.
+          pose: values there, (k,).
+        """
+        model = self.models[0]
+        data = mujoco.MjData(model)
+        data.qpos[qpos] = pose
+        mujoco.mj_kinematics(model, data)
+        return data
+
     def body_ids(self, names: Sequence[str]) -> np.ndarray:
         return self._ids(mujoco.mjtObj.mjOBJ_BODY, names)
 

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from trl_suite import actuation, errors
@@ -566,12 +565,10 @@ class GaitTask(Task):
         for name, (angle, rate) in start['joints'].items():
             pose[0, 3 + self.gait.number[name]] = angle
             rates[0, 3 + self.gait.number[name]] = rate
-        model = self.world.models[0]
-        data = mujoco.MjData(model)
-        data.qpos[figure.pose_qpos] = pose[0]
-        mujoco.mj_kinematics(model, data)
+        data = self.world.posed(figure.pose_qpos, pose[0])
         root = data.xpos[figure.links[0]][::2]
-        return pose, rates, link_extents(model, data, figure.geoms, root)[None]
+        extents = link_extents(self.world.models[0], data, figure.geoms, root)
+        return pose, rates, extents[None]
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         poses, rates, extents = (np.repeat(part, len(env_ids), axis=0) for part in self._start)

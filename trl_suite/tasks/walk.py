@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from trl_suite import actuation
@@ -33,6 +32,7 @@ from trl_suite.kinematics.spatial import (
     write_body,
     write_terrain,
 )
+from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.task import (
@@ -336,21 +336,14 @@ class Walk(Task):
         values: list[float] = [0, 0, 0, 1, 0, 0, 0] if self._spatial else [0, 0, 0]
         for joint, ball in zip(row.joints.values(), self.character.spherical, strict=True):
             if ball:
-                quaternion = np.zeros(4)
                 vector = np.broadcast_to(joint.target, 3).astype(float)
-                mujoco.mju_axisAngle2Quat(
-                    quaternion, vector / max(np.linalg.norm(vector), 1e-9), np.linalg.norm(vector)
-                )
-                values += quaternion.tolist()
+                values += quaternion.from_vector(vector).tolist()
             else:
                 values.append(float(np.ravel(joint.target)[0]))
         pose = np.array(values)
-        model = world.models[0]
-        data = mujoco.MjData(model)
-        data.qpos[figure.pose_qpos] = pose
-        mujoco.mj_fwdPosition(model, data)
+        data = world.posed(figure.pose_qpos, pose)
         geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
-        return pose, link_extents(model, data, geoms, np.zeros(2))
+        return pose, link_extents(world.models[0], data, geoms, np.zeros(2))
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         terrain, count = self.arena.terrain, len(env_ids)
