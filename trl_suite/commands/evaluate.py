@@ -37,7 +37,11 @@ def run(arguments: argparse.Namespace) -> None:
         (
             'distance',
             f'{result["distance"]:.2f} m'
-            + ('' if distances is None else ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances))
+            + (
+                ''
+                if distances is None
+                else ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances)
+            )
             + f', median {result["median_distance"]:.2f} m, at {result["speed"]:.2f} m/s',
         ),
         ('full length', f'{result["full"]:.0%} of the episodes'),
