@@ -139,12 +139,16 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
         own, default = (
             float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
         )
-        published = PUBLISHED_DISTANCES.get(id_)
+        published, to_fall = PUBLISHED_DISTANCES.get(id_), '–'
+        if far := run.get('to_first_fall'):
+            low, high = far['distance_interval']
+            to_fall = f'{far["distance"]:.0f} ({low:.0f} to {high:.0f})'
         rows.append([
             f'`{id_}`', f'{own:.1f}', f'{default:.1f}', f'{own / default:.1f}',
             f'{run["evaluation"]["distance"]:.1f}', f'{stored[id_]["distance"]:.1f}',
+            to_fall,
             f'{published}' if published else '–',
-            f'{run["settings"]["samples"] / 1e3:.0f} k', str(run['seed']),
+            f'{run["curve"][-1]["samples"] / 1e3:.0f} k', str(run['seed']),
         ])  # fmt: skip
     return rows
 
@@ -206,8 +210,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '# What has been learnt',
         f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is made '
         f'by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
-        'run of `examples/ppo.py`, or of `examples/search_gaits.py` where a gait acts, with the '
-        'settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
+        'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` where a '
+        'gait acts, with the settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
         'shipped: `suite.reference_policy(id)`. What the papers found: [beside the papers](findings.md).',
         f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
         'neither training nor the choice of a policy along its curve had seen, so that numbers here are not '
@@ -248,8 +252,10 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         parts += [
             '## Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
-            'default gait, in the same episodes. A decision is a cycle whose base actions were all '
-            'tried. In 2016: the mean that the paper of Peng, Berseth and van de Panne reports for '
+            'default gait, in the same episodes, which 256 cycles cut; *to the first fall*: mean of '
+            f'{train_all.FALL_EPISODES} episodes that only {train_all.FALL_STEPS} cycles cut, with its '
+            '95 % interval. A decision is a cycle: of `examples/search_gaits.py` one whose base actions '
+            'were all tried, of `examples/learn_gaits.py` one that was taken. In 2016: the mean that the paper of Peng, Berseth and van de Panne reports for '
             'some 10 million cycles, in another simulator, as we remember it (not checked).',
             table(
                 (
@@ -259,6 +265,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'ratio',
                     'mean',
                     'default',
+                    'to the first fall',
                     '2016',
                     'decisions',
                     'seed',

@@ -5,10 +5,10 @@
     python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
     python examples/train_all.py --only FSM_Goat2D_Terrain_Cliffs-v0
 
-Each run is `examples/ppo.py` on one thread, of rows that gaits drive `examples/search_gaits.py`;
-those that begin with the policy of another environment come after it. Stopped runs go on from their checkpoints in RUNS;
-finished ones are evaluated and entered into `trained/ID.json` (settings, learning curve,
-evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
+Each run is `examples/ppo.py` on one thread, of rows that gaits drive `examples/learn_gaits.py` or
+`examples/search_gaits.py`; those that begin with the policy of another environment come after it.
+Stopped runs go on from their checkpoints in RUNS; finished ones are evaluated and entered into
+`trained/ID.json` (settings, learning curve, evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
 the same settings is not trained again. Of the rows that gaits drive (FSM_...) five are trained; any
 other has to be named in full.
 """
@@ -27,10 +27,11 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from types import ModuleType
 from typing import Any
 
+import learn_gaits
 import numpy as np
 import ppo
 import ppo_settings
@@ -40,6 +41,7 @@ import tqdm
 from trl_suite import catalogue, errors, evaluation, files, policies, resources
 
 EPISODES, SEED = 50, 0  # of the published evaluation
+FALL_EPISODES, FALL_STEPS = 200, 5000  # cycles; how far gaits get before they fall
 SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
 GAITS = (  # that are compared with their default gaits
@@ -47,6 +49,9 @@ GAITS = (  # that are compared with their default gaits
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Gaps-v0',
     'FSM_Hopper2D_Terrain_Gaps-v0',
 )  # fmt: skip
+
+
+LEARNT = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0')  # not searched
 
 
 def compared(row: catalogue.Row) -> bool:
@@ -76,7 +81,9 @@ def shipped(entry: dict[str, Any]) -> dict[str, Any]:
 
 def program(id_: str) -> ModuleType:
     """The program that trains an environment."""
-    return search_gaits if catalogue.BY_ID[id_].rules == 'gait' else ppo
+    if catalogue.BY_ID[id_].rules != 'gait':
+        return ppo
+    return learn_gaits if id_ in LEARNT else search_gaits
 
 
 def depth(id_: str) -> int:
@@ -118,13 +125,21 @@ def trimmed(policy: policies.Policy) -> policies.Policy:
     """The same policy in a small file: weights are rounded to half precision, and inputs that were
     always 0, as the place where the standing foot lands, are left out.
     """
+    if policy.convolution is not None:  # inputs have their places
+        line = policy.convolution
+        line = dataclasses.replace(line, weights=_rounded(line.weights))
+        return dataclasses.replace(policy, convolution=line, weights=_rounded(policy.weights))
     kept = (policy.mean != 0) | (policy.std > ppo.LEAST_STD)
     columns = np.arange(len(kept)) if policy.columns is None else policy.columns
     weights = (policy.weights[0][kept], *policy.weights[1:])
     return dataclasses.replace(
         policy, columns=columns[kept], mean=policy.mean[kept], std=policy.std[kept],
-        weights=tuple(w.astype(np.float16).astype(w.dtype) for w in weights),
+        weights=_rounded(weights),
     )  # fmt: skip
+
+
+def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
+    return tuple(w.astype(np.float16).astype(w.dtype) for w in weights)
 
 
 def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
@@ -135,6 +150,9 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
+    if catalogue.BY_ID[id_].rules == 'gait':
+        limit = {'step_limit': FALL_STEPS}
+        run['to_first_fall'] = evaluation.evaluate(id_, policy, FALL_EPISODES, SEED, 1, limit)
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]
     every = sorted([run, *others], key=lambda r: r['seed'])
     best = max(every, key=lambda r: r['evaluation']['return'])

@@ -647,7 +647,10 @@ class EvaluateTest(CommandTest):
                 'return': f'{expected["return"]:.2f} +- {expected["return_interval"]:.2f} '
                 f'(95 % confidence), {expected["fraction"]:.1%} of the maximum 256',
                 'length': f'{expected["length"]:.1f} of 256 steps',
-                'distance': f'{expected["distance"]:.2f} m',
+                'distance': '{distance:.2f} m ({0:.2f} to {1:.2f}, 95 % confidence), median '
+                '{median_distance:.2f} m, at {speed:.2f} m/s'.format(
+                    *expected['distance_interval'], **expected
+                ),
                 'full length': f'{expected["full"]:.0%} of the episodes',
                 'falls': f'{expected["falls"]:.0%} of the episodes',
             },
@@ -669,9 +672,16 @@ class EvaluateTest(CommandTest):
         self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
         self.assertIn('of the maximum 5\n', out)
 
+    def test_another_step_limit(self):
+        out = self.output(
+            'evaluate', GAPS, '--policy', 'clip', '--episodes', '2', '--step-limit', '3'
+        )
+        self.assertRegex(out, r'\n  length +3.0 of 3 steps\n')
+
     def test_one_episode_has_no_interval(self):
         out = self.output('evaluate', GAPS, '--policy', 'zero', '--episodes', '1')
         self.assertRegex(out, r'\n  return +[\d.]+, [\d.]+% of the maximum 256\n')
+        self.assertRegex(out, r'\n  distance +-?[\d.]+ m, median')
 
     @parameterized.parameters(
         ('did you mean', 'PD_Biped2D_Gap_Terrain-v0'),

@@ -130,7 +130,16 @@ class EvaluateTest(parameterized.TestCase):
             self.assertAlmostEqual(found[one], np.mean(found[many]))
         for name in LISTS:
             self.assertLen(found[name], 5)
-        self.assertIsNone(evaluation.evaluate(GAPS, make(GAPS), 1)['return_interval'])
+        distances = np.array(found['distances'])
+        self.assertEqual(found['median_distance'], np.median(distances))
+        low, high = found['distance_interval']
+        error = distances.std() / np.sqrt(5)
+        self.assertAlmostEqual(low, distances.mean() - 1.96 * error, delta=0.5 * error)
+        self.assertAlmostEqual(high, distances.mean() + 1.96 * error, delta=0.5 * error)
+        self.assertAlmostEqual(found['speed'], 30 * distances.sum() / np.sum(found['lengths']))
+        single = evaluation.evaluate(GAPS, make(GAPS), 1)
+        self.assertIsNone(single['return_interval'])
+        self.assertIsNone(single['distance_interval'])
 
     def test_options_of_the_task(self):
         blind = 'PD_Biped2D_Flat-v0'

@@ -67,6 +67,31 @@ class TrimTest(absltest.TestCase):
         np.testing.assert_allclose(trimmed(observation), policy(observation), atol=2e-3)  # halves
         self.assertFalse((trimmed.weights[0].view(np.int32) & 0x1FFF).any())  # 11 bits, kept by zip
 
+    def test_inputs_of_convolutions_keep_their_places(self):
+        rng = np.random.default_rng(0)
+        line = policies.Convolution(
+            line=4, strides=(2,), weights=[rng.normal(size=(2, 1, 3))], biases=[np.zeros(3)]
+        )
+        policy = policies.Policy(
+            id='PD_Biped2D_Flat-v0', blocks=(('a', 5),), actions=('x', 'y'), quantity='target angle',
+            mean=np.zeros(5), std=[1, 1, 1, 0.01, 1], clip=10, activation='relu',
+            weights=[rng.normal(size=(7, 2))], biases=[[0, 0]], log_std=[0, 0], convolution=line,
+        )  # fmt: skip
+        trimmed = train_all.trimmed(policy)
+        observation = rng.normal(size=(9, 5)) / 30
+        np.testing.assert_allclose(trimmed(observation), policy(observation), atol=5e-3)
+        for weights in (trimmed.weights[0], trimmed.convolution.weights[0]):
+            self.assertFalse((weights.view(np.int32) & 0x1FFF).any())
+
+    def test_the_program_of_each_environment(self):
+        for id_, program in (
+            ('PD_Biped2D_Flat-v0', 'ppo'),
+            ('FSM_Hopper2D_Terrain_Gaps-v0', 'search_gaits'),
+            ('FSM_Dog2D_Terrain_Mixed-v0', 'learn_gaits'),
+        ):
+            self.assertEqual(train_all.program(id_).__name__, program)
+            self.assertIn('samples', train_all.settings(id_))
+
 
 class TransferTest(parameterized.TestCase):
     def test_flat_ground_of_every_row(self):

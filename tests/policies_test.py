@@ -1,7 +1,9 @@
 """Trained policies: what they compute, what they refuse, their files, and those shipped."""
 
 import collections
+import dataclasses
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -39,6 +41,21 @@ def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes
     return policies.Policy(**{**fields, **changes})
 
 
+def make_convolving(seed=0, **changes):
+    """A policy that sees 9 heights through convolutions, relative to the first of 4 other numbers."""
+    rng = np.random.default_rng(seed)
+    shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
+    line = policies.Convolution(
+        line=9, strides=(2, 1), weights=[rng.normal(0, 0.6, shape) for shape in shapes],
+        biases=[rng.normal(0, 0.3, shape[2]) for shape in shapes], origin=9,
+    )  # fmt: skip
+    sizes = (3 * 5 + 4, 6, 5, 2)
+    weights = [rng.normal(0, 0.6, pair) for pair in itertools.pairwise(sizes)]
+    return make(
+        seed, blocks=(('terrain', 9), ('pose', 4)), weights=weights, convolution=line, **changes
+    )
+
+
 def plain(policy, observation):
     """The same in plain Python, one number after the other."""
     hidden = {
@@ -46,16 +63,43 @@ def plain(policy, observation):
         'relu': lambda x: x if x > 0 else 0.0,
         'elu': lambda x: x if x > 0 else float(np.exp(x)) - 1,
     }[policy.activation]
+    line = policy.convolution
+    if line is not None:
+        relative = [float(o) - float(observation[line.origin]) for o in observation[: line.line]]
+        observation = [*relative, *observation[line.line :]]
     x = [
         min(max((float(o) - float(m)) / float(s), -policy.clip), policy.clip)
         for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
     ]
+    if line is not None:
+        rows = [[value] for value in x[: line.line]]
+        for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
+            width, channels, filters = weight.shape
+            rows = [
+                [
+                    hidden(
+                        sum(
+                            rows[start + w][c] * float(weight[w, c, o])
+                            for w in range(width)
+                            for c in range(channels)
+                        )
+                        + float(bias[o])
+                    )
+                    for o in range(filters)
+                ]
+                for start in range(0, len(rows) - width + 1, stride)
+            ]
+        x = [value for row in rows for value in row] + x[line.line :]
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         x = [
             sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])
             for o in range(len(bias))
         ]
         if i < len(policy.weights) - 1:
+            if policy.layer_norm:
+                mean = sum(x) / len(x)
+                variance = sum((value - mean) ** 2 for value in x) / len(x)
+                x = [(value - mean) / (variance + 1e-5) ** 0.5 for value in x]
             x = [hidden(value) for value in x]
     return [min(max(value, -1.0), 1.0) for value in x]
 
@@ -79,6 +123,21 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_allclose(actions, expected, atol=2e-6)
         self.assertEqual(np.abs(actions).max(), 1)  # some are clipped, not all
         self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
+
+    @parameterized.product(activation=tuple(policies.ACTIVATIONS), layer_norm=(False, True))
+    def test_it_may_convolve_a_line(self, activation, layer_norm):
+        policy = make_convolving(activation=activation, layer_norm=layer_norm)
+        observations = np.random.default_rng(1).normal(0, 2, (50, 13))
+        expected = [plain(policy, row) for row in observations]
+        np.testing.assert_allclose(policy(observations), expected, atol=2e-6)
+
+    def test_a_row_that_convolves_does_not_depend_on_the_others(self):
+        policy = make_convolving(layer_norm=True)
+        observations = np.random.default_rng(1).normal(0, 2, (67, 13))
+        together = policy(observations)
+        for n in (1, 2, 3, 31):
+            np.testing.assert_array_equal(policy(observations[-n:]), together[-n:])
+        np.testing.assert_array_equal(policy(observations[5]), together[5])
 
     def test_observations_are_normalised_and_clipped(self):
         identity = make(
@@ -211,6 +270,23 @@ class ActTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, message):
             make(**changes)
 
+    @parameterized.parameters(
+        ({'strides': ()}, 'strides: 0 layers with 2 weights and 2 biases'),
+        ({'strides': (2, 0)}, 'filter_1: 5 of width 2 and stride 0 on 4 positions'),
+        ({'line': 2}, 'filter_0: 4 of width 3 and stride 2 on 2 positions'),
+        ({'weights': [np.zeros((3, 1, 4)), np.zeros((2, 3, 5))]}, r'filter_1: has shape \(2, 3, 5'),
+        ({'weights': [np.zeros((3, 4)), np.zeros((2, 4, 5))]}, r'filter_0: has shape \(3, 4\)'),
+        ({'biases': [np.zeros(4), np.zeros(4)]}, r'filter_bias_1: has shape \(4,\); expected \(5,'),
+        ({'origin': 13}, 'origin: is 13; expected a number of 0 to 12'),
+        ({'line': 14}, 'line: has 14 of 13 inputs'),
+        ({'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
+    )
+    def test_refuses_malformed_convolutions(self, changes, message):
+        policy = make_convolving()
+        with self.assertRaisesRegex(ValueError, message):
+            line = dataclasses.replace(policy.convolution, **changes)
+            dataclasses.replace(policy, convolution=line)
+
     def test_its_arrays_are_its_own(self):
         mean = np.zeros(7)
         policy = make(mean=mean)
@@ -285,6 +361,44 @@ class FileTest(FolderTest):
         for name in policies._OPTIONAL:
             np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
             self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+
+    @parameterized.parameters(9, None)
+    def test_convolutions_come_back(self, origin):
+        policy = make_convolving(layer_norm=True)
+        line = dataclasses.replace(policy.convolution, origin=origin)
+        policy = dataclasses.replace(policy, convolution=line)
+        path = self.folder / 'p.npz'
+        policies.save(policy, path)
+        again = policies.load(path)
+        self.assertEqual(again.convolution.origin, origin)
+        observations = np.random.default_rng(1).normal(size=(9, 13))
+        np.testing.assert_array_equal(again(observations), policy(observations))
+        policies.save(again, self.folder / 'q.npz')
+        self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
+        for name in (*policies._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
+            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+
+    @parameterized.parameters(
+        ({'line': None}, "'line': is missing"),
+        ({'strides': np.array([2, 1, 1])}, "'filter_2': is missing"),
+        ({'strides': np.array([2])}, "'filter_1': is unknown"),
+        ({'filter_bias_1': None}, "'filter_bias_1': is missing"),
+        ({'filter_0': np.zeros((3, 4))}, "'filter_0': has type float64 and 2 axes"),
+        ({'line': 2}, "'line': filter_0: 4 of width 3"),
+        ({'origin': 0.5}, "'origin': has type float64"),
+        ({'origin': 40}, 'origin: is 40; expected'),
+        ({'layer_norm': 2}, "'layer_norm': is 2; expected 1"),
+    )
+    def test_refuses_convolutions(self, changes, message):
+        policies.save(make_convolving(layer_norm=True), self.folder / 'p.npz')
+        with np.load(self.folder / 'p.npz') as data:
+            fields = {**data, **changes}
+        np.savez(
+            self.folder / 'p.npz',
+            **{name: value for name, value in fields.items() if value is not None},
+        )
+        with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
+            policies.load(self.folder / 'p.npz')
 
     def test_the_format_is_the_documented_one(self):
         policies.save(make(), self.folder / 'p.npz')

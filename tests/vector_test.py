@@ -319,6 +319,40 @@ class SomeRowsTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.observation, expected.observation[[1, 0, 1]])
         np.testing.assert_array_equal(step.reward, expected.reward[[1, 0, 1]])
 
+    @parameterized.parameters(*KINDS)
+    def test_single_rows_go_back(self, id_):
+        rows, twin = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (3, len(rows.action_map)))
+        for each in (rows, twin):
+            each.reset()
+            each.step(action)
+        state = rows.get_state([2, 0])
+        rows.step(action)
+        rows.step(-action)
+        rows.set_state(state, [2, 0])
+        twin.step(action, [1])
+        twin.step(-action, [1])
+        for each in (action, -action):
+            step, expected = rows.step(each), twin.step(each)
+            np.testing.assert_array_equal(step.observation, expected.observation)
+            np.testing.assert_array_equal(step.reward, expected.reward)
+        np.testing.assert_array_equal(rows.reset(), twin.reset())
+
+    def test_what_rows_cannot_go_back_to(self):
+        rows = VectorEnvironment(GAPS, 3, 1, 0)
+        state = rows.get_state([1])
+        with self.assertRaisesRegex(RuntimeError, 'some rows before the first reset'):
+            rows.set_state(state, [1])
+        rows.reset()
+        for numbers in ([0, 1], None, []):
+            with self.assertRaisesRegex(ValueError, 'the state has 1 rows; expected'):
+                rows.set_state(state, numbers)
+        with self.assertRaisesRegex(ValueError, 'each of 2 rows once'):
+            rows.set_state(rows.get_state([1, 2]), [1, 1])
+        for call in (rows.get_state, lambda numbers: rows.set_state(state, numbers)):
+            with self.assertRaisesRegex(ValueError, 'rows .3. of an environment of 3 rows'):
+                call([3])
+
     def test_what_cannot_be_copied(self):
         rows, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):

@@ -125,6 +125,10 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--episodes', type=_positive, default=50, help='how many')
     command.add_argument('--seed', type=int, default=0, help='of all episodes')
     command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument(
+        '--step-limit', type=_positive, metavar='N',
+        help="steps after which an episode is cut, instead of the environment's limit",
+    )  # fmt: skip
     command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
 
     command = add('terrain', 'plot draws of a terrain, or write one as a mesh')

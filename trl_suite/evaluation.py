@@ -24,6 +24,7 @@ from trl_suite.vector import VectorEnvironment
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 CHUNK = 256  # episodes that run side by side
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
+BOOTSTRAP = 10_000  # resamplings
 _NORMAL_95 = 1.96  # standard errors on either side of a mean
 
 
@@ -46,8 +47,8 @@ def evaluate(
 
     Args:
       environment: id, alias, or row of the catalogue.
-      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and rows whose
-        episode has ended go on with another that does not count.
+      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and of rows whose
+        episode has ended the action does not count.
       episodes: how many.
       seed: of them all; or a sequence of as many seeds as episodes.
       num_threads: threads that step the physics; 0 takes all cores.
@@ -62,7 +63,10 @@ def evaluate(
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
       standard errors; None for a single episode), 'fraction' (mean return over the step limit; no
       step has a reward above 1), 'full' (share of episodes that last until the step limit),
-      'length' (mean, steps), 'distance' (mean, m), 'falls' and 'diverged' (shares of episodes).
+      'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its 95 % confidence interval
+      by `BOOTSTRAP` resamplings of the episodes, [m, m]; None for a single episode: how far a policy
+      gets is far from normal), 'median_distance' (m), 'speed' (distance over time, m/s), 'falls' and
+      'diverged' (shares of episodes).
       Lists, one entry per episode: 'seeds', 'returns', 'lengths', 'distances', 'fell'.
 
     Raises:
@@ -116,6 +120,9 @@ def evaluate(
         'full': float(of['full'].mean()),
         'length': float(of['lengths'].mean()),
         'distance': float(of['distances'].mean()),
+        'distance_interval': _bootstrap(of['distances']) if len(seeds) > 1 else None,
+        'median_distance': float(np.median(of['distances'])),
+        'speed': float(of['distances'].sum() / of['durations'].sum()),
         'falls': float(of['fell'].mean()),
         'diverged': float(of['diverged'].mean()),
         'seeds': seeds,
@@ -126,27 +133,34 @@ def evaluate(
 def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict[str, np.ndarray]:
     """Runs one episode in every row."""
     n = environments.num_envs
-    returns, lengths, distances = np.zeros(n), np.zeros(n, int), np.zeros(n)
+    returns, lengths, distances, durations = np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n)
     fell, diverged, full = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
     runs = np.ones(n, bool)  # rows in their first episode
     observation = environments.reset()
     while runs.any():
-        observation, reward, terminated, truncated, info = environments.step(policy(observation))
+        observation, reward, terminated, truncated, info = environments.step(
+            policy(observation), runs
+        )
         bar.update()
         returns[runs] += reward[runs]
         lengths[runs] += 1
-        ended = terminated | truncated
-        ends = ended & runs
+        ends = (terminated | truncated) & runs
         distances[ends] = info['distance'][ends]
+        durations[ends] = environments.task.world.time[ends]
         fell[ends], diverged[ends] = info['fell'][ends], info['diverged'][ends]
         full[ends] = truncated[ends]
-        runs &= ~ended
-        if ended.any() and runs.any():  # every row must go on
-            observation = environments.reset(ended)
+        runs &= ~ends
     return {
-        'returns': returns, 'lengths': lengths, 'distances': distances, 'fell': fell,
-        'diverged': diverged, 'full': full,
+        'returns': returns, 'lengths': lengths, 'distances': distances, 'durations': durations,
+        'fell': fell, 'diverged': diverged, 'full': full,
     }  # fmt: skip
+
+
+def _bootstrap(values: np.ndarray) -> list[float]:
+    """Returns a 95 % confidence interval of the mean."""
+    random = np.random.default_rng(0)
+    means = [random.choice(values, len(values)).mean() for _ in range(BOOTSTRAP)]
+    return np.percentile(means, (2.5, 97.5)).tolist()
 
 
 def zero(environments: VectorEnvironment) -> BatchPolicy:

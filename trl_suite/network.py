@@ -18,12 +18,94 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
 }
 _FLAT = 'observations'  # key of the flat vector, where an environment gives one
+_LEAST_VARIANCE = 1e-5  # of the sums of a layer that are brought to deviation 1
 REACH = 1.0  # m; within which a network sees where a place is, and farther away its direction
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Convolution:
+    """1-D convolutions over a line, the first l inputs of a network, such as ground heights.
+
+    What comes out takes the place of the line, position by position, before the other inputs.
+
+    Attributes:
+      line: number of inputs that form the line, l.
+      strides: of each layer, in positions of its input.
+      weights: per layer (width, channels, filters), float32, like all arrays read-only; the first has
+        one channel, each other as many as the one before has filters.
+      biases: per layer (filters,).
+      origin: number of the input that is subtracted from those of the line, such as the root's
+        height, before they are normalised; None: nothing is.
+      outputs: how many numbers come out: positions times filters of the last layer.
+
+    Raises:
+      ValueError: fields do not fit each other; the message names one.
+    """
+
+    line: int
+    strides: tuple[int, ...]
+    weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    origin: int | None = None
+    outputs: int = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put('line', int(self.line))
+        put('strides', tuple(map(int, self.strides)))
+        layers = len(self.strides)
+        if not layers or len(self.weights) != layers or len(self.biases) != layers:
+            raise ValueError(
+                f'strides: {layers} layers with {len(self.weights)} weights and '
+                f'{len(self.biases)} biases'
+            )
+        weights, biases, positions, channels = [], [], self.line, 1
+        for i, stride in enumerate(self.strides):
+            width, _, filters = (
+                np.shape(self.weights[i]) if np.ndim(self.weights[i]) == 3 else 3 * (0,)
+            )
+            weights.append(_array(f'filter_{i}', self.weights[i], (width, channels, filters)))
+            biases.append(_array(f'filter_bias_{i}', self.biases[i], (filters,)))
+            if stride < 1 or not 1 <= width <= positions or not filters:
+                raise ValueError(
+                    f'filter_{i}: {filters} of width {width} and stride {stride} on {positions} positions'
+                )
+            positions, channels = (positions - width) // stride + 1, filters
+        put('weights', tuple(weights))
+        put('biases', tuple(biases))
+        put('outputs', positions * channels)
+
+    def check(self, inputs: int) -> None:
+        """Raises ValueError unless a network with so many inputs can have it."""
+        if not self.line <= inputs:
+            raise ValueError(f'line: has {self.line} of {inputs} inputs')
+        if self.origin is not None and not 0 <= self.origin < inputs:
+            raise ValueError(f'origin: is {self.origin}; expected a number of 0 to {inputs - 1}')
+
+    def relative(self, seen: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, c) in which the line is relative to the origin."""
+        if self.origin is None:
+            return seen
+        line = seen[:, : self.line] - seen[:, self.origin, None]
+        return np.concatenate([line, seen[:, self.line :]], axis=1)
+
+    def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Returns what comes of normalised inputs (n, c), (n, outputs + c - l)."""
+        line = x[:, : self.line, None]
+        for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
+            width, channels, filters = weight.shape
+            places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
+            windows = line[:, places].reshape(len(x), len(places), width * channels)
+            # One product per row, so that it does not depend on how many rows there are.
+            line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
+        return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
-    """A fully connected network from observations to actions in [-1, 1].
+    """A network from observations to actions in [-1, 1].
 
     Row i of a batch gets, bit for bit, the action that it would get alone.
 
@@ -37,7 +119,7 @@ class Policy:
       clip: bound of the normalised observation.
       weights: per layer (inputs, outputs).
       biases: per layer (outputs,).
-      activation: of all layers but the last, one of `ACTIVATIONS`.
+      activation: of all layers but the last, convolutions included, one of `ACTIVATIONS`.
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was made; what JSON can hold.
       mirror: how it sees left stance as right stance; None if it sees all as it is.
@@ -47,6 +129,10 @@ class Policy:
         None: all.
       choices: actions of which the one with the largest output is taken, (b, a); None: the outputs
         are the action.
+      convolution: what the first of the inputs go through before the others join them, so that
+        `weights[0]` has as many inputs as then are left; None: nothing.
+      layer_norm: whether the sums of each fully connected layer but the last are brought to mean 0
+        and standard deviation 1 before the activation.
 
     Raises:
       ValueError: a field is malformed, or fields do not fit each other; the message names it.
@@ -68,6 +154,8 @@ class Policy:
     places: np.ndarray | None = dataclasses.field(default=None, repr=False)
     columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
     choices: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    convolution: Convolution | None = dataclasses.field(default=None, repr=False)
+    layer_norm: bool = False
 
     def __post_init__(self) -> None:
         def put(name: str, value: Any) -> None:
@@ -113,7 +201,12 @@ class Policy:
         layers = len(self.weights)
         if not layers or len(self.biases) != layers:
             raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
-        weights, biases, inputs = [], [], seen
+        inputs = seen
+        if self.convolution is not None:
+            self.convolution.check(seen)
+            inputs += self.convolution.outputs - self.convolution.line
+        put('layer_norm', bool(self.layer_norm))
+        weights, biases = [], []
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             outputs = last if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
             weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
@@ -216,13 +309,20 @@ class Policy:
             seen = placed(seen, self.places)
         if self.columns is not None:
             seen = seen.take(self.columns, 1)
+        if self.convolution is not None:
+            seen = self.convolution.relative(seen)
         x = np.clip((seen - self.mean) / self.std, -self.clip, self.clip)
         x = x.astype(np.float32, order='C')
         activation = ACTIVATIONS[self.activation]
+        if self.convolution is not None:
+            x = self.convolution(x, activation)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             # Row by row, so that an action does not depend on how many rows there are.
             x = np.matmul(x[:, None], weight)[:, 0] + bias
             if i < len(self.weights) - 1:
+                if self.layer_norm:
+                    x = x - x.mean(1, keepdims=True)
+                    x /= np.sqrt((x * x).mean(1, keepdims=True) + np.float32(_LEAST_VARIANCE))
                 x = activation(x)
         if self.choices is not None:
             x = self.choices[x.argmax(1)]

@@ -51,6 +51,22 @@ and, if it chooses among b actions instead of composing one, as mixtures of expe
 
     choices      float (b, a)  the action is the row whose output is the largest
 
+and, if the first l of its inputs are a line, say of ground heights, that goes through C convolutions
+before the other c - l inputs join what comes out, position by position:
+
+    line           int ()    l
+    strides        int (C,)  of each layer
+    filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters); channel 0 of the
+                             first is the line; window (positions, channels) @ filter
+    filter_bias_0  float     (filters,); the activation is that of the hidden layers
+    origin         int ()    optional: number of the input that is subtracted from each of the line
+                             before the normalisation, as the height of the root is
+
+and, if what the hidden layers sum up is brought to mean 0 and standard deviation 1 (over the layer's
+outputs, with 1e-5 added to the variance) before the activation:
+
+    layer_norm   int ()      1
+
 Floats are written as float32, or as float16 where nothing is lost by it.
 """
 
@@ -66,10 +82,12 @@ import numpy as np
 
 from trl_suite import resources
 from trl_suite.files import check_path, existing, replacing
-from trl_suite.network import ACTIVATIONS, Policy, placed
+from trl_suite.network import ACTIVATIONS, Convolution, Policy, placed
 from trl_suite.symmetry import Mirror
 
-__all__ = ('ACTIVATIONS', 'Policy', 'available', 'load', 'placed', 'reference', 'save')
+__all__ = (
+    'ACTIVATIONS', 'Convolution', 'Policy', 'available', 'load', 'placed', 'reference', 'save',
+)  # fmt: skip
 
 FORMAT = 'trl_suite policy'
 VERSION = 1
@@ -86,6 +104,7 @@ _MIRROR = {
 }  # fmt: skip
 _SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
 _OPTIONAL = {'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2)}
+_LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
@@ -118,6 +137,15 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
         for name, (kind, _) in {**_MIRROR, side: _SIDES[side]}.items():
             value = np.asarray(getattr(policy.mirror, name))
             fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
+    if policy.convolution is not None:
+        fields |= {name: getattr(policy.convolution, name) for name in _LINE}
+        if policy.convolution.origin is not None:
+            fields['origin'] = policy.convolution.origin
+        layers = zip(policy.convolution.weights, policy.convolution.biases, strict=True)
+        for i, (weight, bias) in enumerate(layers):
+            fields[f'filter_{i}'], fields[f'filter_bias_{i}'] = weight, bias
+    if policy.layer_norm:
+        fields['layer_norm'] = 1
     optional = {name: getattr(policy, name) for name in _OPTIONAL}
     fields |= {name: value for name, value in optional.items() if value is not None}
     with replacing(check_path(path, ('.npz',))) as part:
@@ -136,56 +164,57 @@ def load(path: str | os.PathLike[str]) -> Policy:
     path = existing(path, ('.npz',))
     content = io.BytesIO(path.read_bytes())
     fields: dict[str, Any] = {}
-    field = ''
+    read = _Reader()
     try:
         archive = np.load(content, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError('a single array')
-        for field, (kind, axes) in _FIELDS.items():
-            fields[field] = _read(archive, field, kind, axes).tolist()
-            if field == 'format' and fields[field] != FORMAT:
-                raise ValueError(f'is {fields[field]!r}; expected {FORMAT!r}')
-            if field == 'version' and fields[field] != VERSION:
-                raise ValueError(f'is {fields[field]}; expected {VERSION}')
-        weights: list[np.ndarray] = []
-        biases: list[np.ndarray] = []
-        for i in range(fields['layers']):
-            for field, axes, into in ((f'weight_{i}', 2, weights), (f'bias_{i}', 1, biases)):
-                into.append(_read(archive, field, 'f', axes))
-        mirror = None
+        read.archive = archive
+        for name, (kind, axes) in _FIELDS.items():
+            fields[name] = read(name, kind, axes).tolist()
+            if name == 'format' and fields[name] != FORMAT:
+                raise ValueError(f'is {fields[name]!r}; expected {FORMAT!r}')
+            if name == 'version' and fields[name] != VERSION:
+                raise ValueError(f'is {fields[name]}; expected {VERSION}')
+        weights, biases = read.layers('', fields['layers'], 2)
         if any(name.startswith('mirror_') for name in archive.files):
             side = 'feet' if 'mirror_feet' in archive else 'phase'
             parts: dict[str, Any] = {}
             for name, (kind, axes) in {**_MIRROR, side: _SIDES[side]}.items():
-                field = f'mirror_{name}'
-                parts[name] = _read(archive, field, kind, axes)
-            mirror = Mirror(**{**parts, side: parts[side].tolist()})
-        for field in _OPTIONAL.keys() & archive.files:
-            fields[field] = _read(archive, field, *_OPTIONAL[field])
-        field = 'info'
-        fields[field] = json.loads(fields[field])
-        for field in archive:
-            known = field in _FIELDS or field in _OPTIONAL
-            known |= field.removeprefix('mirror_') in (*_MIRROR, *_SIDES)
-            if not known and field.partition('_')[0] not in ('weight', 'bias'):
+                parts[name] = read(f'mirror_{name}', kind, axes)
+            fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
+        if any(name in archive for name in _LINE):
+            line = {name: read(name, *_LINE[name]).tolist() for name in _LINE}
+            if 'origin' in archive:
+                line['origin'] = read('origin', 'iu', 0).tolist()
+            filters = read.layers('filter', len(line['strides']), 3)
+            read.field = 'line'
+            fields['convolution'] = Convolution(weights=filters[0], biases=filters[1], **line)
+        if 'layer_norm' in archive:
+            fields['layer_norm'] = read('layer_norm', 'iu', 0).tolist()
+            if fields['layer_norm'] != 1:
+                raise ValueError(f'is {fields["layer_norm"]}; expected 1')
+        for name in _OPTIONAL.keys() & archive.files:
+            fields[name] = read(name, *_OPTIONAL[name])
+        read.field = 'info'
+        fields['info'] = json.loads(fields['info'])
+        for left in sorted({*archive.files} - read.taken):
+            read.field = left
+            if left.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
-        expected = len(_FIELDS) + 2 * len(weights) + (len(_MIRROR) + 1 if mirror else 0)
-        expected += len(_OPTIONAL.keys() & archive.files)
-        if len(archive.files) != expected:
-            field = 'layers'
+            read.field = 'layers'
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
     except Exception as error:  # a damaged archive fails in a dozen ways
-        where = f'field {field!r}' if field else 'no readable policy'
+        where = f'field {read.field!r}' if read.field else 'no readable policy'
         raise ValueError(f'{path}: {where}: {error}') from None
     names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
-    for field in ('format', 'version', 'layers'):
-        del fields[field]
+    for name in ('format', 'version', 'layers'):
+        del fields[name]
     try:
         return Policy(
             blocks=tuple(zip(names, sizes, strict=True)),
-            weights=tuple(weights),
-            biases=tuple(biases),
-            mirror=mirror,
+            weights=weights,
+            biases=biases,
             **fields,
         )
     except ValueError as error:
@@ -229,10 +258,28 @@ def _small(value: Any) -> Any:
     return half if np.array_equal(half, value) else value
 
 
-def _read(archive: Any, field: str, kind: str, axes: int) -> np.ndarray:
-    if field not in archive:
-        raise ValueError('is missing')
-    array = archive[field]
-    if array.dtype.kind not in kind or array.ndim != axes:
-        raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
-    return array
+class _Reader:
+    """Takes arrays out of an archive, and knows which one it took last and which it took."""
+
+    def __init__(self) -> None:
+        self.archive: Any = {}
+        self.field = ''
+        self.taken: set[str] = set()
+
+    def __call__(self, field: str, kind: str, axes: int) -> np.ndarray:
+        self.field = field
+        self.taken.add(field)
+        if field not in self.archive:
+            raise ValueError('is missing')
+        array = self.archive[field]
+        if array.dtype.kind not in kind or array.ndim != axes:
+            raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
+        return array
+
+    def layers(self, kind: str, count: int, axes: int) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Returns weights and biases of so many layers, of a kind other than fully connected."""
+        weight, bias = (kind, f'{kind}_bias') if kind else ('weight', 'bias')
+        found = [
+            (self(f'{weight}_{i}', 'f', axes), self(f'{bias}_{i}', 'f', 1)) for i in range(count)
+        ]
+        return tuple(part[0] for part in found), tuple(part[1] for part in found)

@@ -280,33 +280,54 @@ class VectorEnvironment:
             self._picture.close()
             self._picture = None
 
-    def get_state(self) -> dict[str, Any]:
-        """Returns everything that the future of all rows depends on."""
+    def get_state(self, rows: Sequence[int] | None = None) -> dict[str, Any]:
+        """Returns everything that the future of some rows, or of all, depends on.
+
+        Args:
+          rows: numbers of m rows; None for all.
+        """
         self._check_usable()
         assert self._world is not None
-        rows = range(self.num_envs)
+        rows = list(range(self.num_envs) if rows is None else rows)
+        self._numbers(rows)
         return {
             'world': [self._world.get_state(row) for row in rows],
             'task': [self._task.get_state(row) for row in rows],
-            'random': [random.get_state() for random in self._random],
-            'seeds': self.seeds.copy(),
-            'steps': self._steps.copy(),
-            'ended': self._ended.copy(),
+            'random': [self._random[row].get_state() for row in rows],
+            'seeds': self.seeds[rows],
+            'steps': self._steps[rows],
+            'ended': self._ended[rows],
             'fresh': self._fresh,
         }
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_state` of an environment of the same row and size returned."""
+    def set_state(self, state: dict[str, Any], rows: Sequence[int] | None = None) -> None:
+        """Restores what `get_state` of an environment of the same id and options returned.
+
+        Args:
+          state: of m rows.
+          rows: numbers of the m rows that go on from it, each named once; None for all.
+
+        Raises:
+          ValueError: the state has another number of rows, or there are no such rows.
+          RuntimeError: some rows are restored before the first reset.
+        """
         self._check_usable()
         assert self._world is not None
-        if len(state['world']) != self.num_envs:
-            raise ValueError(f'the state has {len(state["world"])} rows; expected {self.num_envs}')
-        for row in range(self.num_envs):
-            self._task.set_state(row, state['task'][row])
-            self._world.set_state(row, state['world'][row])
-            self._random[row].set_state(state['random'][row])
-        self.seeds, self._fresh = state['seeds'].copy(), state['fresh']
-        self._steps, self._ended = state['steps'].copy(), state['ended'].copy()
+        if rows is not None and self._fresh:
+            raise RuntimeError('set_state of some rows before the first reset')
+        numbers = list(range(self.num_envs) if rows is None else rows)
+        if len(state['world']) != len(numbers):
+            raise ValueError(f'the state has {len(state["world"])} rows; expected {len(numbers)}')
+        if len(self._numbers(numbers)) != len(numbers):
+            raise ValueError(f'rows {numbers}; expected each of {len(numbers)} rows once')
+        for i, row in enumerate(numbers):
+            self._task.set_state(row, state['task'][i])
+            self._world.set_state(row, state['world'][i])
+            self._random[row].set_state(state['random'][i])
+        self.seeds[numbers] = state['seeds']
+        self._steps[numbers], self._ended[numbers] = state['steps'], state['ended']
+        if rows is None:
+            self._fresh = state['fresh']
 
     def copy_from(
         self, other: VectorEnvironment, other_rows: Sequence[int], rows: Sequence[int]

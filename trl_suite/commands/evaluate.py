@@ -16,13 +16,14 @@ def run(arguments: argparse.Namespace) -> None:
     from trl_suite import evaluation
 
     baseline = evaluation.BASELINES.get(arguments.policy)
+    limits = {} if arguments.step_limit is None else {'step_limit': arguments.step_limit}
     result = evaluation.evaluate(
         row, baseline or acting.trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
-        arguments.threads, factory=baseline is not None, progress=True,
+        arguments.threads, limits, factory=baseline is not None, progress=True,
     )  # fmt: skip
     if arguments.json is not None:
         files.write_json({**result, 'policy': arguments.policy}, arguments.json)
-    interval = result['return_interval']
+    interval, distances = result['return_interval'], result['distance_interval']
     lines = (
         ('policy', arguments.policy),
         ('episodes', f'{result["episodes"]}, seed {result["seed"]}'),
@@ -33,7 +34,16 @@ def run(arguments: argparse.Namespace) -> None:
             + f', {result["fraction"]:.1%} of the maximum {result["step_limit"]}',
         ),
         ('length', f'{result["length"]:.1f} of {result["step_limit"]} steps'),
-        ('distance', f'{result["distance"]:.2f} m'),
+        (
+            'distance',
+            f'{result["distance"]:.2f} m'
+            + (
+                ''
+                if distances is None
+                else ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances)
+            )
+            + f', median {result["median_distance"]:.2f} m, at {result["speed"]:.2f} m/s',
+        ),
         ('full length', f'{result["full"]:.0%} of the episodes'),
         ('falls', f'{result["falls"]:.0%} of the episodes'),
     )

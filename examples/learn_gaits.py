@@ -1,0 +1,466 @@
+"""Learns which base action of a gait to take when, with Q-learning, in one file, on the CPU.
+
+    python examples/learn_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1 --threads 1
+    python examples/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs
+
+The value of each base action in each state is learnt from a replay of transitions (Mnih et al. 2015)
+with returns of several steps, the smaller of two networks' estimates (Fujimoto et al. 2018) and
+averaged target networks. The networks see the ground through 1-D convolutions, relative to the root,
+as those of Peng, Berseth, van de Panne (2016) do. After a fall most simulations go back a few cycles
+and try again, so that what decides between falling and not is seen often.
+
+Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it had
+never stopped, and with a larger `--samples` for longer), `curve.json` (settings, learning curve),
+`last.npz` (the averaged network so far), and at the end `policy.npz`, after a last phase in which the
+learning rate falls while nothing new is collected. Needs `pip install 'trl_suite[train]'`.
+"""
+
+from __future__ import annotations
+
+import collections
+import copy
+import dataclasses
+import json
+import os
+import pathlib
+import time
+from typing import Any
+
+import numpy as np
+import ppo
+import ppo_settings
+import torch
+import tqdm
+from torch import nn
+
+from trl_suite import characters, evaluation, files, policies
+from trl_suite.tasks import gait
+from trl_suite.vector import VectorEnvironment
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a run depends on besides environment and seed."""
+
+    samples: float = 2e5  # cycles
+    num_envs: int = 64
+    guided: float = 8e3  # first cycles, driven by the shipped policy, or by random base actions
+    guide_epsilon: float = 0.15  # share of random actions in them
+    begin: float = 2e3  # cycles before learning begins; they set the scales of the observation
+    epsilon: float = 0.08  # share of random actions after them
+    greedy: float = 0.25  # share of simulations without random actions and without retries
+    retry: float = 0.8  # probability that a simulation that fell goes back
+    retries: int = 4  # at one place at most
+    back: tuple[int, int] = (1, 3)  # cycles before the last one, at least and at most
+    retry_epsilon: float = 0.3  # share of random actions in the first cycles of a retry
+    retry_cycles: int = 2
+    gamma: float = 0.95  # per cycle
+    steps: int = 3  # of the returns
+    alive: float = 0.5  # reward for a cycle without a fall, beside the environment's
+    capacity: float = 5e5  # transitions in the replay
+    minibatch: int = 256
+    updates: int = 16  # per cycle of all simulations
+    learning_rate: float = 3e-4
+    weight_decay: float = 1e-2
+    polyak: float = 0.005  # share of the new weights in the targets
+    final_updates: int = 5000  # in which the learning rate falls to `final_rate`
+    final_rate: float = 1e-5
+    view: float = 6.5  # m ahead that the network sees
+    relief: float = 0.8  # m above or below the usual height under the root that it tells apart
+    convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
+    ground_units: int = 128  # that the convolutions end in
+    hidden: tuple[int, ...] = (256, 128)
+    write_every: float = 4096  # cycles
+    evaluate_every: float = 16384  # cycles
+    evaluation_episodes: int = 32
+
+
+OVERRIDES: dict[str, dict[str, Any]] = {
+    'FSM_Hopper2D_*': {'relief': 2.0},
+    'FSM_Goat2D_*': {'relief': 1.6},
+}
+CLIP = 5.0  # bound of what the networks see, in standard deviations
+_STATE = (
+    'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
+    'past', 'chains',
+)  # fmt: skip
+_PARTS = 'networks', 'targets', 'optimizer'
+
+
+def settings_for(id_: str, **changes: Any) -> Settings:
+    """The settings of an environment."""
+    return Settings(**{**ppo_settings.matching(id_, OVERRIDES.items()), **changes})
+
+
+class Network(nn.Module):
+    """Values of all actions; the first `line` inputs are ground heights.
+
+    Every layer but the last is followed by a rectifier; the sums of fully connected ones are brought
+    to mean 0 and deviation 1 before it (Ba et al. 2016), which keeps Q-learning stable.
+    """
+
+    def __init__(self, line: int, others: int, actions: int, settings: Settings) -> None:
+        super().__init__()
+        self.line, self.filters = line, nn.ModuleList()
+        channels, length = 1, line
+        for outputs, width, stride in settings.convolutions:
+            self.filters.append(nn.Conv1d(channels, outputs, width, stride))
+            channels, length = outputs, (length - width) // stride + 1
+        self.filters.append(nn.Conv1d(channels, settings.ground_units, length))
+        sizes = (settings.ground_units + others, *settings.hidden)
+        self.hidden = nn.ModuleList(map(nn.Linear, sizes, settings.hidden))
+        self.last = nn.Linear(sizes[-1], actions)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        ground = x[:, None, : self.line]
+        for layer in self.filters:
+            ground = layer(ground).relu()
+        x = torch.cat([ground.flatten(1), x[:, self.line :]], 1)
+        for layer in self.hidden:
+            x = nn.functional.layer_norm(layer(x), (layer.out_features,)).relu()
+        return self.last(x)
+
+
+class Replay:
+    """Transitions over several steps; the oldest make room for new ones."""
+
+    def __init__(self, capacity: int, size: int) -> None:
+        self.before, self.after = np.zeros((2, capacity, size), np.float16)
+        self.action = np.zeros(capacity, np.int64)
+        self.reward, self.discount = np.zeros((2, capacity), np.float32)
+        self.count = 0  # of all that were ever put in
+
+    def __len__(self) -> int:
+        return min(self.count, len(self.action))
+
+    def add(
+        self, before: np.ndarray, action: int, reward: float, discount: float, after: np.ndarray
+    ) -> None:
+        """Puts in a transition, with discount 0 where it ends in a fall."""
+        i = self.count % len(self.action)
+        self.before[i], self.after[i] = before, after
+        self.action[i], self.reward[i], self.discount[i] = action, reward, discount
+        self.count += 1
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns what has been put in."""
+        arrays = {name: value[: len(self)] for name, value in vars(self).items() if name != 'count'}
+        return {**arrays, 'count': self.count}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_state` of a replay of the same capacity returned."""
+        self.count = state['count']
+        for name, value in vars(self).items():
+            if name != 'count':
+                value[: len(self)] = state[name]
+
+
+class Learner:
+    """One run: the simulations, the networks, and where it has got to."""
+
+    def __init__(self, id_: str, seed: int, settings: Settings, threads: int) -> None:
+        torch.manual_seed(seed)
+        self.settings, self.seed, self.threads = settings, seed, threads
+        s, n = settings, settings.num_envs
+        self.random = np.random.default_rng(seed)
+        self.environments = VectorEnvironment(
+            id_, n, threads, seed, autoreset='disabled', step_limit=None
+        )
+        environments = self.environments
+        parameters = environments.task.gait.parameters
+        self.choices = parameters.action(parameters.base_actions)
+        ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+        self.line = int((ahead <= s.view).sum())
+        heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
+        self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]
+        # Heights come relative to the ground under the root, and above a gap that is its floor.
+        self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
+        others = len(self.columns) - self.line
+        self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
+        self.networks = nn.ModuleList(
+            Network(self.line, others, len(self.choices), s) for _ in range(2)
+        )
+        self.targets = copy.deepcopy(self.networks).requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            self.networks.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
+        )
+        self.replay = Replay(int(s.capacity), len(self.columns))
+        self.guide = policies.reference(id_) if id_ in policies.available() else None
+        self.samples = self.updates = 0
+        self.loss = 0.0
+        self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
+        self.curve: list[dict[str, Any]] = []
+        self.observation = environments.reset()
+        # Of each row: states before the last cycles, and what has not all gone into the replay.
+        self.past: list[collections.deque] = [
+            collections.deque(maxlen=s.back[1] + 1) for _ in range(n)
+        ]
+        self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
+        # How often each row went back at this place, and the cycles since.
+        self.tried = np.zeros((2, n), int)
+
+    def seen(self, observation: np.ndarray) -> torch.Tensor:
+        """What the networks see of columns of observations."""
+        x = observation.astype(np.float32)
+        x[:, : self.line] -= x[:, [self.origin]]
+        x = np.clip((x - self.mean) / self.std, -CLIP, CLIP)
+        return torch.from_numpy(x.astype(np.float32))
+
+    def set_scales(self) -> None:
+        """Sets mean and deviation of what the networks see from the replay."""
+        x = self.replay.before[: len(self.replay)].astype(np.float64)
+        line = x[:, : self.line] - x[:, [self.origin]]
+        self.mean, self.std = x.mean(0), np.maximum(x.std(0), ppo.LEAST_STD)
+        self.mean[: self.line], self.std[: self.line] = line.mean(), self.settings.relief / CLIP
+
+    def act(self) -> np.ndarray:
+        """Chooses an action for each row, (n,)."""
+        s, n = self.settings, self.settings.num_envs
+        epsilon = np.full(n, s.epsilon)
+        guided = self.samples < s.guided
+        if guided and self.guide is None:
+            epsilon[:] = 1.0
+            chosen = np.zeros(n, int)
+        elif guided:
+            epsilon[:] = s.guide_epsilon
+            away = self.guide(self.observation)[:, None] - self.choices
+            chosen = (away**2).sum(2).argmin(1)
+        else:
+            with torch.no_grad():
+                values = self.networks[0](self.seen(self.observation[:, self.columns]))
+            chosen = values.argmax(1).numpy()
+            epsilon[self.greedy] = 0.0
+        again = (self.tried[0] > 0) & (self.tried[1] < s.retry_cycles)
+        epsilon[again] = np.maximum(epsilon[again], s.retry_epsilon)
+        drawn = self.random.integers(len(self.choices), size=n)
+        return np.where(self.random.random(n) < epsilon, drawn, chosen)
+
+    @property
+    def greedy(self) -> np.ndarray:
+        """Which rows the network alone drives, (n,) bool."""
+        n = self.settings.num_envs
+        return np.arange(n) < self.settings.greedy * n
+
+    def collect(self) -> None:
+        """Runs one cycle in every row, and puts what came of it into the replay."""
+        s, environments = self.settings, self.environments
+        action, before = self.act(), self.observation[:, self.columns].astype(np.float16)
+        for i, past in enumerate(self.past):
+            past.append(environments.get_state([i]))
+        step = environments.step(self.choices[action])
+        self.samples += s.num_envs
+        reward = step.reward + s.alive * ~step.terminated
+        after, fresh = step.observation[:, self.columns].astype(np.float16), []
+        self.tried[1] += 1
+        self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
+        for i, chain in enumerate(self.chains):
+            chain.append((before[i], int(action[i]), float(reward[i])))
+            while chain and (step.terminated[i] or len(chain) == s.steps):
+                value = sum(s.gamma**k * each[2] for k, each in enumerate(chain))
+                discount = 0.0 if step.terminated[i] else s.gamma ** len(chain)
+                self.replay.add(chain[0][0], chain[0][1], value, discount, after[i])
+                del chain[0]
+        for i in np.flatnonzero(step.terminated).tolist():
+            if self.go_back(i):
+                continue
+            fresh.append(i)
+            self.past[i].clear()
+            self.tried[:, i] = 0
+        if fresh:
+            environments.reset(fresh)
+        self.observation = environments.task.observation.copy()
+
+    def go_back(self, row: int) -> bool:
+        """Puts a row that fell where it was some cycles ago; returns whether it did."""
+        s, past = self.settings, self.past[row]
+        back = int(self.random.integers(s.back[0], s.back[1] + 1))
+        if self.random.random() >= s.retry or self.greedy[row]:
+            return False
+        if self.tried[0, row] >= s.retries or len(past) <= back:
+            return False
+        for _ in range(back + 1):
+            state = past.pop()
+        self.environments.set_state(state, [row])
+        self.tried[:, row] = self.tried[0, row] + 1, 0
+        return True
+
+    def learn(self) -> None:
+        """Updates both networks once, and the targets."""
+        s, replay = self.settings, self.replay
+        picked = self.random.integers(len(replay), size=s.minibatch)
+        before, after = self.seen(replay.before[picked]), self.seen(replay.after[picked])
+        action = torch.from_numpy(replay.action[picked])[:, None]
+        scale = 1 - s.gamma  # so that values are of the size of a cycle's reward
+        with torch.no_grad():
+            following = torch.minimum(*(target(after) for target in self.targets)).amax(1)
+            reward, discount = (
+                torch.from_numpy(each[picked]) for each in (replay.reward, replay.discount)
+            )
+            aim = scale * reward + discount * following
+        loss = sum(
+            (network(before).gather(1, action)[:, 0] - aim).square().mean()
+            for network in self.networks
+        )
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(
+                list(self.targets.parameters()), list(self.networks.parameters()), s.polyak
+            )
+        self.updates += 1
+        self.loss += (float(loss.detach()) - self.loss) / min(self.updates, 1000)
+
+    def advance(self) -> None:
+        """Collects one cycle of every row, and learns."""
+        begin, before, s = time.process_time(), self.samples, self.settings
+        self.collect()
+        middle = time.process_time()
+        if before < s.begin <= self.samples:
+            self.set_scales()
+        if self.samples >= s.begin:
+            for _ in range(s.updates):
+                self.learn()
+        self.seconds['simulation'] += middle - begin
+        self.seconds['learning'] += time.process_time() - middle
+
+    def finish(self) -> None:
+        """Updates the networks with a falling learning rate, without collecting."""
+        s = self.settings
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimizer, s.final_updates, s.final_rate
+        )
+        begin = time.process_time()
+        for _ in tqdm.trange(s.final_updates, unit='update', desc='last updates'):
+            self.learn()
+            schedule.step()
+        self.seconds['learning'] += time.process_time() - begin
+
+    def exported(self) -> policies.Policy:
+        """The first of the averaged networks, without PyTorch."""
+
+        def arrays(parts: nn.ModuleList, axes: tuple[int, ...]) -> dict[str, Any]:
+            return {
+                'weights': tuple(part.weight.permute(axes).numpy().copy() for part in parts),
+                'biases': tuple(part.bias.numpy().copy() for part in parts),
+            }
+
+        environments, network = self.environments, self.targets[0]
+        strides = *(stride for *_, stride in self.settings.convolutions), 1
+        return policies.Policy(
+            id=environments.row.id,
+            blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
+            actions=tuple(environments.action_map.names),
+            quantity=environments.action_map.quantity,
+            mean=self.mean,
+            std=self.std,
+            clip=CLIP,
+            columns=self.columns,
+            convolution=policies.Convolution(
+                line=self.line, strides=strides, origin=self.origin,
+                **arrays(network.filters, (2, 1, 0)),
+            ),
+            **arrays(nn.ModuleList([*network.hidden, network.last]), (1, 0)),
+            activation='relu',
+            layer_norm=True,
+            log_std=np.full(len(environments.action_map), np.log(ppo.LEAST_STD)),
+            choices=self.choices,
+            info={
+                'seed': self.seed,
+                'samples': self.samples,
+                'character': characters.fingerprint(environments.task.character.row),
+            },
+        )  # fmt: skip
+
+    def evaluate(self) -> dict[str, Any]:
+        """Puts a point on the curve, and returns it."""
+        s, begin = self.settings, time.process_time()
+        result = evaluation.evaluate(
+            self.environments.row, self.exported(), s.evaluation_episodes, ppo.EVALUATION_SEED,
+            self.threads,
+        )  # fmt: skip
+        self.seconds['evaluation'] += time.process_time() - begin
+        point = {name: result[name] for name in ('fraction', 'full', 'distance')}
+        point['median_distance'] = float(np.median(result['distances']))
+        point |= {'samples': self.samples, 'updates': self.updates, 'loss': self.loss}
+        self.curve.append({**point, 'seconds': dict(self.seconds)})
+        return point
+
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes checkpoint, curve and policy."""
+        state = {name: getattr(self, name) for name in _STATE}
+        state |= {name: getattr(self, name).state_dict() for name in _PARTS}
+        state |= {name: getattr(self, name).get_state() for name in ('replay', 'environments')}
+        state |= {'settings': self.settings, 'random': self.random.bit_generator.state}
+        part = folder / '.checkpoint.part'
+        torch.save(state, part)
+        os.replace(part, folder / 'checkpoint.pt')
+        self.write_curve(folder)
+        policies.save(self.exported(), folder / 'last.npz')
+
+    def write_curve(self, folder: pathlib.Path) -> None:
+        """Writes the settings and the curve."""
+        record = {
+            'id': self.environments.row.id, 'seed': self.seed,
+            'settings': dataclasses.asdict(self.settings), 'threads': self.threads,
+            'curve': self.curve,
+        }  # fmt: skip
+        with files.replacing(folder / 'curve.json') as part:
+            part.write_text(json.dumps(record, indent=1))
+
+    def restore(self, folder: pathlib.Path) -> None:
+        """Goes on where `save` was called."""
+        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file of our own
+        before, now = (dataclasses.asdict(each) for each in (state['settings'], self.settings))
+        if {**before, 'samples': 0} != {**now, 'samples': 0}:
+            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        for name in _STATE:
+            setattr(self, name, state[name])
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
+        for name in ('replay', 'environments'):
+            getattr(self, name).set_state(state[name])
+        self.random.bit_generator.state = state['random']
+
+
+def train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int = 0
+) -> list[dict[str, Any]]:
+    """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
+
+    Raises:
+      ValueError: the checkpoint is of other settings; only `samples` may have changed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)
+    learner, s = Learner(id_, seed, settings, threads), settings
+    if (folder / 'checkpoint.pt').exists():
+        learner.restore(folder)
+    with tqdm.tqdm(total=int(s.samples), initial=learner.samples, unit='cycle') as bar:
+        bar.set_description(id_)
+        while learner.samples < s.samples:
+            before = learner.samples
+            learner.advance()
+            bar.update(learner.samples - before)
+            if learner.samples // s.evaluate_every > before // s.evaluate_every:
+                point = learner.evaluate()
+                bar.set_postfix(distance=f'{point["distance"]:.1f} m', loss=f'{point["loss"]:.4f}')
+            if learner.samples // s.write_every > before // s.write_every:
+                learner.save(folder)
+    learner.save(folder)
+    learner.finish()
+    learner.evaluate()
+    learner.write_curve(folder)
+    policies.save(learner.exported(), folder / 'policy.npz')
+    return learner.curve
+
+
+def main() -> None:
+    id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'cycles')
+    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
+        print(f'{point["samples"]:9} {point["distance"]:.1f} m, {point["full"]:.0%} complete')
+    print(folder / 'policy.npz')
+
+
+if __name__ == '__main__':
+    main()

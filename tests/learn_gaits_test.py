@@ -1,0 +1,115 @@
+"""Q-learning over base actions: transitions, retries, the policy that comes out, going on exactly."""
+
+import dataclasses
+import pathlib
+import sys
+import tempfile
+
+import numpy as np
+import torch
+from absl.testing import absltest
+
+from trl_suite import policies
+from trl_suite.vector import VectorEnvironment
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import learn_gaits
+
+HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
+TINY = learn_gaits.Settings(
+    samples=48, num_envs=4, guided=24, begin=16, greedy=0.25, capacity=100, minibatch=8, updates=1,
+    final_updates=2, convolutions=((4, 8, 2),), ground_units=8, hidden=(8, 6), write_every=16,
+    evaluate_every=32, evaluation_episodes=2,
+)  # fmt: skip
+
+
+class LearnTest(absltest.TestCase):
+    def test_transitions_and_retries(self):
+        settings = dataclasses.replace(TINY, guided=1e9, guide_epsilon=1.0, retry=1.0, retries=2)
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        learner.guide = None  # random base actions fall soon
+        tried = []
+        for _ in range(24):
+            learner.collect()
+            tried.append(learner.tried[0].copy())
+        tried = np.array(tried)
+        self.assertEqual(tried.max(), 2)
+        np.testing.assert_array_equal(tried[:, 0], 0)  # this row is greedy
+        replay, waiting = learner.replay, sum(map(len, learner.chains))
+        self.assertEqual(len(replay) + waiting, 24 * 4)  # every cycle begins one
+        discount, reward = replay.discount[: len(replay)], replay.reward[: len(replay)]
+        self.assertSetEqual(set(discount.tolist()), {0.0, float(np.float32(0.95**3))})
+        # A fall has no reward; up to then there is more than that for being up.
+        self.assertTrue((reward[discount > 0] >= 0.5 * (1 + 0.95 + 0.95**2) - 1e-6).all())
+        self.assertIn(0.0, reward[discount == 0])
+        for row, past in enumerate(learner.past):
+            self.assertLessEqual(len(past), settings.back[1] + 1, row)
+
+    def test_a_row_that_goes_back_is_where_it_was(self):
+        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, retry=1.0), 1)
+        seen = []
+        for _ in range(3):
+            seen.append(learner.observation.copy())
+            learner.collect()
+        self.assertLen(learner.past[3], 3)
+        learner.random = np.random.default_rng(0)
+        while not learner.go_back(3):
+            pass
+        left = len(learner.past[3])
+        self.assertLess(left, 2)  # it was the last cycle but one, or but two
+        now = learner.environments.task.observation
+        np.testing.assert_array_equal(now[3], seen[left][3])
+        np.testing.assert_array_equal(now[:3], learner.observation[:3])
+
+    def test_the_oldest_transitions_make_room(self):
+        replay = learn_gaits.Replay(3, 2)
+        for i in range(5):
+            replay.add(np.full(2, i), i, i, 0.5, np.full(2, i + 1))
+        self.assertLen(replay, 3)
+        np.testing.assert_array_equal(replay.action, [3, 4, 2])
+        other = learn_gaits.Replay(3, 2)
+        other.set_state(replay.get_state())
+        self.assertEqual(other.count, 5)
+        for name in ('before', 'after', 'action', 'reward', 'discount'):
+            np.testing.assert_array_equal(getattr(other, name), getattr(replay, name))
+
+    def test_the_policy_chooses_as_the_network_does(self):
+        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+        for _ in range(6):
+            learner.advance()
+        policy = learner.exported()
+        policy.check(learner.environments)
+        observation = learner.replay.before[: len(learner.replay)].astype(float)
+        with torch.no_grad():
+            values = learner.targets[0](learner.seen(observation)).numpy()
+        whole = np.zeros((len(observation), policy.observation_size))
+        whole[:, learner.columns] = observation
+        # Where two are as good, rounding decides.
+        clear = np.diff(np.sort(values, axis=1)[:, -2:])[:, 0] > 1e-4
+        self.assertGreater(clear.sum(), 5)
+        expected = learner.choices[values.argmax(1)]
+        np.testing.assert_allclose(policy(whole)[clear], expected[clear], atol=1e-6)
+
+    def test_a_run_writes_its_policy_and_goes_on_exactly(self):
+        curves = []
+        with tempfile.TemporaryDirectory() as name:
+            folders = [pathlib.Path(name) / each for each in 'ab']
+            for folder, samples in zip(folders, ((48,), (32, 48)), strict=True):
+                for each in samples:
+                    settings = dataclasses.replace(TINY, samples=each)
+                    curve = learn_gaits.train(HOPPER, 1, settings, folder, 1)
+                curves.append([{**point, 'seconds': None} for point in curve])
+            self.assertEqual([point['samples'] for point in curves[0]], [32, 48])
+            self.assertEqual(*curves)
+            for file in ('policy.npz', 'last.npz'):
+                self.assertEqual(*((folder / file).read_bytes() for folder in folders))
+            policy = policies.load(folders[0] / 'policy.npz')
+            policy.check(VectorEnvironment(HOPPER, 1, 1))
+            self.assertEqual(policy.info['samples'], 48)
+            with self.assertRaisesRegex(ValueError, 'other settings'):
+                other = dataclasses.replace(TINY, alive=1.0)
+                learn_gaits.train(HOPPER, 1, other, folders[0], 1)
+
+
+if __name__ == '__main__':
+    absltest.main()
