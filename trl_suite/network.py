@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -241,7 +242,7 @@ class Policy:
         Raises:
           ValueError: an observation of another size, or a missing block.
         """
-        return np.clip(self._output(self._flat(observation)), -1, 1)
+        return _bounded(self._output(self._flat(observation)), 1.0)
 
     def sample(self, observation: Any, random: np.random.Generator) -> np.ndarray:
         """Returns the action with exploration noise, clipped to [-1, 1].
@@ -301,6 +302,11 @@ class Policy:
             )
         return flat
 
+    @functools.cached_property
+    def _scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and deviation as doubles, so that they need not be cast at every call."""
+        return self.mean.astype(float), self.std.astype(float)
+
     def _output(self, flat: np.ndarray) -> np.ndarray:
         seen, left = np.atleast_2d(flat), None
         if self.mirror is not None:
@@ -311,14 +317,14 @@ class Policy:
             seen = seen.take(self.columns, 1)
         if self.convolution is not None:
             seen = self.convolution.relative(seen)
-        x = np.clip((seen - self.mean) / self.std, -self.clip, self.clip)
-        x = x.astype(np.float32, order='C')
+        mean, std = self._scales
+        x = _bounded((seen - mean) / std, self.clip).astype(np.float32, order='C')
         activation = ACTIVATIONS[self.activation]
         if self.convolution is not None:
             x = self.convolution(x, activation)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             # Row by row, so that an action does not depend on how many rows there are.
-            x = np.matmul(x[:, None], weight)[:, 0] + bias
+            x = (x @ weight if len(x) == 1 else np.matmul(x[:, None], weight)[:, 0]) + bias
             if i < len(self.weights) - 1:
                 if self.layer_norm:
                     x = x - x.mean(1, keepdims=True)
@@ -329,6 +335,11 @@ class Policy:
         if self.mirror is not None and left is not None:
             x = self.mirror.answered(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+
+def _bounded(x: np.ndarray, bound: float) -> np.ndarray:
+    """Returns numbers clipped to [-bound, bound]; of few numbers quicker than `numpy.clip`."""
+    return np.minimum(np.maximum(x, -bound), bound)
 
 
 def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -76,12 +76,16 @@ class Mirror:
     def canonical(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns observations as in right stance, and which of them were of left stance."""
         left = self.left(observation)
+        if left.all():
+            return self.observation(observation), left
         if left.any():
             observation = np.where(left[:, None], self.observation(observation), observation)
         return observation, left
 
     def answered(self, action: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Returns actions, those that answer to left stance reflected."""
+        if left.all():
+            return self.action(action)
         if left.any():
             action = np.where(left[:, None], self.action(action), action)
         return action
