@@ -84,6 +84,10 @@ _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
     'past', 'chains',
 )  # fmt: skip
+# Settings that a run may go on with others of.
+_CHANGEABLE = (
+    'samples', 'final_updates', 'final_rate', 'write_every', 'evaluate_every', 'evaluation_episodes',
+)  # fmt: skip
 _PARTS = 'networks', 'targets', 'optimizer'
 
 
@@ -411,8 +415,8 @@ class Learner:
     def restore(self, folder: pathlib.Path) -> None:
         """Goes on where `save` was called."""
         state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file of our own
-        before, now = (dataclasses.asdict(each) for each in (state['settings'], self.settings))
-        if {**before, 'samples': 0} != {**now, 'samples': 0}:
+        same = {name: getattr(self.settings, name) for name in _CHANGEABLE}
+        if dataclasses.replace(state['settings'], **same) != self.settings:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
             setattr(self, name, state[name])
@@ -429,7 +433,8 @@ def train(
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
     Raises:
-      ValueError: the checkpoint is of other settings; only `samples` may have changed.
+      ValueError: the checkpoint is of other settings; only how long it learns, how it ends and how
+        often it writes and evaluates may have changed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
