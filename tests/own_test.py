@@ -20,6 +20,7 @@ from trl_suite import characters, cli, engine, gym, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk import Walk
+from trl_suite.terrain import generators
 from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
@@ -642,6 +643,10 @@ class TaskTest(parameterized.TestCase):
 
 class ExampleTest(Folder):
     """The examples run and are short; so does the page."""
+
+    def setUp(self):
+        super().setUp()
+        self.enterContext(mock.patch.dict(generators._generators))  # they register types
 
     def test_page(self):
         page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')
