@@ -15,9 +15,9 @@ import time
 
 import numpy as np
 
-from trl_suite import catalogue
-from trl_suite.commands import bench
-from trl_suite.controllers import llc
+from trl_suite.cli import bench
+from trl_suite.controllers import footstep_controller as llc
+from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
 HALF_RANGE = 0.1  # of the random plans about action 0, straight on

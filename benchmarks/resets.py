@@ -30,7 +30,7 @@ import tqdm
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.engine import World
 from trl_suite.terrain import Ground, Strip
-from trl_suite.terrain.layout import Layout
+from trl_suite.terrain.spatial.layout import Layout
 from trl_suite.vector import VectorEnvironment
 
 IDS = (

@@ -24,8 +24,8 @@ import multiprocessing
 import os
 import resource
 
-from trl_suite.commands import bench
-from trl_suite.commands.bench import actions, rate, raw, warmed
+from trl_suite.cli import bench
+from trl_suite.cli.bench import actions, rate, raw, warmed
 
 IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',

@@ -19,11 +19,14 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from trl_suite import acting, catalogue, characters, describe, files, policies, suite, terrain
-from trl_suite.characters.muscles import MUSCLES
-from trl_suite.commands import gallery
+from trl_suite import characters, describe, policies, suite, terrain
+from trl_suite.actuation.muscles import MUSCLES
 from trl_suite.describe import common
-from trl_suite.mannequin import Mannequin
+from trl_suite.environments import named_policies as acting
+from trl_suite.registry import catalogue
+from trl_suite.rendering.kinematic_viewer import Mannequin
+from trl_suite.util import files
+from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 FAMILIES = {

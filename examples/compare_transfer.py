@@ -14,7 +14,9 @@ import json
 
 import train_all
 
-from trl_suite import catalogue, evaluation, files, policies, resources
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.util import files, resources
 
 
 def flat_ground(row: catalogue.Row) -> str:

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import files, policies, suite
-from trl_suite.catalogue import Row
+from trl_suite import policies, suite
+from trl_suite.registry.catalogue import Row
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped3D_LLC_General_Step-v0'

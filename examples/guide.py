@@ -15,11 +15,11 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from trl_suite import scripted
-from trl_suite.scripted import CAUTIOUS
-from trl_suite.tasks import rewards
-from trl_suite.tasks.high_level import HighLevel
-from trl_suite.terrain.layout import Trail
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.navigation import scripted
+from trl_suite.tasks.navigation.hierarchical import HighLevel
+from trl_suite.tasks.navigation.scripted import CAUTIOUS
+from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
 REACH, FINE, COARSE = 5.0, 0.125, 2  # m to each side; m between heights; heights between two places

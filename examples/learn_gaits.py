@@ -33,8 +33,9 @@ import torch
 import tqdm
 from torch import nn
 
-from trl_suite import characters, evaluation, files, policies
+from trl_suite import characters, evaluation, policies
 from trl_suite.tasks import gait
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 

@@ -34,9 +34,9 @@ from torch import nn
 from torch.optim import swa_utils
 
 from trl_suite import characters, evaluation, policies, suite
-from trl_suite.catalogue import Row
-from trl_suite.tasks import rewards
-from trl_suite.terrain import spatial_ground
+from trl_suite.registry.catalogue import Row
+from trl_suite.tasks.components import rewards
+from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.vector import VectorEnvironment
 
 TEACHERS = {**evaluation.BASELINES, 'guide': guide}

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import train_all
 
-from trl_suite import catalogue, resources
+from trl_suite.registry import catalogue
+from trl_suite.util import resources
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}

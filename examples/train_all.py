@@ -38,7 +38,9 @@ import ppo_settings
 import search_gaits
 import tqdm
 
-from trl_suite import catalogue, errors, evaluation, files, policies, resources
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.util import errors, files, resources
 
 EPISODES, SEED = 50, 0  # of the published evaluation
 FALL_EPISODES, FALL_STEPS = 200, 5000  # cycles; how far gaits get before they fall

@@ -30,10 +30,10 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
-from trl_suite.catalogue import Row
 from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
+from trl_suite.registry.catalogue import Row
 from trl_suite.tasks.gait import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
+from trl_suite.util import errors
 from trl_suite.vector import VectorEnvironment
 
 START_NOISE = 0.01  # rad, of the joints; see `GaitTask`

@@ -7,8 +7,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
-from trl_suite import actuation, characters, motion, resources, suite
-from trl_suite.tasks import imitation
+from trl_suite import actuation, characters, motion, suite
+from trl_suite.tasks.imitation import planar as imitation
+from trl_suite.util import resources
 
 TIMESTEP = 1 / 300  # s
 MUSCLES = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}

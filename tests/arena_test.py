@@ -5,10 +5,11 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import mjcf
 
-from trl_suite import catalogue, suite, terrain
+from trl_suite import suite, terrain
 from trl_suite.arenas import PlanarTerrain, boxes
 from trl_suite.engine import PhysicsWorld
-from trl_suite.terrain import planar_ground
+from trl_suite.registry import catalogue
+from trl_suite.terrain.planar import windows as planar_ground
 
 TIMESTEP = 1 / 300  # s
 GRAVITY = 9.8  # m/s^2; the original's

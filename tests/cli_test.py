@@ -16,10 +16,13 @@ import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, scripted, suite
-from trl_suite.commands import list as listing
-from trl_suite.commands import rollout
+from trl_suite import cli, evaluation, policies, rendering, suite
+from trl_suite.cli import list as listing
+from trl_suite.cli import rollout
+from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import GaitTask
+from trl_suite.tasks.navigation import scripted
+from trl_suite.util import resources
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SIZE = ('--size', '160x120')

@@ -10,8 +10,11 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from PIL import Image
 
-from trl_suite import acting, catalogue, characters, motion, policies, suite, terrain
-from trl_suite.commands import bench, doctor, gallery, machine
+from trl_suite import characters, motion, policies, suite, terrain
+from trl_suite.cli import bench, doctor, machine
+from trl_suite.environments import named_policies as acting
+from trl_suite.registry import catalogue
+from trl_suite.viewing import gallery
 
 GAPS = cli_test.GAPS
 CommandTest, run = cli_test.CommandTest, cli_test.run

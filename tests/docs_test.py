@@ -6,8 +6,9 @@ import re
 
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, describe, suite
+from trl_suite import describe, suite
 from trl_suite.describe import options
+from trl_suite.registry import build, catalogue
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -90,11 +91,11 @@ class WordsTest(parameterized.TestCase):
         self.assertIn('at the origin', told['Start'])
 
     def test_every_option_is_explained(self):
-        known = {name for row in catalogue.ROWS for name in suite.task_options(row)}
-        known |= set(suite.task_options(suite.combine('dog', task='walk')))
+        known = {name for row in catalogue.ROWS for name in build.task_options(row)}
+        known |= set(build.task_options(suite.combine('dog', task='walk')))
         self.assertEqual(known - {'interface'}, set(options.MEANINGS))
         row = suite.find('PD_Biped3D_HLC_Forest-v0')
-        table = options.options(row, suite.task_options(row)).parts[0]
+        table = options.options(row, build.task_options(row)).parts[0]
         meanings = {name: (default, meaning) for name, default, meaning in table.cells}
         self.assertIn('frame', meanings['interface'][1])
         self.assertEqual(meanings['step_limit'][0], 400)

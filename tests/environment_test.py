@@ -1,4 +1,4 @@
-"""Tests of trl_suite.environment, over every environment of the catalogue."""
+"""Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
 import dm_env
 import numpy as np
@@ -10,8 +10,8 @@ from helpers import links_on_ground
 
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain
-from trl_suite.environment import Environment
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.imitation.planar import Imitation
 
 # Links and joints of each figure; muscles where it has any.
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
@@ -267,7 +267,8 @@ def every_row(id_):
                     with (
                         self.subTest(str(options)),
                         self.assertRaisesRegex(
-                            RuntimeError, 'trl_suite.environment.Environment, not.*composer'
+                            RuntimeError,
+                            'trl_suite.environments.environment.Environment, not.*composer',
                         ),
                     ):
                         environment.step(np.zeros(len(task.action_map)))

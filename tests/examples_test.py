@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, characters, policies
+from trl_suite import characters, policies
+from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))

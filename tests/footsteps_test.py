@@ -21,8 +21,8 @@ from helpers import (
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite, terrain
-from trl_suite.tasks import rewards
-from trl_suite.tasks.plans import Plans, Pushes
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.plans import Plans, Pushes
 from trl_suite.vector import VectorEnvironment
 
 GENERAL, MIRRORED = 'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'

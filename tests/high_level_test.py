@@ -24,8 +24,9 @@ from helpers import (
     heading_of,
 )
 
-from trl_suite import evaluation, policies, rendering, scripted, suite
-from trl_suite.controllers import llc
+from trl_suite import evaluation, policies, rendering, suite
+from trl_suite.controllers import footstep_controller as llc
+from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'

@@ -15,7 +15,7 @@ from helpers import (
 )
 
 from trl_suite import motion, suite, terrain
-from trl_suite.tasks import rewards
+from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 PLANE, HILLS = 'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills-v0'

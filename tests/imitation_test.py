@@ -6,9 +6,9 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain
-from trl_suite.environment import Environment
-from trl_suite.tasks import rewards
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.imitation.planar import Imitation
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.

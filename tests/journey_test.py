@@ -4,7 +4,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.tasks import rewards
+from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 TRAIL, FOREST, BLOCKS, MOVERS, SOCCER = (

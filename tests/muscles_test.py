@@ -7,8 +7,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
-from trl_suite import actuation, characters, hill, suite
-from trl_suite.characters import muscles
+from trl_suite import actuation, characters, suite
+from trl_suite.actuation import hill, muscles
 
 TIMESTEP = 1 / 300  # s
 ISOMETRIC_ERROR = 0.05  # peak forces; largest error of the active force-length curve

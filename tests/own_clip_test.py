@@ -12,9 +12,10 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from scipy.spatial.transform import Rotation
 
-from trl_suite import clip_check, motion, retargeting, suite
-from trl_suite.mannequin import Mannequin
+from trl_suite import motion, retargeting, suite
 from trl_suite.motion import quaternion
+from trl_suite.rendering.kinematic_viewer import Mannequin
+from trl_suite.retargeting import clip_check
 
 FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # ours from a file with y up, z forward
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'

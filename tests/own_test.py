@@ -20,7 +20,7 @@ from trl_suite import characters, cli, engine, gym, motion, suite, terrain
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk import Walk
-from trl_suite.terrain import generators
+from trl_suite.terrain.planar import generators
 from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'

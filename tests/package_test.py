@@ -165,7 +165,8 @@ class WheelTest(absltest.TestCase):
             import pathlib
             import numpy as np
             import trl_suite
-            from trl_suite import motion, resources, suite
+            from trl_suite import motion, suite
+            from trl_suite.util import resources
             print(pathlib.Path(trl_suite.__file__).resolve())
             print(resources.directory('xml').resolve())
             print(resources.directory('mocap').resolve())

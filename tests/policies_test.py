@@ -18,7 +18,10 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 import trl_suite
-from trl_suite import catalogue, motion, policies, resources, suite
+from trl_suite import motion, policies, suite
+from trl_suite.policies import files
+from trl_suite.registry import catalogue
+from trl_suite.util import resources
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -358,7 +361,7 @@ class FileTest(FolderTest):
         )  # fmt: skip
         policies.save(policy, self.folder / 'p.npz')
         again = policies.load(self.folder / 'p.npz')
-        for name in policies._OPTIONAL:
+        for name in files._OPTIONAL:
             np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
             self.assertRegex(policies.__doc__, rf'\n    {name}\b')
 
@@ -375,7 +378,7 @@ class FileTest(FolderTest):
         np.testing.assert_array_equal(again(observations), policy(observations))
         policies.save(again, self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
-        for name in (*policies._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
+        for name in (*files._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
             self.assertRegex(policies.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(
@@ -404,11 +407,11 @@ class FileTest(FolderTest):
         policies.save(make(), self.folder / 'p.npz')
         with np.load(self.folder / 'p.npz', allow_pickle=False) as data:
             arrays = dict(data)
-        for name in policies._FIELDS:
+        for name in files._FIELDS:
             self.assertRegex(policies.__doc__, rf'\n    (\w+, )?{name}\b')
         self.assertCountEqual(
             arrays,
-            {*policies._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
+            {*files._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
         )
         self.assertEqual((str(arrays['format']), int(arrays['version'])), ('trl_suite policy', 1))
         self.assertEqual(json.loads(str(arrays['info'])), make().info)

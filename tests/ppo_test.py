@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, evaluation, policies
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import ppo

@@ -18,8 +18,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from trl_suite import suite
+from trl_suite.adapters.stable_baselines import SuiteVecEnv
 from trl_suite.gym import SuiteEnv
-from trl_suite.stable_baselines import SuiteVecEnv
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'

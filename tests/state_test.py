@@ -13,8 +13,8 @@ from absl.testing import absltest, parameterized
 from trl_suite import motion, suite
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import make
-from trl_suite.environment import Environment
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.imitation.planar import Imitation
 from trl_suite.terrain import load
 
 EXAMPLES = (

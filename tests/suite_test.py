@@ -10,7 +10,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 import trl_suite
-from trl_suite import catalogue, characters, motion, resources, suite, terrain
+from trl_suite import characters, motion, suite, terrain
+from trl_suite.registry import catalogue
+from trl_suite.util import resources
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 # The planar ids of tracking that the original registers: 21 of PLAiD and 9 of Imitation.

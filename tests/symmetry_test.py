@@ -7,9 +7,10 @@ import tempfile
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import policies, scripted, suite
-from trl_suite.symmetry import Mirror, blocks, exchanged
-from trl_suite.tasks.imitation3d import joint_targets
+from trl_suite import policies, suite
+from trl_suite.policies.mirror import Mirror, blocks, exchanged
+from trl_suite.tasks.imitation.spatial import joint_targets
+from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 
 SOCCER = 'PD_Biped3D_HLC_Soccer-v0'

@@ -11,7 +11,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain import noise, spatial, spatial_ground
+from trl_suite.terrain.spatial import generators as spatial
+from trl_suite.terrain.spatial import noise
+from trl_suite.terrain.spatial import windows as spatial_ground
 
 GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
 BOXED = ('blocks3d', 'pillars3d', 'path3d', 'path3d_wide', 'ramp3d', 'stairs3d')

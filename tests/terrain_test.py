@@ -13,7 +13,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain import generators
+from trl_suite.terrain.planar import generators
 
 # The example printed in the paper.
 PAPER = """

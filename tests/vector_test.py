@@ -11,7 +11,8 @@ import numpy as np
 from absl.testing import parameterized
 from helpers import assert_rows_are_singles
 
-from trl_suite import catalogue, suite
+from trl_suite import suite
+from trl_suite.registry import catalogue
 from trl_suite.vector import AUTORESET, VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'

@@ -10,8 +10,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.commands import view
-from trl_suite.environment import Environment
+from trl_suite.cli import view
+from trl_suite.environments.environment import Environment
 
 GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
@@ -20,7 +20,7 @@ FRAME = 1 / 30  # s
 
 with warnings.catch_warnings():  # GLFW's, where there is no screen
     warnings.simplefilter('ignore')
-    window = importlib.import_module('trl_suite.commands.window')
+    window = importlib.import_module('trl_suite.viewing.window')
 
 
 class CommandTest(cli_test.CommandTest):

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.catalogue import Row
+from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
-from trl_suite.scripted import scripted
-from trl_suite.vector import VectorEnvironment
+from trl_suite.registry.catalogue import Row
+from trl_suite.tasks.navigation.scripted import scripted
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 CHUNK = 256  # episodes that run side by side

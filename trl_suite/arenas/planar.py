@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import boxes, stage
+from trl_suite.arenas import boxes
+from trl_suite.arenas import scene as stage
 from trl_suite.arenas.boxes import Boxes
-from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
-from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain, planar_ground
-from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.windows import PlanarGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid

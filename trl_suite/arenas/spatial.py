@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import stage
-from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas import scene as stage
+from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
-from trl_suite.terrain.ground import Random
-from trl_suite.terrain.spatial_ground import HALF, VERTICES, SpatialGround, keep_moving
-from trl_suite.terrain.surroundings import ALL, Rows
+from trl_suite.terrain.spatial.ground import Random
+from trl_suite.terrain.spatial.surroundings import ALL, Rows
+from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialGround, keep_moving
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from trl_suite import errors
-from trl_suite.characters.character import (
-    Character,
-    CharacterRow,
-    Joint,
-    body_figures,
-    fingerprint,
-)
-from trl_suite.characters.own import from_file
-from trl_suite.characters.rows import CHARACTERS
+from trl_suite.characters.character import Character, CharacterRow, Joint, body_figures, fingerprint
+from trl_suite.characters.from_file import from_file
+from trl_suite.characters.specs import CHARACTERS
+from trl_suite.util import errors
 
 __all__ = (
     'CHARACTERS',

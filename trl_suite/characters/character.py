@@ -12,7 +12,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
-from trl_suite import resources
+from trl_suite.util import resources
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is drawn
 DIGITS = 6  # to which a fingerprint looks

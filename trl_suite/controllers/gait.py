@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
 from trl_suite.characters import Character
 from trl_suite.controllers import dynamics, gaits, parameters
 from trl_suite.controllers.dynamics import Mechanics
@@ -27,6 +26,7 @@ from trl_suite.controllers.machine import STATES, GaitRules, GaitState, Machine,
 from trl_suite.controllers.parameters import KINDS, Parameters
 from trl_suite.engine import World
 from trl_suite.kinematics.planar import PlanarState
+from trl_suite.util import errors
 from trl_suite.util.compiled import packed
 
 _LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift carries, beside the root

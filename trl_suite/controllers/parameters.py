@@ -43,7 +43,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
+from trl_suite.util import errors
 
 KINDS = ('bound', 'stride', 'hop')
 REWARD = {'speed': 0.8, 'stumble': 0.2}

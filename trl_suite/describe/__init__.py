@@ -16,13 +16,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from trl_suite import catalogue
 from trl_suite.describe import layout
 from trl_suite.describe.differences import differences_of
 from trl_suite.describe.layout import Section, Table, escape, markdown, markdown_table, table
+from trl_suite.registry import catalogue
 
 if TYPE_CHECKING:
-    from trl_suite.environment import Environment
+    from trl_suite.environments.environment import Environment
 
 __all__ = [
     'Section', 'Table', 'differences_of', 'escape', 'markdown', 'markdown_table', 'parts', 'sections',
@@ -48,11 +48,11 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
       environment: built from it, or from a row that differs by its terrain only.
     """
     # They import the engine, which the tables of the command line do without.
-    from trl_suite import suite
     from trl_suite.describe import common, gait, high_level, options, planar, spatial
+    from trl_suite.registry.build import task_options
     from trl_suite.tasks.gait import GaitTask
-    from trl_suite.tasks.high_level import HighLevel
-    from trl_suite.tasks.imitation import Imitation
+    from trl_suite.tasks.imitation.planar import Imitation
+    from trl_suite.tasks.navigation.hierarchical import HighLevel
     from trl_suite.tasks.spatial_task import SpatialTask
 
     families = (
@@ -64,7 +64,7 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
         yield common.observation(environment, planar.blocks(task))
         yield common.action(environment)
         yield common.time(row, task)
-        yield options.options(row, suite.task_options(row))
+        yield options.options(row, task_options(row))
         return
     yield from common.character(environment)
     yield from family.before(task)
@@ -74,4 +74,4 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
     yield common.ground(row)
     yield from family.rules(row, task)
     yield family.time(row, task)
-    yield options.options(row, suite.task_options(row))
+    yield options.options(row, task_options(row))

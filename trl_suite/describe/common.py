@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, characters, terrain
+from trl_suite import characters, terrain
 from trl_suite.describe.layout import Section, Table, section
-from trl_suite.environment import Environment
-from trl_suite.tasks import rewards
+from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
+from trl_suite.tasks.components import rewards
 from trl_suite.tasks.spatial_task import SpatialTask
 
 Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks

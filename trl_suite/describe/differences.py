@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from trl_suite import catalogue
+from trl_suite.registry import catalogue
 
 _CLIP, _GAIT, _SPATIAL, _CLIP3D, _STEPS, _HIGH, _HARD = (
     lambda row: row.rules in ('imitation', 'footsteps2d'), lambda row: row.rules == 'gait',

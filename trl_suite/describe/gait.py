@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue
 from trl_suite.describe.common import Meanings, floats
 from trl_suite.describe.layout import Section, Table, section
-from trl_suite.environment import Environment
+from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
 from trl_suite.tasks import gait
 
 _BLOCKS = {

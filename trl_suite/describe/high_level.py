@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite import catalogue
 from trl_suite.describe import spatial
 from trl_suite.describe.common import Meanings, floats
 from trl_suite.describe.gait import looks_until_fall, running_share
 from trl_suite.describe.layout import Section, Table, section
 from trl_suite.describe.spatial import after, before
-from trl_suite.environment import Environment
-from trl_suite.tasks import high_level
+from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
+from trl_suite.tasks.navigation import hierarchical as high_level
 
 __all__ = ['action', 'after', 'before', 'blocks', 'rules', 'time']
 

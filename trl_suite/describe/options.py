@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite import catalogue
 from trl_suite.describe.layout import Section, Table, section
+from trl_suite.registry import catalogue
 
 MEANINGS = {
     'blend': "which of the terrain's parameter sets to draw from; 0 is the first, 0.5 half-way to the second",
@@ -23,8 +23,8 @@ MEANINGS = {
     'hidden_plan': "observe a goal instead of the plan, as the original's 'Hard' environments do",
     'miss': 'm; a foot that lands farther from its place ends the episode; by default it does not',
     'muscle_set': "'plain', or the motion that the muscles were optimised for",
-    'plans': 'how footstep plans are drawn: a mapping, see trl_suite.tasks.plans; by default as told above',
-    'pushes': 'forces on the torso: a mapping, see trl_suite.tasks.plans; by default there are none',
+    'plans': 'how footstep plans are drawn: a mapping, see trl_suite.tasks.components.plans; by default as told above',
+    'pushes': 'forces on the torso: a mapping, see trl_suite.tasks.components.plans; by default there are none',
     'reward': "'goal', or 'original': what the original computes",
     'sight': "maps that are observed, of 'height' and 'velocity'",
     'spawn': "where planar ground begins: as 'intended', or 'upstream', as the original builds it",

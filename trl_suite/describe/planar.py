@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from trl_suite import catalogue
 from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, section
 from trl_suite.describe.spatial import BLOCKS, REWARD, plan, span
-from trl_suite.tasks.footsteps2d import PlanarFootsteps
+from trl_suite.registry import catalogue
+from trl_suite.tasks.footsteps.planar import PlanarFootsteps
 
 __all__ = ['action', 'after', 'before', 'blocks', 'rules', 'time']
 

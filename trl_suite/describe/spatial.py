@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, terrain
+from trl_suite import terrain
 from trl_suite.describe.common import Meanings, action, time, tracking_terms
 from trl_suite.describe.layout import Section, Table, section
-from trl_suite.tasks import ball, goals, journey
-from trl_suite.terrain import Ground, ground
-from trl_suite.terrain.layout import Layout
+from trl_suite.registry import catalogue
+from trl_suite.tasks.components import ball, goals
+from trl_suite.tasks.navigation import direct as journey
+from trl_suite.terrain import Ground
+from trl_suite.terrain.spatial import ground
+from trl_suite.terrain.spatial.layout import Layout
 
 __all__ = ['BLOCKS', 'action', 'after', 'before', 'blocks', 'rules', 'time']
 

@@ -10,8 +10,8 @@ import numpy as np
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.terrain import planar_ground
-from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.windows import PlanarGround
 from trl_suite.util.compiled import compiled
 
 CLEARANCE = 0.001  # m; left under every link at the start

@@ -17,8 +17,8 @@ from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.engine.native import Engine
 from trl_suite.motion import quaternion
-from trl_suite.terrain import spatial_ground
-from trl_suite.terrain.spatial_ground import SAMPLES, SpatialGround, see_movers
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SAMPLES, SpatialGround, see_movers
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
 CLEARANCE = 0.001  # m; left under every link at the start

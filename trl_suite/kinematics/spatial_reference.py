@@ -22,7 +22,7 @@ from trl_suite.kinematics.spatial import (
     measurement,
 )
 from trl_suite.motion import Clip, Steps, quaternion
-from trl_suite.terrain import spatial_ground
+from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util.compiled import compiled_inline, packed
 
 CYCLE_SAMPLES = 256  # of a looping clip

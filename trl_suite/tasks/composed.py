@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite import errors
 from trl_suite.engine import World
 from trl_suite.tasks.task import Task, consecutive, outcome
+from trl_suite.util import errors
 
 Function = Callable[[Any], np.ndarray]
 OPTIONS = ('rewards', 'observations', 'failures')

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite import actuation, errors
-from trl_suite.action_map import ActionMap
+from trl_suite import actuation
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, gaits
@@ -41,7 +41,8 @@ from trl_suite.tasks.task import (
     too_fast,
 )
 from trl_suite.terrain import Strip
-from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain.planar.windows import PlanarGround
+from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite import actuation, errors
-from trl_suite.action_map import Drive, drive
+from trl_suite import actuation
+from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.arenas import SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
@@ -24,8 +24,8 @@ from trl_suite.kinematics.spatial import (
 from trl_suite.kinematics.spatial import measure as measure_body
 from trl_suite.kinematics.spatial_reference import mean_targets
 from trl_suite.motion import Clip, Steps
-from trl_suite.symmetry import Mirror
-from trl_suite.tasks import reflection3d
+from trl_suite.policies.mirror import Mirror
+from trl_suite.tasks.components import reflection as reflection3d
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -36,8 +36,10 @@ from trl_suite.tasks.task import (
     start_phases,
     too_fast,
 )
-from trl_suite.terrain import Ground, spatial_ground
-from trl_suite.terrain.spatial_ground import SpatialGround
+from trl_suite.terrain import Ground
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SpatialGround
+from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop
 
 CONTROL_TIMESTEP = 1 / 30  # s

@@ -14,7 +14,7 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from trl_suite.action_map import ActionMap
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.util.compiled import compiled
 
@@ -300,7 +300,7 @@ def check_simulated(lasted: np.ndarray) -> None:
     if not lasted.all():
         raise RuntimeError(
             'a task whose steps are long runs their physics by itself: step it by '
-            'trl_suite.environment.Environment, not by a plain composer.Environment'
+            'trl_suite.environments.environment.Environment, not by a plain composer.Environment'
         )
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite import actuation
-from trl_suite.action_map import Drive, drive
+from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
@@ -34,7 +34,7 @@ from trl_suite.kinematics.spatial import (
 )
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
+from trl_suite.tasks.imitation.planar import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -45,9 +45,10 @@ from trl_suite.tasks.task import (
     outcome,
     too_fast,
 )
-from trl_suite.terrain import Ground, Strip, spatial_ground
-from trl_suite.terrain.planar_ground import PlanarGround
-from trl_suite.terrain.spatial_ground import SpatialGround
+from trl_suite.terrain import Ground, Strip
+from trl_suite.terrain.planar.windows import PlanarGround
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 SAMPLES = 50  # heights on the line that a planar character sees

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.files import check_path, replacing
-from trl_suite.terrain.generators import SPACING
-from trl_suite.terrain.ground import Ground
-from trl_suite.terrain.layout import GRID, Boxes
-from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.planar.generators import SPACING
+from trl_suite.terrain.planar.ground import Strip
+from trl_suite.terrain.spatial.ground import Ground
+from trl_suite.terrain.spatial.layout import GRID, Boxes
 from trl_suite.terrain.surface import Y_UP, library
+from trl_suite.util.files import check_path, replacing
 
 if TYPE_CHECKING:
     import trimesh

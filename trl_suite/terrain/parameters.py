@@ -46,11 +46,11 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.errors import unknown
-from trl_suite.files import existing
-from trl_suite.terrain.generators import GENERATORS, check
-from trl_suite.terrain.layout import GRID
-from trl_suite.terrain.spatial import GENERATORS3D
+from trl_suite.terrain.planar.generators import GENERATORS, check
+from trl_suite.terrain.spatial.generators import GENERATORS3D
+from trl_suite.terrain.spatial.layout import GRID
+from trl_suite.util.errors import unknown
+from trl_suite.util.files import existing
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
 

@@ -1,0 +1,25 @@
+"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps."""
+
+from typing import TYPE_CHECKING
+
+from trl_suite.rendering.frames import frame, frames, markers, no_gl, watching
+from trl_suite.rendering.pictures import (
+    CONTROL_FPS,
+    IMAGE_SUFFIXES,
+    STRIP_MARGIN,
+    VIDEO_SUFFIXES,
+    Video,
+    film_strip,
+    height_map,
+    plot_terrain,
+    spread,
+    video,
+)
+
+if TYPE_CHECKING:
+    from trl_suite.rendering.frames import Policy as Policy
+
+__all__ = [
+    'CONTROL_FPS', 'IMAGE_SUFFIXES', 'STRIP_MARGIN', 'VIDEO_SUFFIXES', 'Video', 'film_strip', 'frame',
+    'frames', 'height_map', 'markers', 'no_gl', 'plot_terrain', 'spread', 'video', 'watching',
+]  # fmt: skip

@@ -1,0 +1,1 @@
+"""Tasks that walk along planned footsteps."""

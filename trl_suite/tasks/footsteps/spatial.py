@@ -1,0 +1,648 @@
+"""Walking where the feet are told to go: the footstep-tracking low-level controllers.
+
+Source: the step scenario of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import SpatialTerrain
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import SpatialMeasurement, polar
+from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
+from trl_suite.motion import Steps, quaternion, step_features
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.comparison import (
+    Comparison,
+    com_error,
+    comparison,
+    height_error,
+    pose_error,
+    rate_error,
+    term,
+)
+from trl_suite.tasks.components.footstep_plan import (
+    CONTACT_SIZE,
+    LEFT,
+    PLAN_SIZE,
+    RIGHT,
+    SIDE,
+    FootstepPlan,
+    footstep_plan,
+    observe_plan,
+    plan_markers,
+    plan_mirror,
+    update_stance,
+)
+from trl_suite.tasks.components.goals import GOAL_COLOUR, flag
+from trl_suite.tasks.components.plans import ROOT_TURN_LIMIT, Plans, Pushes, options
+from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.spatial_task import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    SpatialRules,
+    SpatialTask,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    publish,
+    tick,
+)
+from trl_suite.tasks.task import Marker, conclude, consecutive
+from trl_suite.util.compiled import compiled, compiled_loop, packed
+
+NEAR_GOAL = 0.1  # m; nearer a goal gives no direction
+GOAL_REACHED = 1.0  # m; a goal is drawn anew there
+TYPICAL_POSES = 31  # of a step, whose mean is the middle of position control
+HIDDEN = ('contact', 'plan')  # blocks of a hidden plan
+
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING = range(len(rewards.STEP_TERMS))
+
+
+class FootstepState(NamedTuple):
+    """What the task knows beside the plan, (n, ...).
+
+    Attributes:
+      length, width: of the current steps, m.
+      track: of the reference.
+      turned: by which the reference is turned, rad.
+      shift: where the origin of its track is, (n, 2) m.
+      goal: (n, 3) m.
+      push: force on the torso, (n, 3) N.
+      push_end, push_begin: control steps of an episode at which the push ends and the next begins.
+      excused: control step of an episode until which no foot misses.
+      missed: whether a foot landed too far from its place in the last step.
+    """
+
+    length: np.ndarray
+    width: np.ndarray
+    track: np.ndarray
+    turned: np.ndarray
+    shift: np.ndarray
+    goal: np.ndarray
+    push: np.ndarray
+    push_end: np.ndarray
+    push_begin: np.ndarray
+    excused: np.ndarray
+    missed: np.ndarray
+
+
+class FootstepRules(NamedTuple):
+    """All that the rules of footsteps work on.
+
+    Attributes:
+      contact, plan_block: where these blocks begin in the full observation.
+      goal_block: where the goal is seen; -1: it is not.
+      footstep_scales, heading_scale: of errors in the reward.
+      largest_miss: of a foot that lands, m.
+    """
+
+    common: SpatialRules
+    comparison: Comparison
+    plan: FootstepPlan
+    state: FootstepState
+    contact: int
+    plan_block: int
+    goal_block: int
+    footstep_scales: np.ndarray
+    heading_scale: float
+    largest_miss: float
+
+
+# A step of simulation i: `land`, the next plan where stance switches, `finish`.
+
+
+@compiled
+def land(i: int, rules: FootstepRules) -> bool:
+    """Measures the body and looks at what has landed; returns whether it wants another plan."""
+    common, plan, state = rules.common, rules.plan, rules.state
+    tick(i, common)
+    plan.landed[i] = state.missed[i] = False
+    if breaks_down(i, common):
+        return False
+    measure(i, common)
+    plan.landed[i] = update_stance(i, common.clock.phase[i], common.found, plan)
+    if plan.landed[i] and plan.landing_error[i] > rules.largest_miss:
+        state.missed[i] = common.clock.steps[i] > state.excused[i]
+    return plan.landed[i]
+
+
+@compiled
+def finish(i: int, rules: FootstepRules) -> None:
+    """Reward, failure and observation."""
+    outcome = rules.common.outcome
+    if outcome.diverged[i]:  # the last finite observation stands
+        conclude(i, True, outcome)
+        return
+    compare(i, rules)
+    conclude(i, rules.common.found.fallen[i] or rules.state.missed[i], outcome)
+    observe(i, rules)
+
+
+@compiled
+def step_phase(phase: float) -> float:
+    """Share of the single step that has passed, of the phase of two."""
+    return 2 * phase - np.floor(2 * phase)
+
+
+@compiled
+def compare(i: int, rules: FootstepRules) -> None:
+    """Writes the reward terms: the reference's pose and motion, and where and how feet land."""
+    common, plan, by = rules.common, rules.plan, rules.comparison
+    found, terms, state = common.found, common.outcome.reward_terms, rules.state
+    share = step_phase(common.clock.phase[i])
+    row, rest = moment(share, state.track[i], by.tracks)
+    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
+    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    # The reference heads where the character did when it was put there.
+    terms[i, COM] = term(COM, com_error(i, row, rest, state.turned[i], by, found), by)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+
+    swing, late = 1 - plan.stance[i], share > 0.5
+    feet = step = 0.0
+    for foot in range(2):
+        for k in range(3):
+            # In the second half the plan takes the place of the reference.
+            if not (late and foot == swing and k < 2):
+                column = by.effectors + 3 * foot + k
+                off = found.features[i, column] - feature(row, rest, column, by.tracks)
+                feet += off * off
+    if late:
+        for k in range(3):
+            off = plan.landing[i, 0, k] - found.feet[i, swing, k]
+            if k == 2:
+                off += feature(row, rest, by.effectors + 3 * swing + 2, by.tracks)
+            step += off * off
+    end = 0.0
+    for scale in rules.footstep_scales:
+        end += term(END_EFFECTOR, feet + scale * step, by)
+    terms[i, END_EFFECTOR] = end / len(rules.footstep_scales)
+    off = abs(rewards.wrapped(plan.heading[i] - found.heading[i]))
+    facing = rewards.facing(min(rules.heading_scale * off, math.pi))
+    terms[i, HEADING] = by.term_weights[HEADING] * facing
+
+
+@compiled
+def observe(i: int, rules: FootstepRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observe_body(i, common)
+    observe_plan(i, rules.contact, rules.plan_block, found, rules.plan, common.full)
+    if rules.goal_block >= 0:
+        x = rules.state.goal[i, 0] - found.root[i, 0]
+        y = rules.state.goal[i, 1] - found.root[i, 1]
+        bearing, distance = polar(i, x, y, found)
+        common.full[i, rules.goal_block] = bearing
+        common.full[i, rules.goal_block + 1] = distance
+    publish(i, common)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def land_all(env_ids: np.ndarray, rules: FootstepRules) -> int:
+    """Looks at what has landed; returns how many want another plan."""
+    switched = 0
+    for i in env_ids:
+        switched += land(i, rules)
+    return switched
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
+    """Observes, and compares as if a step had been taken."""
+    for i in env_ids:
+        measure(i, rules.common)
+        compare(i, rules)
+        observe(i, rules)
+
+
+class Footsteps(SpatialTask):
+    """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
+
+    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
+    left, z up), N = 8: 125 numbers:
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. The right foot stands below 0.5.
+      contact: whether right and left foot touch the ground; 2.
+      plan: where the first step lands as seen from the right foot, zero while that one stands, and
+        from the left foot, zero while that one does; where the second lands as seen from the right
+        foot, zero unless that one stands, and from the left foot; (x, y, z) each, z from the ground
+        under the root; then the planned heading, rad to the left of the present one; 13.
+    Mirrored, 117 numbers: all of it reflected in left stance, actions too; the phase is that of the
+    single step, with the one-hot of its half (3), and the plan (7) has the heading first, then the
+    first landing place as seen from the swing foot, then the second from the stance foot.
+    """
+
+    TERMS = rewards.STEP_TERMS
+    ABOUT = 'root'
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialTerrain,
+        steps: Steps,
+        *,
+        actuation_model: str = 'position',
+        plans: Plans | Mapping[str, Any] | None = None,
+        goal: bool = False,
+        pushes: Pushes | Mapping[str, Any] | None = None,
+        miss: float | None = None,
+        grace: float = 0.0,
+        footstep_scale: float | Sequence[float] = 1.0,
+        heading_scale: float = 1.0,
+        terrain_map: bool = False,
+        mirrored: bool = False,
+        substeps: int = SUBSTEPS,
+        centre: str = 'clip',
+        half_range: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
+        blend: float = 0.0,
+        hidden_plan: bool = False,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: where it moves.
+          steps: library of single steps of this character; the clock has the period of two.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+          plans: how plans are drawn; or keyword arguments of `Plans`.
+          pushes: forces on the torso; or keyword arguments of `Pushes`. None without.
+          goal: plans head for a goal on the terrain instead, one after the other.
+          miss: an episode fails where a foot lands farther than this from its place, m. The original
+            meant to fail at 1 m and does not.
+          grace: s after a push or a sharp turn in which no foot misses its place.
+          footstep_scale: times the squared distance between swing foot and landing place in the
+            reward; more than 1 teaches accuracy sooner. Of several, the mean of their rewards counts:
+            a small one reaches far, a large one is accurate.
+          heading_scale: the same of the error of the heading.
+          terrain_map, mirrored, substeps, centre, half_range, start_phase, blend: as for
+            `SpatialImitation`; the middle of position control is the mean pose of a straight step.
+          hidden_plan: observe bearing (rad) and distance (m) of a goal that stays where it is, in a
+            block goal, instead of contact and plan, which the reward is still about: what the
+            original's 'Hard' environments do.
+
+        Raises:
+          ValueError: options out of range, or steps that do not fit the character.
+        """
+        if len(character.row.end_effectors) != 2:
+            raise ValueError(f'character {character.row.name!r} has no two feet to place')
+        if miss is not None and not 0 < miss < np.inf:
+            raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
+        if not 0 <= grace < np.inf:
+            raise ValueError(f'grace is {grace}; expected seconds, 0 or more')
+        for name, given in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
+            scales = np.atleast_1d(given)
+            if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
+                raise ValueError(f'{name} is {given}; expected 0 or more')
+        self._footstep_scales = np.atleast_1d(footstep_scale).astype(float)
+        self._heading_scale = float(heading_scale)
+        self.plans = options(Plans, 'plans', {} if plans is None else plans)
+        self.pushes = None if pushes is None else options(Pushes, 'pushes', pushes)
+        self.steps, self.period = steps, 2 * steps.duration
+        self.goal_given, self.hidden_plan = goal, hidden_plan
+        self.miss = miss
+        self._largest_miss = np.inf if miss is None else float(miss)
+        self._grace = round(grace / CONTROL_TIMESTEP)
+        # The straight step of about the planned length, from which episodes start.
+        self._first = straight_step(steps, float(np.mean(self.plans.length)))
+        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * hidden_plan}
+        super().__init__(
+            character, arena, steps, actuation_model=actuation_model, substeps=substeps,
+            centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
+            mirrored=mirrored, blend=blend, extras=extras,
+        )  # fmt: skip
+        if hidden_plan:
+            if mirrored:
+                raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+            self._hide_plan()
+
+    def _hide_plan(self) -> None:
+        """Leaves the plan out of what is observed."""
+        names = [name for name in self._full if name not in HIDDEN]
+        self.blocks = consecutive({
+            name: self._full[name].stop - self._full[name].start for name in names
+        })  # fmt: skip
+        kept = self._kept = np.concatenate([np.r_[self._full[name]] for name in names])
+        if self.mirror is None:
+            return
+        place = np.zeros(len(self.mirror.observation_sign), int)
+        place[kept] = np.arange(len(kept))
+        self.mirror = dataclasses.replace(
+            self.mirror,
+            observation_index=place[self.mirror.observation_index[kept]],
+            observation_sign=self.mirror.observation_sign[kept],
+        )
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.reference = SpatialReference.of_steps(self.steps, common.body, world.models[0])
+        self.plan = footstep_plan(n)
+        self.state = FootstepState(
+            np.zeros(n), np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros((n, 2)),
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, int), np.zeros(n, int), np.zeros(n, int),
+            np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.state)
+        self.info_arrays |= {
+            name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
+        }
+        starts = {name: part.start for name, part in self._full.items()}
+        rules = FootstepRules(
+            common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
+            starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
+            self._heading_scale, self._largest_miss,
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
+
+    # The plan, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, `RIGHT` or `LEFT`, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, (n, 3) m."""
+        return self.state.goal
+
+    @property
+    def step_phase(self) -> np.ndarray:
+        """Share of the single step that has passed, (n,)."""
+        twice = 2 * self.phase
+        return twice - np.floor(twice)
+
+    # Episodes and plans.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = self._begin_grounds(env_ids, random_states)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        found, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
+        plan.landed[env_ids] = state.missed[env_ids] = False
+        state.push_end[env_ids] = state.excused[env_ids] = 0
+        aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
+        for k, i in enumerate(env_ids.tolist()):
+            if self.pushes:
+                state.push_begin[i] = self._steps_within(i, self.pushes.interval)
+            self._redraw_step(i, always=True)
+            aside[k] = state.width[i]
+            if self.goal_given:
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
+            sizes[k] = self._next_size(i), self._next_size(i)
+        places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
+        plan.heading[env_ids] = angles
+        stance = plan.stance[env_ids]
+        anchors = found.feet[env_ids, stance, :2]
+        if self.goal_given:
+            self._head_for_goals(env_ids, found.root[env_ids, :2])
+        else:
+            # The line of the plan goes through the start, half a width beside each foot.
+            line = quaternion.turned(anchors - places, -angles)
+            line[:, 1] = 0.5 * SIDE[stance] * aside
+            anchors = places + quaternion.turned(line, angles)
+        for which, foot in enumerate((1 - stance, stance)):
+            anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
+        self._put_reference(env_ids, found, np.full(len(env_ids), self._first))
+        if self.hidden_plan:
+            for i in env_ids.tolist():
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
+
+    def _redraw_step(self, i: int, always: bool = False) -> None:
+        """Draws length and width of the steps to come, perhaps."""
+        plans, random = self.plans, self._random[i]
+        if always or random.uniform() < plans.change:
+            self.state.length[i] = random.uniform(*plans.length)
+            self.state.width[i] = random.uniform(*plans.width)
+
+    def _next_size(self, i: int) -> tuple[float, float]:
+        """Returns length and width of the next step, which perhaps are drawn anew, m."""
+        self._redraw_step(i)
+        return float(self.state.length[i]), float(self.state.width[i])
+
+    def _lay(
+        self,
+        env_ids: np.ndarray,
+        which: int,
+        feet: np.ndarray,
+        places: np.ndarray,
+        sizes: np.ndarray,
+    ) -> np.ndarray:
+        """Enters into the plans where feet land while the other ones stand at places, on the ground.
+
+        Args:
+          env_ids: which simulations, (m,).
+          which: of the plan's two steps.
+          feet: which ones step, (m,).
+          places: (m, 2) m.
+          sizes: lengths and widths of the steps, (m, 2) m.
+
+        Returns:
+          The landing places, (m, 2) m.
+        """
+        steps = sizes.copy()
+        steps[:, 1] *= SIDE[feet]
+        places = places + quaternion.turned(steps, self.heading[env_ids])
+        self.landing[env_ids, which, :2] = places
+        heights = self.arena.height(places[:, :1], places[:, 1:], env_ids)
+        self.landing[env_ids, which, 2] = heights[:, 0]
+        return places
+
+    def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
+        """Plans to head from places (m, 2) for the goals, where these are not too near."""
+        way = self.goal[env_ids, :2] - places
+        headings = np.arctan2(way[:, 1], way[:, 0])
+        far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
+        self.heading[env_ids[far]] = headings[far]
+
+    def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
+        return round(self._random[i].uniform(*seconds) / self.control_timestep)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+        if self.pushes:
+            self._push(env_ids, self.pushes)
+
+    def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
+        """Applies the forces of pushes, and draws those that begin."""
+        state, count = self.state, self.clock.steps
+        for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
+            angle = self._random[i].uniform(-np.pi, np.pi)
+            force = self._random[i].uniform(*pushes.force)
+            state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
+            state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
+            state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
+            state.excused[i] = state.push_end[i] + self._grace
+        pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
+        self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if land_all(env_ids, self._pack):
+            switched = env_ids[self.plan.landed[env_ids]]
+            found = self.figure.found
+            self._replan(switched, found)
+            self._put_reference(switched, found, self._choose(switched, found))
+        finish_all(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def _replan(self, env_ids: np.ndarray, found: SpatialMeasurement) -> None:
+        """Makes the next plans of some simulations, at a switch of stance."""
+        plans, count = self.plans, len(env_ids)
+        by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
+        for k, i in enumerate(env_ids.tolist()):
+            random = self._random[i]
+            if plans.from_root and random.uniform() < plans.from_root:
+                by_root[k] = True
+                turns[k] = random.normal(0, plans.root_turn)
+                for which in (0, 1):
+                    ahead = random.uniform(*plans.root_length)
+                    sizes[k, which] = ahead, random.uniform(*plans.root_width)
+                continue
+            if self.goal_given:
+                root = found.root[i, :2]
+                if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
+                    self.goal[i] = self.arena.goal(i, random, root, 'step')
+            elif plans.sharp and random.uniform() < plans.sharp:
+                turns[k] = random.uniform(-np.pi, np.pi)
+                self.state.excused[i] = self.clock.steps[i] + self._grace
+            elif plans.turn:
+                turns[k] = random.normal(0, plans.turn)
+            sizes[k, 1] = self._next_size(i)
+        stance = self.stance[env_ids]
+        on = ~by_root
+        if on.any():
+            going = env_ids[on]
+            if self.goal_given:
+                self._head_for_goals(going, self.landing[going, :, :2].mean(1))
+            self.heading[going] += turns[on]
+            self.landing[going, 0] = self.landing[going, 1]
+            self._lay(going, 1, stance[on], self.landing[going, 0, :2], sizes[on, 1])
+        if by_root.any():
+            going, foot = env_ids[by_root], stance[by_root]
+            off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            self.heading[going] = found.heading[going] + off
+            places = found.feet[going, foot, :2]
+            for which, feet in enumerate((1 - foot, foot)):
+                places = self._lay(going, which, feet, places, sizes[by_root, which])
+
+    def _choose(self, env_ids: np.ndarray, found: SpatialMeasurement) -> np.ndarray:
+        """Returns the steps nearest to the plans of some simulations."""
+        feet = found.feet[env_ids]
+        query = step_features(
+            found.root[env_ids, :2], found.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
+            self.landing[env_ids, 0, :2], self.heading[env_ids], self.stance[env_ids] == RIGHT,
+        )  # fmt: skip
+        return self.steps.select(query)
+
+    def _put_reference(
+        self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
+    ) -> None:
+        """Has the chosen steps begin where the characters are and as they head."""
+        self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
+        columns = self.reference.columns
+        now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
+        turned = found.heading[env_ids] - now[:, columns['heading'].start]
+        self.state.turned[env_ids] = turned
+        self.state.shift[env_ids] = found.root[env_ids, :2] - quaternion.turned(
+            now[:, columns['root']], turned
+        )
+
+    # Left and right, and pictures.
+
+    def _extra_mirror(self, name: str) -> Reflection:
+        return (np.arange(2), np.array([-1.0, 1.0])) if name == 'goal' else plan_mirror(name)
+
+    def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
+        return {**extras, 'plan': 7}
+
+    def _canonical_extra_columns(self, name: str) -> np.ndarray:
+        columns = super()._canonical_extra_columns(name)
+        if name == 'contact':
+            return columns
+        # Heading; the first step as seen from the left foot, the second from the right one.
+        return columns[[12, 3, 4, 5, 6, 7, 8]]
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Where the feet are to land, which way the body is to head, and the goal."""
+        root = self.world.xpos[env_id, self.figure.links[0]]
+        found = plan_markers(env_id, root, self.plan)
+        if self.goal_given:
+            found.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
+        if self.hidden_plan:
+            found.append(flag(self.goal[env_id]))
+        return found
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Pose of the reference where it was put: root, then joints."""
+        state = self.state
+        mirrored, index = divmod(int(state.track[env_id]), len(self.steps))
+        time = self.step_phase[env_id] * self.steps.duration
+        pose = self.steps.pose(index, time, bool(mirrored))
+        turned = state.turned[env_id]
+        pose[:2] = state.shift[env_id] + quaternion.turned(pose[:2], turned)
+        pose[3:7] = quaternion.multiply(quaternion.about_z(turned), pose[3:7])
+        env_ids = np.array([env_id])
+        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]
+        return pose
+
+
+def straight_step(steps: Steps, length: float) -> int:
+    """Returns the step of a library that is straight on and of about this length, m."""
+    straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
+    return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
+
+
+def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses over the origin, and rates, at phases (m,) of two steps like this one."""
+    times = (2 * phase - np.floor(2 * phase)) * steps.duration
+    poses, rates = (
+        part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)
+    )  # fmt: skip
+    poses[:, :2] = 0.0
+    return poses, rates

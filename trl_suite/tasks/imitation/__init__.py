@@ -1,0 +1,1 @@
+"""Tasks that track a motion clip."""

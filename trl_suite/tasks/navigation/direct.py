@@ -1,0 +1,416 @@
+"""Going from goal to goal without hierarchy: joints are driven 30 times a second, by one policy.
+
+Source: the 'Hard' environments of the original, and its imitation scenario with a goal, which they
+were meant to have.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import SpatialTerrain
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial_reference import SpatialReference, moment
+from trl_suite.motion import Clip, Steps
+from trl_suite.tasks.components import ball, rewards
+from trl_suite.tasks.components.ball import MIRRORED as MIRRORED_BALL
+from trl_suite.tasks.components.ball import Ball, BallRules, dribble, observe_ball, remember
+from trl_suite.tasks.components.comparison import (
+    Comparison,
+    com_error,
+    comparison,
+    effector_error,
+    height_error,
+    pose_error,
+    rate_error,
+    term,
+)
+from trl_suite.tasks.components.goals import Goals, flag, goals, set_goal
+from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.trace import Trace, follow, trace, trace_markers
+from trl_suite.tasks.footsteps.spatial import Footsteps
+from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
+from trl_suite.tasks.spatial_task import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    SpatialRules,
+    SpatialTask,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    publish,
+    tick,
+)
+from trl_suite.tasks.task import Marker, conclude
+from trl_suite.util import errors
+from trl_suite.util.compiled import compiled, compiled_loop, packed
+
+REWARDS = ('goal', 'original')
+GOAL_REACHED = 0.5  # m; of the root, on the ground
+NEAR = 3.0  # m from the goal, where neither speed nor heading counts any longer
+HIDDEN_LENGTH = 0.4  # m; of the steps of the plan that the original's reward is about
+BALL_SHARE = 0.5  # of the reward, where there is a ball
+BALL_TERMS = {
+    name: (BALL_SHARE * weight, scale)
+    for name, (weight, scale) in {**rewards.JOURNEY_TERMS, **ball.SOCCER_TERMS}.items()
+}
+
+TERMS = len(rewards.JOURNEY_TERMS)
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING, PROXIMITY = range(TERMS)
+
+
+class Progress(NamedTuple):
+    """How fast each walker goes where it is to go, (n,) m/s."""
+
+    speed: np.ndarray
+
+
+class JourneyRules(NamedTuple):
+    """All that the rules of a journey work on.
+
+    Attributes:
+      goal: where the goal block begins in the full observation.
+      goal_reached: m; nearer, the root has reached the goal.
+      with_ball: whether the goal is that of a ball.
+    """
+
+    common: SpatialRules
+    comparison: Comparison
+    goals: Goals
+    progress: Progress
+    trace: Trace
+    goal: int
+    goal_reached: float
+    with_ball: bool
+    ball: BallRules
+
+
+# A step of simulation i: `travel`, the next goal where one is wanted, `finish`.
+
+
+@compiled
+def travel(i: int, rules: JourneyRules) -> bool:
+    """Measures the body and looks at what was reached; returns whether anything is to be drawn."""
+    common, goals, state = rules.common, rules.goals, rules.ball.state
+    tick(i, common)
+    goals.wanted[i] = state.wanted[i] = False
+    if breaks_down(i, common):
+        return False
+    measure(i, common)
+    count, found = common.clock.steps[i], common.found
+    follow(i, count, found.com, rules.trace)
+    if rules.with_ball:
+        dribble(
+            i, TERMS, BALL_SHARE, CONTROL_TIMESTEP, goals.place, common.physics, found, rules.ball,
+            common.outcome.reward_terms,
+        )  # fmt: skip
+        reached = state.at_goal[i]
+        state.wanted[i] = count >= state.due[i]
+        goals.wanted[i] = count >= goals.due[i]  # reaching it does not end it
+    else:
+        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        reached = x * x + y * y < rules.goal_reached * rules.goal_reached
+        goals.wanted[i] = reached or count >= goals.due[i]
+    goals.reached[i] += reached
+    return goals.wanted[i] or state.wanted[i]
+
+
+@compiled
+def finish(i: int, rules: JourneyRules) -> None:
+    """Reward, failure and observation."""
+    common = rules.common
+    if common.outcome.diverged[i]:  # the last finite observation stands
+        conclude(i, True, common.outcome)
+        return
+    if rules.with_ball:
+        remember(i, common.physics, common.found, rules.ball)
+    compare(i, rules)
+    conclude(i, common.found.fallen[i], common.outcome)
+    observe(i, rules)
+
+
+@compiled
+def compare(i: int, rules: JourneyRules) -> None:
+    """Writes the reward terms: imitation on the way to the goal, or to the ball."""
+    common, by, found = rules.common, rules.comparison, rules.common.found
+    row, rest = moment(common.clock.phase[i], 0, by.tracks)
+    if rules.with_ball:
+        x, y = common.physics.qpos[i, rules.ball.qpos], common.physics.qpos[i, rules.ball.qpos + 1]
+    else:
+        x, y = rules.goals.place[i, 0], rules.goals.place[i, 1]
+    x, y = x - found.root[i, 0], y - found.root[i, 1]
+    squared = x * x + y * y
+    distance, direction = math.sqrt(squared), math.atan2(y, x)
+    near = distance < NEAR
+    com = 0.0 if near else com_error(i, row, rest, direction, by, found)
+    off = 0.0 if near else rewards.wrapped(direction - found.heading[i])
+
+    terms = common.outcome.reward_terms
+    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
+    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    terms[i, END_EFFECTOR] = term(END_EFFECTOR, effector_error(i, row, rest, by, found), by)
+    terms[i, COM] = term(COM, com, by)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+    terms[i, HEADING] = by.term_weights[HEADING] * rewards.facing(off)
+    terms[i, PROXIMITY] = term(PROXIMITY, squared / (NEAR * NEAR), by)
+    if rules.with_ball:
+        for k in range(TERMS):
+            terms[i, k] *= 1.0 - BALL_SHARE
+    along = found.com_velocity[i, 0] * x + found.com_velocity[i, 1] * y
+    rules.progress.speed[i] = along / max(distance, 1e-9)
+
+
+@compiled
+def observe(i: int, rules: JourneyRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observe_body(i, common)
+    if rules.with_ball:
+        place, physics = rules.goals.place, common.physics
+        observe_ball(i, rules.goal, place, physics, found, rules.ball, common.full)
+    else:
+        x, y = (
+            rules.goals.place[i, 0] - found.root[i, 0],
+            rules.goals.place[i, 1] - found.root[i, 1],
+        )
+        bearing, distance = polar(i, x, y, found)
+        common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
+    publish(i, common)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def travel_all(env_ids: np.ndarray, rules: JourneyRules) -> int:
+    """Looks at what was reached; returns for how many anything is to be drawn."""
+    wanted = 0
+    for i in env_ids:
+        wanted += travel(i, rules)
+    return wanted
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: JourneyRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: JourneyRules) -> None:
+    """Observes, and compares as if a step had been taken; at their starts if they are fresh."""
+    for i in env_ids:
+        measure(i, rules.common)
+        if fresh and rules.with_ball:
+            remember(i, rules.common.physics, rules.common.found, rules.ball)
+        compare(i, rules)
+        observe(i, rules)
+
+
+class Journey(SpatialTask):
+    """A spatial character imitates a clip on its way from goal to goal, or dribbles a ball to them.
+
+    The reward is that of imitation, but that the clip's velocity is turned towards the goal, and
+    heading for the goal and nearness are rewarded too (`rewards.JOURNEY_TERMS`). With a ball, half of
+    it is that of a journey to the ball, half that of dribbling (`ball.SOCCER_TERMS`).
+
+    Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
+      goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball, as
+        seen from the ball.
+      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+    """
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialTerrain,
+        clip: Clip,
+        ball: Ball | None = None,
+        *,
+        actuation_model: str = 'position',
+        terrain_map: bool = True,
+        goal_reached: float = GOAL_REACHED,
+        substeps: int = SUBSTEPS,
+        centre: str = 'clip',
+        half_range: float | None = None,
+        start_phase: float | Sequence[Sequence[float]] | None = None,
+        blend: float = 0.0,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial character without actuators; it is attached to the arena.
+          arena: where it moves.
+          clip: a looping clip for this character, with a free root.
+          ball: a ball of the arena that is to be dribbled.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+          terrain_map: observe the heights around.
+          goal_reached: m; nearer, a goal is drawn anew. With a ball: nearer, the ball is at the goal.
+          substeps, centre, half_range, start_phase, blend: as for `SpatialImitation`.
+
+        Raises:
+          ValueError: options out of range, or a clip that does not fit the character.
+        """
+        if not 0 < goal_reached < np.inf:
+            raise ValueError(
+                f'goal_reached is {goal_reached}; expected a positive number of metres'
+            )
+        check_cycle(clip)
+        self.clip, self.period, self.ball = clip, clip.duration, ball
+        self.TERMS = BALL_TERMS if ball else rewards.JOURNEY_TERMS
+        self._goal_reached = goal_reached
+        super().__init__(
+            character, arena, clip, actuation_model=actuation_model, terrain_map=terrain_map,
+            substeps=substeps, centre=centre, half_range=half_range, start_phase=start_phase,
+            blend=blend, extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
+        )  # fmt: skip
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
+
+    def _extra_mirror(self, name: str) -> Reflection:
+        signs = MIRRORED_BALL if name == 'ball' else (-1.0, 1.0)
+        return np.arange(len(signs)), np.array(signs)
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
+        self.goals, self.progress, self.trace = goals(n), Progress(np.zeros(n)), trace(n)
+        self.saved = (*self.saved, self.goals, self.progress, self.trace)
+        self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
+        starts = {name: part.start for name, part in self._full.items()}
+        balls = ball.no_ball(n)
+        if self.ball:
+            self.ball.bind(world)
+            balls = self.ball.rules(starts['ball'], ball.SPEED, float(self._goal_reached))
+            self.saved = (*self.saved, self.ball.state)
+            self.info_arrays['at_goal'] = self.ball.state.at_goal
+        rules = JourneyRules(
+            common, comparison(self.character, self.reference, rewards.JOURNEY_TERMS), self.goals,
+            self.progress, self.trace, starts['goal'], float(self._goal_reached),
+            self.ball is not None, balls,
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, or where the ball is to go, (n, 3) m."""
+        return self.goals.place
+
+    # Episodes.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = self._begin_grounds(env_ids, random_states)
+        return *pose_of_clip(self.clip, self.clock.start[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        self.goals.reached[env_ids] = 0
+        self.trace.places[env_ids] = np.nan
+        for i in env_ids.tolist():
+            place = self.travel.origin[i, :2]
+            if self.ball:
+                self.ball.state.at_goal[i] = False
+                self.ball.put(i, place, 0, self._random[i])
+            self._draw_goal(i, place)
+        if self.ball:
+            self.world.forward(env_ids)
+        observe_all(env_ids, True, self._pack)
+
+    def _draw_goal(self, i: int, place: np.ndarray) -> None:
+        random = self._random[i]
+        if self.ball:
+            drawn = self.ball.goal(i, random)
+        else:
+            drawn = self.arena.goal(i, random, place, 'step')
+        set_goal(i, drawn, self.clock.steps[i], random, self.goals)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if travel_all(env_ids, self._pack):
+            self._draw(env_ids)
+        finish_all(env_ids, self._pack)
+
+    def _draw(self, env_ids: np.ndarray) -> None:
+        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        root, count = self.figure.found.root, self.clock.steps
+        if self.ball:
+            wanted = env_ids[self.ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self.ball.put(i, root[i, :2], count[i], self._random[i])
+            self.world.forward(wanted)
+        for i in env_ids[self.goals.wanted[env_ids]].tolist():
+            self._draw_goal(i, root[i, :2])
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, False, self._pack)
+
+    def clip_action(self, env_id: int) -> np.ndarray:
+        """Action that drives joints along the clip; see `imitation3d.clip_action`."""
+        return clip_action(self, self.clip, env_id)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Where the centre of mass has been, and the goal: of a ball as a disc on the ground."""
+        goal = self.goal[env_id]
+        there = ball.goal_disc(goal, self._goal_reached) if self.ball else flag(goal)
+        return [*trace_markers(env_id, self.trace), there]
+
+
+def journey(
+    character: Character,
+    arena: SpatialTerrain,
+    clip: Clip,
+    steps: Steps | None,
+    *,
+    reward: str = 'goal',
+    actuation_model: str = 'position',
+    goal_reached: float | None = None,
+    terrain_map: bool = True,
+    substeps: int = SUBSTEPS,
+    centre: str = 'clip',
+    half_range: float | None = None,
+    start_phase: float | Sequence[Sequence[float]] | None = None,
+    blend: float = 0.0,
+) -> Journey | Footsteps:
+    """Composes what one of the rewards is for.
+
+    Args:
+      reward: 'goal', see `Journey`; or 'original': that of following a hidden plan of footsteps 0.4 m
+        long, see `Footsteps`; its goal stays. In the original that plan begins at the world's origin,
+        mostly far away; here at the start.
+      goal_reached: m, 0.5 by default; only for 'goal'.
+      steps: only for 'original'.
+      character, arena, clip, and the other options: as for the classes.
+
+    Raises:
+      ValueError: options out of range, or that do not fit each other.
+    """
+    options: dict[str, Any] = {
+        'actuation_model': actuation_model, 'terrain_map': terrain_map, 'substeps': substeps,
+        'centre': centre, 'half_range': half_range, 'start_phase': start_phase, 'blend': blend,
+    }  # fmt: skip
+    if reward not in REWARDS:
+        raise ValueError(errors.unknown('reward', reward, REWARDS))
+    if reward == 'goal':
+        reached = GOAL_REACHED if goal_reached is None else goal_reached
+        return Journey(character, arena, clip, goal_reached=reached, **options)
+    if goal_reached is not None:
+        raise ValueError("goal_reached is an option of the reward 'goal', not of 'original'")
+    if steps is None:
+        raise ValueError("the reward 'original' needs a library of steps")
+    plans = {'length': (HIDDEN_LENGTH,) * 2}
+    return Footsteps(character, arena, steps, plans=plans, hidden_plan=True, **options)

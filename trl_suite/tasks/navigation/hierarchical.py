@@ -1,0 +1,706 @@
+"""Walking somewhere by planning footsteps: the high-level tasks above a footstep controller.
+
+Source: the hike scenarios of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.arenas import SpatialTerrain
+from trl_suite.characters import Character
+from trl_suite.controllers import footstep_controller as llc
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import polar, write_body, write_terrain
+from trl_suite.motion import Steps
+from trl_suite.policies.mirror import Mirror
+from trl_suite.tasks.components import reflection as reflection3d
+from trl_suite.tasks.components.ball import (
+    AT_GOAL,
+    GOAL_AWAY,
+    MIRRORED,
+    SOCCER_TERMS,
+    Ball,
+    BallRules,
+    dribble,
+    goal_disc,
+    no_ball,
+    observe_ball,
+    remember,
+)
+from trl_suite.tasks.components.footstep_plan import (
+    CONTACT_SIZE,
+    PLAN_SIZE,
+    FootstepPlan,
+    footstep_plan,
+    observe_plan,
+    plan_markers,
+    plan_mirror,
+    update_stance,
+)
+from trl_suite.tasks.components.goals import Goals, flag, goals, set_goal
+from trl_suite.tasks.components.plans import Plans, span
+from trl_suite.tasks.components.trace import Trace, follow, trace, trace_markers
+from trl_suite.tasks.footsteps.spatial import TYPICAL_POSES, pose_of_step, straight_step
+from trl_suite.tasks.spatial_task import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    SpatialRules,
+    SpatialTask,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    tick,
+)
+from trl_suite.tasks.task import (
+    Marker,
+    check_simulated,
+    conclude,
+    consecutive,
+    drawn_seed,
+    drawn_way,
+)
+from trl_suite.terrain import Ground
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SAMPLES
+from trl_suite.util import errors
+from trl_suite.util.compiled import compiled, compiled_loop, packed
+
+INTERFACES = ('plan', 'frame')
+SIGHTS = ('height', 'velocity')
+# The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
+# m, and turn of the heading, rad.
+PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
+PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
+PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
+STEP_LENGTH = 0.5  # m
+PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
+GOAL_REACHED = 1.0  # m; by default
+GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
+SPEED_SHARPNESS = 1.5
+UPRIGHT = 0.2  # reward for being on one's feet
+HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
+FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples that touch the ground
+SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
+FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
+LONGEST = 60  # control steps of a step; the clock switches stance long before
+
+SPEED, ON_FEET = range(len(HIKE_TERMS))
+
+
+class PlanningState(NamedTuple):
+    """What the task knows beside plan and goal, (n, ...).
+
+    Attributes:
+      lasted: control steps of the last step.
+      duration: of the last step, s.
+      begin: centre of mass at its beginning, (n, 3) m.
+      down: running share of samples with a fall link on the ground.
+      speed: towards the goal in the last step, of walker or ball, m/s.
+      action: of the agent, clipped, (n, k).
+      over: whether the step is over.
+    """
+
+    lasted: np.ndarray
+    duration: np.ndarray
+    begin: np.ndarray
+    down: np.ndarray
+    speed: np.ndarray
+    action: np.ndarray
+    over: np.ndarray
+
+
+class PlanningRules(NamedTuple):
+    """All that the rules of planned footsteps work on.
+
+    The full observation of `common` is what the footstep controller observes.
+
+    Attributes:
+      contact, plan_block: where these blocks begin in the full observation.
+      by_plan: whether a step is a footstep, not a control step.
+      terrain, surface, pose, velocity, target, low_level: where these blocks begin in the
+        observation; -1: not observed.
+      plan_offset, plan_scale: what an action means.
+      target_speed, goal_reached: of the reward, m/s and m.
+      with_ball: whether the goal is that of a ball.
+    """
+
+    common: SpatialRules
+    plan: FootstepPlan
+    goals: Goals
+    state: PlanningState
+    trace: Trace
+    contact: int
+    plan_block: int
+    by_plan: bool
+    terrain: int
+    surface: int
+    pose: int
+    velocity: int
+    target: int
+    low_level: int
+    plan_offset: np.ndarray
+    plan_scale: np.ndarray
+    target_speed: float
+    goal_reached: float
+    with_ball: bool
+    ball: BallRules
+
+
+# A step of simulation i: `begin_step`, then for every control step inside of it actions of the
+# footstep controller, physics and `finish_control_step`; then `score`, the next goal if one is wanted, `finish`.
+
+
+@compiled
+def begin_step(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan where a footstep begins, and shows it to the footstep controller."""
+    common, state = rules.common, rules.state
+    measure(i, common)
+    lay_plan(i, rules)
+    state.lasted[i] = 0
+    for k in range(3):
+        state.begin[i, k] = common.found.com[i, k]
+    if rules.with_ball:
+        remember(i, common.physics, common.found, rules.ball)
+    rules.plan.landed[i] = False
+    observe_low(i, rules)
+
+
+@compiled
+def lay_plan(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan that the action means, from the root and its heading, if a footstep begins."""
+    plan, found, ground = rules.plan, rules.common.found, rules.common.ground
+    if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
+        return
+    heading = found.heading[i]
+    cosine, sine = math.cos(heading), math.sin(heading)
+    for which in range(2):
+        ahead, left = meant(i, 2 * which, rules), meant(i, 2 * which + 1, rules)
+        x = found.root[i, 0] + (cosine * ahead - sine * left)
+        y = found.root[i, 1] + (sine * ahead + cosine * left)
+        plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
+        plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
+    plan.heading[i] = heading + meant(i, 4, rules)
+
+
+@compiled
+def meant(i: int, k: int, rules: PlanningRules) -> float:
+    """What number k of an action means, m or rad."""
+    return rules.state.action[i, k] * rules.plan_scale[k] + rules.plan_offset[k]
+
+
+@compiled
+def observe_low(i: int, rules: PlanningRules) -> None:
+    """Writes what the footstep controller observes."""
+    common = rules.common
+    observe_body(i, common)
+    observe_plan(i, rules.contact, rules.plan_block, common.found, rules.plan, common.full)
+
+
+@compiled
+def finish_control_step(i: int, rules: PlanningRules) -> bool:
+    """Finishes a control step inside of a step: clock, divergence, measurement, falls, landings.
+
+    What the footstep controller is to see next is written if the step goes on, which is returned.
+    """
+    common, state, outcome = rules.common, rules.state, rules.common.outcome
+    tick(i, common)
+    state.lasted[i] += 1
+    if breaks_down(i, common):
+        outcome.failed[i] = state.over[i] = True
+        return False
+    measure(i, common)
+    count, found = common.clock.steps[i], common.found
+    if count % SAMPLE_FRAMES == 0:
+        state.down[i] *= FADING
+        state.down[i] += SHARE * found.fallen[i]
+    outcome.failed[i] = state.down[i] > FALLEN
+    if update_stance(i, common.clock.phase[i], found, rules.plan):
+        rules.plan.landed[i] = True
+    follow(i, count, found.com, rules.trace)
+    state.over[i] = (
+        rules.plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST
+        or not rules.by_plan
+    )  # fmt: skip
+    if not state.over[i]:
+        observe_low(i, rules)
+    return not state.over[i]
+
+
+@compiled
+def score(i: int, rules: PlanningRules) -> bool:
+    """Writes the reward terms; returns whether a goal or a place of the ball is to be drawn."""
+    common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
+    found, terms = common.found, common.outcome.reward_terms
+    seconds = CONTROL_TIMESTEP * state.lasted[i]
+    state.duration[i] = seconds
+    goals.wanted[i] = ball.wanted[i] = False
+    if common.outcome.diverged[i]:
+        return False
+    if rules.with_ball:
+        state.speed[i] = dribble(
+            i, 0, 1.0, seconds, goals.place, common.physics, found, rules.ball, terms
+        )
+    else:
+        x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
+        distance = math.hypot(x, y)
+        moved_x, moved_y = found.com[i, 0] - state.begin[i, 0], found.com[i, 1] - state.begin[i, 1]
+        speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
+        lack = min(speed - rules.target_speed, 0.0)
+        full = distance < rules.goal_reached
+        worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
+        terms[i, SPEED], terms[i, ON_FEET] = (1 - UPRIGHT) * worth, UPRIGHT
+        state.speed[i] = speed
+    if common.outcome.failed[i]:
+        return False
+    count = common.clock.steps[i]
+    late = count >= goals.due[i]
+    if rules.with_ball:  # reaching it does not end it
+        goals.reached[i] += ball.at_goal[i]
+        ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
+    else:
+        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        reached = math.hypot(x, y) < rules.goal_reached
+        goals.reached[i] += reached
+        goals.wanted[i] = reached or late
+    return goals.wanted[i] or ball.wanted[i]
+
+
+@compiled
+def finish(i: int, rules: PlanningRules) -> None:
+    """Reward and observation."""
+    outcome = rules.common.outcome
+    conclude(i, outcome.failed[i], outcome)
+    if not outcome.diverged[i]:  # else the last finite observation stands
+        observe(i, rules)
+
+
+@compiled
+def observe(i: int, rules: PlanningRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observation = common.outcome.observation
+    write_terrain(i, rules.terrain, common.ground, found, observation)
+    if rules.surface >= 0:
+        block = observation[i, rules.surface : rules.surface + 2 * SAMPLES * SAMPLES]
+        x, y = found.root[i, 0], found.root[i, 1]
+        spatial_ground.velocity_map(i, x, y, found.heading[i], common.ground, block)
+    write_body(i, rules.pose, rules.velocity, found, observation)
+    place = rules.goals.place
+    if rules.with_ball:
+        observe_ball(i, rules.target, place, common.physics, found, rules.ball, observation)
+    else:
+        x, y = place[i, 0] - found.root[i, 0], place[i, 1] - found.root[i, 1]
+        bearing, distance = polar(i, x, y, found)
+        observation[i, rules.target], observation[i, rules.target + 1] = bearing, distance
+    if rules.low_level >= 0:
+        observe_low(i, rules)
+        for k in range(common.full.shape[1]):
+            observation[i, rules.low_level + k] = common.full[i, k]
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def take_all(env_ids: np.ndarray, action: np.ndarray, rules: PlanningRules) -> None:
+    """Takes in the actions of the agent, clipped."""
+    for i in env_ids:
+        for k in range(action.shape[1]):
+            rules.state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+
+
+@compiled_loop
+def begin_steps(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Begins steps."""
+    for i in env_ids:
+        begin_step(i, rules)
+
+
+@compiled_loop
+def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Lays out plans as `begin_steps` would, and writes what the footstep controller observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        lay_plan(i, rules)
+        observe(i, rules)
+
+
+@compiled_loop
+def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Accounts for a control step; returns how many steps go on."""
+    going = 0
+    for i in env_ids:
+        going += finish_control_step(i, rules)
+    return going
+
+
+@compiled_loop
+def score_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Writes reward terms; returns for how many anything is to be drawn."""
+    wanted = 0
+    for i in env_ids:
+        wanted += score(i, rules)
+    return wanted
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        observe(i, rules)
+
+
+class HighLevel(SpatialTask):
+    """A spatial biped goes from goal to goal, or dribbles a ball to them, by planning footsteps.
+
+    An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
+    next, half a cycle of the footstep controller that drives the joints inside; the first of an
+    episode may be shorter. The plan is laid out from the root's place on the ground and its heading
+    at the beginning of the step: where the foot that swings lands, where the other one lands after
+    it, and the heading to have.
+
+    Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if it sees heights.
+      surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if it sees velocities.
+      pose, velocity: as in `SpatialImitation`.
+      target: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
+        the ball.
+      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+      low_level: what the footstep controller observes, with interface 'frame' only; see `Footsteps`.
+
+    Attributes:
+      watch: called at every 1/30 s of the first simulation, within steps too; for pictures.
+    """
+
+    ABOUT = 'root'
+    watch: Callable[[], None] | None = None
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialTerrain,
+        steps: Steps,
+        ball: Ball | None = None,
+        *,
+        controller: Any = llc.DEFAULT,
+        interface: str = 'plan',
+        sight: Collection[str] = ('height',),
+        step_length: float = STEP_LENGTH,
+        target_speed: float = 1.0,
+        goal_reached: float | None = None,
+        goal_distance: tuple[float, float] | None = None,
+        start_phases: Sequence[float] = (0.1, 0.6),
+        substeps: int = SUBSTEPS,
+        blend: float = 0.0,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: where it walks.
+          steps: library of single steps of this character, for the first pose and the clock.
+          ball: a ball of the arena that is to be dribbled; its ground must be level.
+          controller: the footstep controller: what `trl_suite.controllers.footstep_controller.load` takes.
+          interface: 'plan', or 'frame': a step is one control step of 1/30 s, and an action is the plan
+            followed by the joint action. A plan takes effect only in a step that begins a footstep.
+          sight: which maps are observed, of 'height' and 'velocity'.
+          step_length: of the steps that action 0 means, m.
+          target_speed: m/s towards the goal, of walker and ball, from which on the reward is full.
+          goal_reached: m; nearer, a goal is drawn anew, or the ball is at the goal. By default 1 m,
+            and 0.5 m of a ball.
+          goal_distance: m; the least and the most, up to 100, from the walker (with a ball: from the
+            ball), in any direction, at which goals are drawn: for open ground. By default they are
+            where the terrain has them.
+          start_phases: of the clock, one of which every episode starts with.
+          substeps: physics steps per 1/30 s.
+          blend: which mixture of the terrain's parameter sets to draw from.
+
+        Raises:
+          ValueError: options out of range, or parts that do not fit each other.
+        """
+        if interface not in INTERFACES:
+            raise ValueError(errors.unknown('interface', interface, INTERFACES))
+        sight = (sight,) if isinstance(sight, str) else tuple(sight)
+        for each in sight:
+            if each not in SIGHTS:
+                raise ValueError(errors.unknown('sight', each, SIGHTS))
+        if goal_reached is None:
+            goal_reached = AT_GOAL if ball else GOAL_REACHED
+        for name, value in (
+            ('step_length', step_length), ('target_speed', target_speed),
+            ('goal_reached', goal_reached),
+        ):  # fmt: skip
+            if not 0 < value < np.inf:
+                raise ValueError(f'{name} is {value}; expected a positive number')
+        if goal_distance is not None:
+            goal_distance = span('goal_distance', goal_distance, 'm')
+            if goal_distance[1] > FARTHEST_GOAL:
+                raise ValueError(
+                    f'goal_distance is {goal_distance}; expected at most {FARTHEST_GOAL:g} m'
+                )
+        if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
+            raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
+        if len(character.row.end_effectors) != 2:
+            raise ValueError(f'character {character.row.name!r} has no two feet to place')
+        self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
+        self._first = straight_step(steps, float(np.mean(Plans().length)))
+        self.TERMS = SOCCER_TERMS if ball else HIKE_TERMS
+        self._goal_signs = {'target': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        super().__init__(
+            character, arena, steps, substeps=substeps, blend=blend,
+            extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
+        )  # fmt: skip
+        self.controller = llc.load(controller)
+        self.controller.check(self)
+        # A function of the user's is called by one thread, for all simulations that go on.
+        self.in_parts = self.controller.policy is not None
+        self.interface, self.sight, self.step_length = interface, sight, step_length
+        self._target_speed, self._goal_reached = float(target_speed), float(goal_reached)
+        self._goal_distance = goal_distance
+        self._start_phases = tuple(start_phases)
+        self._frame = substeps
+        low = max(part.stop for part in self._full.values())
+        centre, half_range, names = step_length * PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
+        if interface == 'frame':
+            joints = self.joint_map
+            names = (*names, *joints.names)
+            centre = np.concatenate([centre, np.zeros(len(joints))])
+            half_range = np.concatenate([half_range, np.ones(len(joints))])
+        else:
+            self.set_timesteps(steps.duration, CONTROL_TIMESTEP / substeps)
+        self.action_map = ActionMap(names, 'footstep plan', 'm (turn: rad)', centre, half_range)
+        pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
+        self.blocks = consecutive({
+            'terrain': SAMPLES**2 if 'height' in sight else 0,
+            'surface': 2 * SAMPLES**2 if 'velocity' in sight else 0,
+            **pose,
+            **{name: len(signs) for name, signs in self._goal_signs.items()},
+            'low_level': low if interface == 'frame' else 0,
+        })  # fmt: skip
+        mirrors = interface == 'plan' and self.character.row.mirror
+        self.mirror = self._plan_mirror() if mirrors else None
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
+        return plan_mirror(name)
+
+    def _plan_mirror(self) -> Mirror:
+        """How observations and plans are reflected."""
+        parts = reflection3d.body(self.character)
+        lines, _ = parts['terrain']
+        ahead = np.ones(len(lines))
+        parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
+        for name, signs in self._goal_signs.items():
+            parts[name] = np.arange(len(signs)), np.array(signs)
+        index, sign = reflection3d.joined(self.blocks, parts)
+        links = list(self.character.row.links)
+        feet = [links.index(name) for name in self.character.row.end_effectors]
+        right, left = self.blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
+        return Mirror(
+            index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
+        )
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.plan, self.goals, self.trace = footstep_plan(n), goals(n), trace(n)
+        self.state = PlanningState(
+            np.zeros(n, int), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
+            np.zeros((n, len(self.action_map))), np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
+        self.info_arrays |= {
+            'landed': self.plan.landed,
+            'landing_error': self.plan.landing_error,
+            'heading_error': self.plan.heading_error,
+            'goals_reached': self.goals.reached,
+            'speed': self.state.speed,
+            'duration': self.state.duration,
+        }
+        starts = {name: part.start for name, part in self.blocks.items()}
+        balls = no_ball(n)
+        if self.ball:
+            self.ball.bind(world)
+            balls = self.ball.rules(starts['ball'], self._target_speed, self._goal_reached)
+            self.saved = (*self.saved, self.ball.state)
+            self.info_arrays['at_goal'] = self.ball.state.at_goal
+        low = self._full
+        names = 'terrain', 'surface', 'pose', 'velocity', 'target', 'low_level'
+        rules = PlanningRules(
+            common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
+            contact=low['contact'].start, plan_block=low['plan'].start,
+            by_plan=self.interface == 'plan', plan_offset=self.action_map.centre,
+            plan_scale=self.action_map.half_range, target_speed=self._target_speed,
+            goal_reached=self._goal_reached, with_ball=self.ball is not None, ball=balls,
+            **{name: starts.get(name, -1) for name in names},
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._low_action = np.zeros((n, len(self.joint_map)))
+
+    # What is often asked for, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, 0 the right one, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, or where the ball is to go, (n, 3) m."""
+        return self.goals.place
+
+    # Episodes.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = np.zeros((len(env_ids), 3))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
+            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
+            self.clock.start[i] = random.choice(self._start_phases)
+            spawns[k] = ground.spawn(random)
+            self.arena.begin_episode(i, ground, spawns[k, :2])
+        self._begin_clocks(env_ids)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        plan, state = self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = state.down[env_ids] = 0.0
+        plan.landed[env_ids] = False
+        state.lasted[env_ids] = self.goals.reached[env_ids] = 0
+        state.speed[env_ids] = state.duration[env_ids] = 0.0
+        self.trace.places[env_ids] = np.nan
+        found = self.figure.measure(env_ids)
+        for i in env_ids.tolist():
+            self.begin_goal(i)
+        if self.ball:
+            self.ball.state.at_goal[env_ids] = False
+            self.world.forward(env_ids)
+        # Until the first action there is no plan; the places under the feet stand for it.
+        plan.heading[env_ids] = found.heading[env_ids]
+        stance = plan.stance[env_ids]
+        plan.landing[env_ids, 0] = found.feet[env_ids, 1 - stance]
+        plan.landing[env_ids, 1] = found.feet[env_ids, stance]
+
+    def begin_goal(self, i: int) -> None:
+        """Draws what is to be reached in an episode by a walker where it was last measured."""
+        place = self.figure.found.root[i, :2]
+        if self.ball:
+            self.ball.put(i, place, self.clock.steps[i], self._random[i])
+        self._draw_goal(i, place)
+
+    def _draw_goal(self, i: int, place: np.ndarray) -> None:
+        random, away = self._random[i], self._goal_distance
+        if self.ball:
+            goal = self.ball.goal(i, random, away or GOAL_AWAY)
+        elif away is None:
+            goal = self.arena.goal(i, random, place)
+        else:
+            x, y = place + drawn_way(random, *away)
+            height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
+            goal = np.array([x, y, height[0, 0]])
+        set_goal(i, goal, self.clock.steps[i], random, self.goals)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        take_all(env_ids, action, self._pack)
+
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Runs each simulation to the next switch of stance, or for a control step."""
+        if not len(env_ids):
+            return
+        by_plan = self.interface == 'plan'
+        begin_steps(env_ids, self._pack)
+        going = env_ids
+        while True:
+            if by_plan:
+                self._low_action[going] = self.controller(self._common.full[going])
+            else:
+                self._low_action[going] = self.state.action[going, len(PLAN_NAMES) :]
+            if act_all(going, self._low_action, self._common_pack):
+                self._lay_ground(going, self._common)
+            self.world.step(self._frame, going)
+            count = finish_control_steps(going, self._pack)
+            if self.watch is not None:
+                self.watch()
+            if not count:
+                return
+            if count < len(going):
+                going = going[~self.state.over[going]]
+
+    def lay(self, action: np.ndarray) -> np.ndarray:
+        """Lays out plans where a footstep begins, as the step to come would with the same actions.
+
+        With the interface 'frame' a footstep controller can so see a plan before it acts by it.
+
+        Args:
+          action: (n, k), in [-1, 1]; what lies behind the plan does not count.
+
+        Returns:
+          What the footstep controller observes now, (n, size); the observation has it as well.
+
+        Raises:
+          ValueError: actions of another shape, or with NaN or infinity.
+        """
+        everyone = self.world.all_ids
+        self.apply_action(self.action_map.checked(action, self.world.n), everyone)
+        show_plans(everyone, self._pack)
+        return self._common.full.copy()
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        check_simulated(self.state.lasted[env_ids])
+        if score_all(env_ids, self._pack):
+            self._draw(env_ids)
+        finish_all(env_ids, self._pack)
+
+    def _draw(self, env_ids: np.ndarray) -> None:
+        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        root, count = self.figure.found.root, self.clock.steps
+        if self.ball:
+            wanted = env_ids[self.ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self.ball.put(i, root[i, :2], count[i], self._random[i])
+            self.world.forward(wanted)
+        for i in env_ids[self.goals.wanted[env_ids]].tolist():
+            self._draw_goal(i, root[i, :2])
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """The plan, where the centre of mass has been, and the goal: of a ball as a disc."""
+        root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
+        there = goal_disc(goal, self._goal_reached) if self.ball else flag(goal)
+        return [
+            *plan_markers(env_id, root, self.plan), *trace_markers(env_id, self.trace), there,
+        ]  # fmt: skip
