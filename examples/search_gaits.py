@@ -169,7 +169,7 @@ class Learner:
         environments, columns = self.environments, self.scales.columns
         layers = [layer for layer in self.network if isinstance(layer, torch.nn.Linear)]
         return policies.Policy(
-            id=environments.row.id,
+            id=environments.spec.id,
             blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
             actions=tuple(environments.action_map.names),
             quantity=environments.action_map.quantity,
@@ -185,7 +185,7 @@ class Learner:
             info={
                 'seed': seed,
                 'samples': samples,
-                'character': characters.fingerprint(environments.task.character.row),
+                'character': characters.fingerprint(environments.task.character.spec),
             },
         )
 
@@ -218,7 +218,7 @@ def train(
     seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
     if curve:
         seconds = dict(curve[-1]['seconds'])
-    best = max((point['fraction'] for point in curve), default=-np.inf)
+    best = max((point['normalized_return'] for point in curve), default=-np.inf)
     observation = environments.reset()
     with tqdm.tqdm(total=int(s.samples), initial=len(found), unit='decision') as bar:
         bar.set_description(id_)
@@ -247,14 +247,16 @@ def train(
             )
             seconds['learning'] += middle - begin
             seconds['evaluation'] += time.perf_counter() - middle
-            point = {name: result[name] for name in ('fraction', 'full', 'distance')}
+            point = {
+                name: result[name] for name in ('normalized_return', 'completion_rate', 'distance')
+            }
             point |= {'samples': len(found), 'loss': loss, 'seconds': dict(seconds)}
             point['median_distance'] = float(np.median(result['distances']))
             point['searched'] = searched  # m; distances of the episodes that the search has ended
             searched = []
             curve.append(point)
-            if point['fraction'] > best:
-                best = point['fraction']
+            if point['normalized_return'] > best:
+                best = point['normalized_return']
                 policies.save(policy, folder / 'policy.npz')
             policies.save(policy, folder / 'last.npz')
             bar.set_postfix(distance=f'{point["median_distance"]:.1f} m', loss=f'{loss:.2f}')
@@ -289,7 +291,7 @@ def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'decisions')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(
-            f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["full"]:.0%} complete'
+            f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["completion_rate"]:.0%} complete'
         )
     print(folder / 'policy.npz')
 

@@ -69,8 +69,8 @@ class ListTest(CommandTest):
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
-        for line, row in zip(lines[1:-1], catalogue.ROWS, strict=True):
-            self.assertEndsWith(line, row.description)
+        for line, spec in zip(lines[1:-1], catalogue.SPECS, strict=True):
+            self.assertEndsWith(line, spec.description)
 
     @parameterized.parameters(
         (('--domain', 'imitation'), 27),
@@ -156,7 +156,7 @@ class InfoTest(CommandTest):
 
     def test_muscles_have_peak_forces(self):
         out = self.output('info', 'MTU_Biped2D_LLC_Imitate_Flat-v0')
-        self.assertIn('Action: 16 numbers in [-1, 1]; excitation = centre', out)
+        self.assertIn('Action: 16 numbers in [-1, 1]; excitation = action_offset', out)
         self.assertRegex(out, r'\n  right_VAS +0\.505 +0\.495 +6000\n')
         self.assertRegex(out, r'\n  strain +29 +45 +16 ')
 
@@ -172,7 +172,7 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 283 numbers', out)
         self.assertRegex(out, r'\n  terrain +0 +200 +200 +m .* to 10 m ahead')
         self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
-        self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = centre', out)
+        self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = action_offset', out)
         self.assertRegex(
             out, r'\n  BackForceX +378.3 +432.7  N +push of the hind foot on the body, ahead'
         )
@@ -220,7 +220,9 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  left_ankle +50 +57 +99 +105\n')
         self.assertRegex(out, r'\n +115 +118 +3  m +first landing place from the left foot')
         self.assertRegex(out, r'\n +124 +125 +1  rad +planned heading')
-        self.assertIn('Action: 17 numbers in [-1, 1]; target rotation vector in rad = centre', out)
+        self.assertIn(
+            'Action: 17 numbers in [-1, 1]; target rotation vector in rad = action_offset', out
+        )
         self.assertRegex(out, r'\n  torso_x +0 +1 +200\n')
         self.assertRegex(out, r'\n  left_knee +-0\.4\d+ +1 +150\n')
         self.assertRegex(out, r'\n  right_hip +4\.5 +ball, up to 2\.57 +200 +300 +30 +0\.5\n')
@@ -255,15 +257,17 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 2155 numbers', out)
         for name, start, stop in (
             ('surface', 0, 2048), ('pose', 2048, 2105), ('velocity', 2105, 2153),
-            ('target', 2153, 2155),
+            ('goal', 2153, 2155),
         ):  # fmt: skip
             self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start}  \S')
-        self.assertIn('Action: 5 numbers in [-1, 1]; footstep plan = centre + half range', out)
-        for name, centre, half_range, unit in (
+        self.assertIn(
+            'Action: 5 numbers in [-1, 1]; footstep plan = action_offset + action_scale', out
+        )
+        for name, action_offset, action_scale, unit in (
             ('first_x', '0.5', '1', 'm'), ('first_y', '0', '1', 'm'), ('second_x', '1', '2', 'm'),
             ('second_y', '0', '2', 'm'), ('turn', '0', '3.142', 'rad'),
         ):  # fmt: skip
-            self.assertRegex(out, rf'\n  {name} +{centre} +{half_range}  {unit}; ')
+            self.assertRegex(out, rf'\n  {name} +{action_offset} +{action_scale}  {unit}; ')
         self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
         self.assertRegex(out, r'\n  upright +0\.2  1\n')
         self.assertRegex(
@@ -314,7 +318,7 @@ class InfoTest(CommandTest):
             'straight on': 'straight on',
             'walks at 1.535 m/s': '3D walk',
             '27 of them': 'steps',
-            'option miss': 'footsteps',
+            'option max_landing_error': 'footsteps',
             'half a cycle of the walk': 'in the plane',
             'truly mirrored': 'mirrored',
             'slower than the steps': 'run',
@@ -648,13 +652,13 @@ class EvaluateTest(CommandTest):
                 'policy': 'mine.npz',
                 'episodes': '5, seed 3',
                 'return': f'{expected["return"]:.2f} +- {expected["return_interval"]:.2f} '
-                f'(95 % confidence), {expected["fraction"]:.1%} of the maximum 256',
+                f'(95 % confidence), {expected["normalized_return"]:.1%} of the maximum 256',
                 'length': f'{expected["length"]:.1f} of 256 steps',
                 'distance': '{distance:.2f} m ({0:.2f} to {1:.2f}, 95 % confidence), median '
                 '{median_distance:.2f} m, at {speed:.2f} m/s'.format(
                     *expected['distance_interval'], **expected
                 ),
-                'full length': f'{expected["full"]:.0%} of the episodes',
+                'full length': f'{expected["completion_rate"]:.0%} of the episodes',
                 'falls': f'{expected["falls"]:.0%} of the episodes',
             },
         )
@@ -668,10 +672,10 @@ class EvaluateTest(CommandTest):
 
     def test_the_scripted_baseline(self):
         self.assert_refused('no scripted policy', 'evaluate', GAPS, '--policy', 'scripted')
-        row = dataclasses.replace(suite.find('PD_Biped3D_HLC_Forest-v0'), step_limit=5)
-        with mock.patch.object(suite, 'find', lambda id_: row):
-            out = self.output('evaluate', row.id, '--policy', 'scripted', '--episodes', '2')
-        expected = evaluation.evaluate(row, scripted.scripted, 2, factory=True)
+        spec = dataclasses.replace(suite.find('PD_Biped3D_HLC_Forest-v0'), step_limit=5)
+        with mock.patch.object(suite, 'find', lambda id_: spec):
+            out = self.output('evaluate', spec.id, '--policy', 'scripted', '--episodes', '2')
+        expected = evaluation.evaluate(spec, scripted.scripted, 2, factory=True)
         self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
         self.assertIn('of the maximum 5\n', out)
 
@@ -797,7 +801,7 @@ class ProgramTest(CommandTest):
 
 
 class ReadmeTest(CommandTest):
-    """What the README and the guide show."""
+    """What the README and the expert show."""
 
     text = ''.join(
         (pathlib.Path(__file__).parents[1] / name).read_text(encoding='utf-8')

@@ -60,7 +60,7 @@ class PagesTest(absltest.TestCase):
 
     def test_numbers_in_the_readme(self):
         text = (ROOT / 'README.md').read_text(encoding='utf-8')
-        self.assertIn(f'{len(catalogue.ROWS)} environments', text)
+        self.assertIn(f'{len(catalogue.SPECS)} environments', text)
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of them are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
@@ -72,30 +72,30 @@ class WordsTest(parameterized.TestCase):
     )
     def test_what_is_built_on_other_ground_is_told_the_same(self, id_):
         """Pages of environments that differ by their ground share what was built."""
-        row = suite.find(id_)
+        spec = suite.find(id_)
         other = next(
-            each for each in catalogue.ROWS
-            if each.terrain != row.terrain and each.options == row.options
-            and (each.rules, each.character, each.clip) == (row.rules, row.character, row.clip)
+            each for each in catalogue.SPECS
+            if each.terrain != spec.terrain and each.options == spec.options
+            and (each.rules, each.character, each.clip) == (spec.rules, spec.character, spec.clip)
         )  # fmt: skip
-        own, shared = (suite.build_row(each, {}, {}) for each in (row, other))
-        self.assertEqual(list(describe.sections(row, own)), list(describe.sections(row, shared)))
+        own, shared = (suite.build_row(each, {}, {}) for each in (spec, other))
+        self.assertEqual(list(describe.sections(spec, own)), list(describe.sections(spec, shared)))
 
     @parameterized.parameters(
         ('journey', '1 to 3 m ahead of the walker along x'), ('hike', 'up to 3 m from the walker'),
     )  # fmt: skip
     def test_goals_of_open_ground(self, task, words):
-        row = suite.combine('biped3d_mocap', terrain='plane', task=task)
-        told = dict(describe.sections(row, suite.build_row(row, {}, {})))
+        spec = suite.combine('biped3d_mocap', terrain='plane', task=task)
+        told = dict(describe.sections(spec, suite.build_row(spec, {}, {})))
         self.assertIn(words, told['Goal'])
         self.assertIn('at the origin', told['Start'])
 
     def test_every_option_is_explained(self):
-        known = {name for row in catalogue.ROWS for name in build.task_options(row)}
+        known = {name for spec in catalogue.SPECS for name in build.task_options(spec)}
         known |= set(build.task_options(suite.combine('dog', task='walk')))
         self.assertEqual(known - {'interface'}, set(options.MEANINGS))
-        row = suite.find('PD_Biped3D_HLC_Forest-v0')
-        table = options.options(row, build.task_options(row)).parts[0]
+        spec = suite.find('PD_Biped3D_HLC_Forest-v0')
+        table = options.options(spec, build.task_options(spec)).parts[0]
         meanings = {name: (default, meaning) for name, default, meaning in table.cells}
         self.assertIn('frame', meanings['interface'][1])
         self.assertEqual(meanings['step_limit'][0], 400)

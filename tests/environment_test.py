@@ -9,7 +9,7 @@ from dm_env import test_utils
 from helpers import links_on_ground
 
 from trl_suite import characters, motion, suite, terrain
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.imitation.planar import Imitation
 
@@ -408,7 +408,7 @@ class EpisodeTest(parameterized.TestCase):
         self.assertTrue(environment.info['fell'])
         self.assertFalse(environment.info['diverged'])
         self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
-        fall_links = environment.task.character.row.fall_links
+        fall_links = environment.task.character.spec.fall_links
         self.assertNotEmpty(links_on_ground(environment) & set(fall_links))
         step = environment.step(action)
         self.assertTrue(step.first())
@@ -517,8 +517,8 @@ class ObservableTest(parameterized.TestCase):
     """A user's own observables beside the blocks."""
 
     def build(self, **options):
-        row = suite.find('PD_Dog2D_Gaps_Terrain-v0')
-        task = suite.build_task(row)
+        spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
+        task = suite.build_task(spec)
         observables = task.character.observables
         for name in ('joints_pos', 'bodies_pos', 'root_pos'):
             getattr(observables, name).enabled = True
@@ -573,7 +573,7 @@ class HookTest(parameterized.TestCase):
 
     def task(self, cls=Imitation):
         return cls(
-            characters.make('biped2d'), PlanarTerrain(terrain.load('flat')),
+            characters.make('biped2d'), PlanarArena(terrain.load('flat')),
             motion.load('biped2d_walk'),
         )  # fmt: skip
 

@@ -26,7 +26,7 @@ def sizes(environment):
 
 def root_of(environment):
     """Place (3,) m and heading (rad) of the root."""
-    named, name = environment.physics.named.data, environment.task.character.row.name
+    named, name = environment.physics.named.data, environment.task.character.spec.name
     ahead = named.xmat[f'{name}/root'].reshape(3, 3)[:, 0]
     return named.xpos[f'{name}/root'].copy(), np.arctan2(ahead[1], ahead[0])
 

@@ -75,14 +75,14 @@ def plain(policy, observation):
         for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
     ]
     if line is not None:
-        rows = [[value] for value in x[: line.line]]
+        env_ids = [[value] for value in x[: line.line]]
         for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
             width, channels, filters = weight.shape
-            rows = [
+            env_ids = [
                 [
                     hidden(
                         sum(
-                            rows[start + w][c] * float(weight[w, c, o])
+                            env_ids[start + w][c] * float(weight[w, c, o])
                             for w in range(width)
                             for c in range(channels)
                         )
@@ -90,9 +90,9 @@ def plain(policy, observation):
                     )
                     for o in range(filters)
                 ]
-                for start in range(0, len(rows) - width + 1, stride)
+                for start in range(0, len(env_ids) - width + 1, stride)
             ]
-        x = [value for row in rows for value in row] + x[line.line :]
+        x = [value for row in env_ids for value in row] + x[line.line :]
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         x = [
             sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])
@@ -591,15 +591,17 @@ class ShippedTest(parameterized.TestCase):
         self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
 
     def test_every_planar_row_that_tracks_a_clip_has_one(self):
-        rows = [row for row in catalogue.ROWS if row.rules == 'imitation' and 'planar' in row.tags]
-        self.assertLen(rows, 42)
-        self.assertContainsSubset([row.id for row in rows], policies.available())
+        specs = [
+            spec for spec in catalogue.SPECS if spec.rules == 'imitation' and 'planar' in spec.tags
+        ]
+        self.assertLen(specs, 42)
+        self.assertContainsSubset([spec.id for spec in specs], policies.available())
 
     @parameterized.parameters(
         *(
-            row.id
-            for row in catalogue.ROWS
-            if row.domain == 'plaid' and row.id in policies.available()
+            spec.id
+            for spec in catalogue.SPECS
+            if spec.domain == 'plaid' and spec.id in policies.available()
         )
     )
     def test_who_does_not_fall_gets_on(self, id_):

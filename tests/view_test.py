@@ -185,7 +185,7 @@ class WindowTest(parameterized.TestCase):
         self.assertGreater(screen.pictures[-1].std(), 10)
         body = shown._viewer.camera.settings.trackbodyid
         name = environment.physics.model.id2name(body, 'body')
-        self.assertEqual(name, f'{environment.task.character.row.name}/')
+        self.assertEqual(name, f'{environment.task.character.spec.name}/')
 
     def test_ground_that_changes_is_drawn_as_it_is(self):
         environment = suite.make(HILLS, {'random': 1})

@@ -40,7 +40,7 @@ from trl_suite.util import errors, files
 
 FIRST_TEST_SEED = 2**31  # of 2**32; smaller ones are for training
 EPISODES = 32  # of every test
-SCORE = 'fraction'  # what counts of an evaluation: the mean return over the step limit
+SCORE = 'normalized_return'  # what counts of an evaluation: the mean return over the step limit
 _SETTINGS = ('sequence', 'ids', 'budget', 'episodes', 'seed')  # that a result must agree on
 
 

@@ -11,7 +11,7 @@ from trl_suite import characters, motion, policies
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import DIMENSIONS, build_task, character_of
-from trl_suite.registry.catalogue import Row, find
+from trl_suite.registry.catalogue import EnvSpec, find
 from trl_suite.tasks.footsteps.planar import check_feet
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.walk import WALK
@@ -20,7 +20,7 @@ from trl_suite.util import errors
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
 ALL_TASKS: tuple[tuple[str, str], ...] = tuple(catalogue.BY_TASK)
 BENCHMARKING: tuple[tuple[str, str], ...] = tuple(
-    key for key, row in catalogue.BY_TASK.items() if 'original' in row.tags
+    key for key, spec in catalogue.BY_TASK.items() if 'original' in spec.tags
 )
 TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
@@ -71,8 +71,8 @@ def load(
                 f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name]
             )
         )
-    row = catalogue.BY_TASK[domain_name, task_name]
-    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    spec = catalogue.BY_TASK[domain_name, task_name]
+    return build_row(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def make(
@@ -98,7 +98,7 @@ def reference_policy(id: str) -> policies.Policy:
 
 
 def build(
-    character: str | characters.CharacterRow,
+    character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
     task: str | Callable[..., Task] = 'imitation',
@@ -110,23 +110,23 @@ def build(
 
     Args:
       character, actuation, terrain, task, clip: as for `combine`.
-      task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
+      task_kwargs: as for `load`; the task's options, e.g. `terrain_observation=50`.
       environment_kwargs: as for `load`.
 
     Raises:
       ValueError: unknown names, options, or parts that do not fit each other.
     """
-    row = combine(character, actuation, terrain, task, clip)
-    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    spec = combine(character, actuation, terrain, task, clip)
+    return build_row(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def combine(
-    character: str | characters.CharacterRow,
+    character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
     task: str | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
-) -> Row:
+) -> EnvSpec:
     """Returns the row of a combination: what `VectorEnvironment` and Gymnasium take.
 
     Args:
@@ -180,7 +180,7 @@ def combine(
             clip = _own_motion(name, title in _OF_STEPS and spatial)
     if terrain is None:
         terrain = 'plane' if spatial else 'flat'
-    return Row(
+    return EnvSpec(
         id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{title}',
         domain='custom',
         task=title,
@@ -212,20 +212,20 @@ def _own_motion(name: str, steps: bool) -> str:
 
 
 def build_row(
-    row: Row, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
+    spec: EnvSpec, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
 ) -> Environment:
     """Builds the environment of a row; see `load` for the arguments."""
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
     for name in environment_kwargs:
         if name not in known:
             raise ValueError(errors.unknown('option of an environment', name, known))
-    options = {'step_limit': row.step_limit, **environment_kwargs}
+    options = {'step_limit': spec.step_limit, **environment_kwargs}
     for name in _ENVIRONMENT_OPTIONS:
         if name in task_kwargs:
             options[name] = task_kwargs[name]
     task = build_task(
-        row, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
+        spec, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
     )
     environment = Environment(task, **options)
-    environment._recipe = (build_row, (row, task_kwargs, environment_kwargs))
+    environment._recipe = (build_row, (spec, task_kwargs, environment_kwargs))
     return environment

@@ -20,14 +20,14 @@ _TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
 
 @dataclasses.dataclass(frozen=True)
 class ActionMap:
-    """The map from an action in [-1, 1] to control: centre + half_range * action.
+    """The map from an action in [-1, 1] to control: action_offset + action_scale * action.
 
     Attributes:
       names: what each action drives, shape (k,).
       quantity: what the controls are, e.g. 'target angle'.
       unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
-      centre: control at action 0, shape (k,).
-      half_range: change of control per unit action, shape (k,).
+      action_offset: control at action 0, shape (k,).
+      action_scale: change of control per unit action, shape (k,).
       actuators: names of the actuators that take the controls, one after the other; those of ball
         joints take three each. Empty where a controller stands between.
     """
@@ -35,8 +35,8 @@ class ActionMap:
     names: tuple[str, ...]
     quantity: str
     unit: str
-    centre: np.ndarray
-    half_range: np.ndarray
+    action_offset: np.ndarray
+    action_scale: np.ndarray
     actuators: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -44,38 +44,38 @@ class ActionMap:
 
     def control(self, action: np.ndarray) -> np.ndarray:
         """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
-        low, high, half_range, centre = self._rows
+        low, high, action_scale, action_offset = self._rows
         control = np.maximum(action, low)  # packed rows: quicker than scalars
         np.minimum(control, high, out=control)
-        control *= half_range
-        control += centre
+        control *= action_scale
+        control += action_offset
         return control if np.ndim(action) > 1 else control[0]
 
     def drive(self, first: int) -> Drive:
         """Returns the map for compiled functions; `first` is the address of the first control."""
         vectors, none = np.zeros((0, 3), int), np.zeros(0, int)
         return Drive(
-            self.centre, self.half_range, first, vectors, np.zeros(0), none, vectors,
+            self.action_offset, self.action_scale, first, vectors, np.zeros(0), none, vectors,
             np.zeros((2, 0), int),
         )  # fmt: skip
 
     @functools.cached_property
     def _rows(self) -> tuple[np.ndarray, ...]:
         ones = np.ones((1, len(self)))
-        return -ones, ones, self.half_range[None], self.centre[None]
+        return -ones, ones, self.action_scale[None], self.action_offset[None]
 
     def action(self, control: np.ndarray) -> np.ndarray:
         """Maps controls (..., k) to the actions that cause them; not clipped."""
-        return (control - self.centre) / self.half_range
+        return (control - self.action_offset) / self.action_scale
 
-    def checked(self, action: npt.ArrayLike, *rows: int) -> np.ndarray:
-        """Returns an action as floats, (k,), or the actions of some rows, (rows, k).
+    def checked(self, action: npt.ArrayLike, *env_ids: int) -> np.ndarray:
+        """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k).
 
         Raises:
-          ValueError: another shape, or NaN or infinity; the row and what is driven are named.
+          ValueError: another shape, or NaN or infinity; the simulation and what is driven are named.
         """
-        shape = (*rows, len(self))
-        are, have = ('actions are', 'actions have') if rows else ('action is', 'action has')
+        shape = (*env_ids, len(self))
+        are, have = ('actions are', 'actions have') if env_ids else ('action is', 'action has')
         try:
             action = np.asarray(action, dtype=float)
         except (TypeError, ValueError) as error:
@@ -84,10 +84,10 @@ class ActionMap:
             raise ValueError(f'{have} shape {action.shape}; expected {shape}')
         # The quick test first; huge numbers fail it and pass the other.
         if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
-            *row, i = np.argwhere(~np.isfinite(action))[0]
-            place = f'action of row {row[0]}, number {i}' if row else f'action[{i}]'
+            *env_id, i = np.argwhere(~np.isfinite(action))[0]
+            place = f'action of simulation {env_id[0]}, number {i}' if env_id else f'action[{i}]'
             raise ValueError(
-                f'{place} ({self.names[i]}) is {action[(*row, i)]}; expected finite numbers'
+                f'{place} ({self.names[i]}) is {action[(*env_id, i)]}; expected finite numbers'
             )
         return action
 
@@ -239,6 +239,6 @@ class AngleAxisMap(ActionMap):
 
 
 def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Lengths of vectors (..., 3); in every row the same whatever the number of rows."""
+    """Lengths of vectors (..., 3); in every simulation the same whatever the number of simulations."""
     square = vectors * vectors
     return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])

@@ -36,17 +36,17 @@ TORQUE_SCALE = 0.75  # of the limit at full action
 FORCE_SCALE = 1.0  # the same of a prismatic joint
 VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
 SLIDE_VELOCITY_SCALE = 10.0  # m/s; at rest the hopper's leg then meets its force limit
-POSITION_HALF_RANGE = 1.5  # rad at full action; of a prismatic joint half its range
+POSITION_SCALE = 1.5  # rad at full action; of a prismatic joint half its range
 ORIGINAL_SPAN = 2.0  # of the range of a joint; how far the original's position targets go at most
 ROTATIONS = ('vector', 'angle_axis')  # how position actions describe the rotation of a ball joint
-EXCITATION_CENTRE, EXCITATION_HALF_RANGE = 0.505, 0.495  # [0.01, 1]
+EXCITATION_OFFSET, EXCITATION_SCALE = 0.505, 0.495  # [0.01, 1]
 
 
 def _prepare(
     character: Character, timestep: float, damping: np.ndarray, least: np.ndarray | None = None
 ) -> None:
     """Gives every joint its armature, at least `least` (J,), damping (J,) and a stiff limit."""
-    armature = np.array([joint.armature for joint in character.row.joints.values()])
+    armature = np.array([joint.armature for joint in character.spec.joints.values()])
     armature = armature if least is None else np.maximum(armature, least)
     for joint, inertia, value in zip(character.joints, armature, damping, strict=True):
         joint.armature = inertia
@@ -66,7 +66,7 @@ def _by_type(character: Character, revolute: float, prismatic: float) -> np.ndar
 
 def _unit(character: Character, revolute: str, prismatic: str) -> str:
     """Returns the unit of controls that drive joints."""
-    slides = np.array(list(character.row.joints))[character.prismatic]
+    slides = np.array(list(character.spec.joints))[character.prismatic]
     return f'{revolute} ({", ".join(slides)}: {prismatic})' if len(slides) else revolute
 
 
@@ -74,7 +74,7 @@ def _split(character: Character, parts: Sequence[str]) -> tuple[str, ...]:
     """Returns the names of the joints, each ball joint's once for every part of it."""
     return tuple(
         f'{name}_{part}' if ball else name
-        for name, ball in zip(character.row.joints, character.spherical, strict=True)
+        for name, ball in zip(character.spec.joints, character.spherical, strict=True)
         for part in (parts if ball else ('',))
     )
 
@@ -89,7 +89,7 @@ def _balls(character: Character, size: int) -> np.ndarray:
 def _dofs(character: Character) -> Iterator[tuple[str, mjcf.Element, dict[str, Any]]]:
     """Yields name and joint of every degree of freedom, and what its actuator needs to know."""
     for name, joint, ball in zip(
-        character.row.joints, character.joints, character.spherical, strict=True
+        character.spec.joints, character.joints, character.spherical, strict=True
     ):
         if ball:
             for axis, gear in zip('xyz', np.eye(3), strict=True):
@@ -105,7 +105,7 @@ def original_ranges(character: Character) -> np.ndarray:
     """
     ranges = character.joint_ranges
     ranges[character.spherical, 0] = -ranges[character.spherical, 1]
-    for i, joint in enumerate(character.row.joints.values()):
+    for i, joint in enumerate(character.spec.joints.values()):
         if joint.original_range is not None:
             ranges[i] = joint.original_range
     free = ~np.isfinite(ranges).all(1)
@@ -133,7 +133,7 @@ def _add_torque(character: Character, timestep: float, **_: object) -> ActionMap
 
 def _add_velocity(character: Character, timestep: float, **_: object) -> ActionMap:
     limits, ball = character.torque_limits, character.spherical
-    kd = np.array([joint.kd for joint in character.row.joints.values()])
+    kd = np.array([joint.kd for joint in character.spec.joints.values()])
     passive, least, clamps = np.zeros(len(limits)), None, limits
     if ball.any():
         # Limbs on ball joints spin up without passive damping. The drive makes up for its pull
@@ -163,20 +163,20 @@ def _add_velocity(character: Character, timestep: float, **_: object) -> ActionM
 def _add_position(
     character: Character,
     timestep: float,
-    centre: Sequence[float] | np.ndarray | None = None,
-    half_range: float | Sequence[float] | np.ndarray | None = None,
+    action_offset: Sequence[float] | np.ndarray | None = None,
+    action_scale: float | Sequence[float] | np.ndarray | None = None,
     rotations: str = 'vector',
     **_: object,
 ) -> ActionMap:
     if rotations not in ROTATIONS:
         raise ValueError(errors.unknown('way to describe rotations', rotations, ROTATIONS))
     limits = character.torque_limits
-    joints = list(character.row.joints.values())
+    joints = list(character.spec.joints.values())
     kd = np.array([joint.kd for joint in joints])
     passive = np.minimum(limits / DAMPING_DIVISOR, kd)
     _prepare(character, timestep, passive)
     for name, joint, element, limit, servo, ball in zip(
-        character.row.joints, joints, character.joints, limits, kd - passive, character.spherical,
+        character.spec.joints, joints, character.joints, limits, kd - passive, character.spherical,
         strict=True,
     ):  # fmt: skip
         if ball:
@@ -192,34 +192,36 @@ def _add_position(
                 forcelimited=True, forcerange=(-limit, limit),
             )  # fmt: skip
     if rotations == 'angle_axis':
-        if centre is not None or half_range is not None:
-            raise ValueError('angles and axes are those of the original: no centre, no half_range')
+        if action_offset is not None or action_scale is not None:
+            raise ValueError(
+                'angles and axes are those of the original: no action_offset, no action_scale'
+            )
         return _angle_axis(character)
     names = _split(character, 'xyz')
-    if centre is None:
+    if action_offset is None:
         middle = np.concatenate([
             np.broadcast_to(joint.target, size)
             for joint, size in zip(joints, character.dofs, strict=True)
         ]).astype(float)  # fmt: skip
     else:
-        middle = np.array(centre)
-    if half_range is None:
+        middle = np.array(action_offset)
+    if action_scale is None:
         slide = np.ptp(character.joint_ranges, axis=1) / 2
         # Joints that hardly move get the original's reach.
         original = ORIGINAL_SPAN * np.ptp(original_ranges(character), axis=1)
-        turn = np.minimum(POSITION_HALF_RANGE, original)
-        half_range = _spread(character, np.where(character.prismatic, slide, turn))
-    reach = np.broadcast_to(np.asarray(half_range, dtype=float), len(names)).copy()
+        turn = np.minimum(POSITION_SCALE, original)
+        action_scale = _spread(character, np.where(character.prismatic, slide, turn))
+    reach = np.broadcast_to(np.asarray(action_scale, dtype=float), len(names)).copy()
     if middle.shape != (len(names),) or not (
         np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
     ):
         raise ValueError(
-            f'position control of {character.row.name!r}: centre and half_range must be finite, '
+            f'position control of {character.spec.name!r}: action_offset and action_scale must be finite, '
             f'positive in range, and broadcast to ({len(names)},)'
         )
     quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')
-    return ActionMap(names, quantity, unit, middle, reach, tuple(character.row.joints))
+    return ActionMap(names, quantity, unit, middle, reach, tuple(character.spec.joints))
 
 
 def _angle_axis(character: Character) -> AngleAxisMap:
@@ -231,14 +233,14 @@ def _angle_axis(character: Character) -> AngleAxisMap:
     names = _split(character, ('angle', 'forward', 'up', 'right'))
     sizes = np.where(ball, 4, 1)
     angles = _balls(character, 4)
-    centre = np.repeat(np.where(ball, 0, ranges.mean(1)), sizes)
-    half_range = np.repeat(span, sizes)
-    centre[angles + 3] = AXIS_OFFSET
-    half_range[angles[:, None] + np.arange(1, 4)] = 1
+    action_offset = np.repeat(np.where(ball, 0, ranges.mean(1)), sizes)
+    action_scale = np.repeat(span, sizes)
+    action_offset[angles + 3] = AXIS_OFFSET
+    action_scale[angles[:, None] + np.arange(1, 4)] = 1
     others = [np.cumsum(width)[~ball] - 1 for width in (sizes, character.dofs)]
     return AngleAxisMap(
-        names, 'target angle and axis', _unit(character, 'rad and 1', 'm'), centre, half_range,
-        tuple(character.row.joints), angles=angles,
+        names, 'target angle and axis', _unit(character, 'rad and 1', 'm'), action_offset, action_scale,
+        tuple(character.spec.joints), angles=angles,
         balls=_balls(character, 3)[:, None] + np.arange(3), hinges=np.array(others),
     )  # fmt: skip
 
@@ -248,7 +250,7 @@ def _add_muscle(
 ) -> ActionMap:
     units = character_muscles(character, muscle_set)
     _prepare(character, timestep, character.torque_limits / MUSCLE_DAMPING_DIVISOR)
-    joints = dict(zip(character.row.joints, character.joints, strict=True))
+    joints = dict(zip(character.spec.joints, character.joints, strict=True))
     for unit in units:
         tendon = character.mjcf_model.tendon.add('fixed', name=unit.name)
         for arm in unit.arms:
@@ -261,7 +263,7 @@ def _add_muscle(
         )  # fmt: skip
     return ActionMap(
         tuple(unit.name for unit in units), 'excitation', '1',
-        np.full(len(units), EXCITATION_CENTRE), np.full(len(units), EXCITATION_HALF_RANGE),
+        np.full(len(units), EXCITATION_OFFSET), np.full(len(units), EXCITATION_SCALE),
         tuple(unit.name for unit in units),
     )  # fmt: skip
 
@@ -283,7 +285,7 @@ def character_muscles(
     Raises:
       ValueError: the character has none, or no such set.
     """
-    name = character.row.name
+    name = character.spec.name
     sets = muscle_tables.MUSCLES.get(name)
     if sets is None:
         raise ValueError(
@@ -301,7 +303,7 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       character: a character without actuators.
       model: one of `ACTUATIONS`.
       timestep: physics time step, s; joint limits are as stiff as it allows.
-      **options: for 'position', `centre` and `half_range` of every degree of freedom, (D,), rad (m
+      **options: for 'position', `action_offset` and `action_scale` of every degree of freedom, (D,), rad (m
         where prismatic); by default the working posture, and 1.5 rad, half the range of a prismatic
         joint, or for joints that hardly move twice their range. `rotations`: how actions describe
         the rotation of a ball joint: by a rotation vector, 'vector', or by an angle and an axis,

@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike
 from trl_suite import rendering, suite
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.vector import VectorEnvironment
-from trl_suite.registry.catalogue import Row
+from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import errors
 
 try:
@@ -54,7 +54,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
     metadata = METADATA
 
     def __init__(
-        self, environment: str | Row | Environment, *, flat_observation: bool = True,
+        self, environment: str | EnvSpec | Environment, *, flat_observation: bool = True,
         task_kwargs: Info | None = None, dtype: DTypeLike = np.float32,
         max_episode_steps: int | None = None, render_mode: str | None = None,
         render_kwargs: Info | None = None,
@@ -78,8 +78,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
-            row = suite.find(environment) if isinstance(environment, str) else environment
-            environment = suite.build_row(row, limited(row, task_kwargs, max_episode_steps), {})
+            spec = suite.find(environment) if isinstance(environment, str) else environment
+            environment = suite.build_row(spec, limited(spec, task_kwargs, max_episode_steps), {})
         elif task_kwargs or max_episode_steps is not None:
             raise ValueError(
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'
@@ -142,14 +142,14 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
 class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     """A `trl_suite.environments.vector.VectorEnvironment`: what `gymnasium.make_vec` makes by default.
 
-    With the same seeds, row i returns what row i of a `SyncVectorEnv` of `SuiteEnv` does.
-    `reset(seed=[s0, s1, ...])` gives every row its own. `reset(seed=s)` seeds the whole: row i gets
+    With the same seeds, simulation i returns what simulation i of a `SyncVectorEnv` of `SuiteEnv` does.
+    `reset(seed=[s0, s1, ...])` gives every simulation its own. `reset(seed=s)` seeds the whole: simulation i gets
     the i-th number of `numpy.random.SeedSequence(s).generate_state(n)`, not s + i, so that
     neighbouring seeds have no episodes in common.
     """
 
     def __init__(
-        self, environment: str | Row, num_envs: int = 1, *, num_threads: int = 0,
+        self, environment: str | EnvSpec, num_envs: int = 1, *, num_threads: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         flat_observation: bool = True, task_kwargs: Info | None = None,
         dtype: DTypeLike = np.float32, max_episode_steps: int | None = None,
@@ -158,7 +158,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         """Makes the environment; the other arguments and errors are those of `SuiteEnv`.
 
         Args:
-          num_envs: number of rows.
+          num_envs: number of simulations.
           num_threads: threads that step the physics; 0 takes all cores.
           autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's own constants.
           dtype: of observations, actions and rewards.
@@ -171,10 +171,10 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
-        row = suite.find(environment) if isinstance(environment, str) else environment
-        options = limited(row, task_kwargs, max_episode_steps)
+        spec = suite.find(environment) if isinstance(environment, str) else environment
+        options = limited(spec, task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
-            row, num_envs, num_threads, options.pop('random', None),
+            spec, num_envs, num_threads, options.pop('random', None),
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
             task_kwargs=options,
         )  # fmt: skip
@@ -189,16 +189,18 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
     ) -> tuple[Any, Info]:
-        """Begins episodes, seeded anew if `seed` is given, in `options['reset_mask']` or all rows."""
-        rows = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
-        if rows.dtype != bool or rows.shape != (self.num_envs,) or not rows.any():
-            raise ValueError(f'reset_mask is {rows}; expected {self.num_envs} bools, not all false')
-        observation = self.environment.reset(rows, seed)
+        """Begins episodes, seeded anew if `seed` is given, in `options['reset_mask']` or all simulations."""
+        env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
+        if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
+            raise ValueError(
+                f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
+            )
+        observation = self.environment.reset(env_ids, seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        return observation, masked(self.environment.info, rows)
+        return observation, masked(self.environment.info, env_ids)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Takes one step in every row; arguments and errors are those of `VectorEnvironment.step`."""
+        """Takes one step in every simulation; arguments and errors are those of `VectorEnvironment.step`."""
         observation, reward, terminated, truncated, info = self.environment.step(actions)
         result: Info = {}
         ended = info.pop('ended', np.zeros(1, bool))
@@ -212,9 +214,12 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         return observation, reward, terminated, truncated, result
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
-        """Draws every row; None if render_mode is None."""
-        rows = range(self.num_envs if self.render_mode else 0)
-        return tuple(self.environment.render(row, **self._render_kwargs) for row in rows) or None
+        """Draws every simulation; None if render_mode is None."""
+        env_ids = range(self.num_envs if self.render_mode else 0)
+        return (
+            tuple(self.environment.render(env_id, **self._render_kwargs) for env_id in env_ids)
+            or None
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulations."""
@@ -226,14 +231,14 @@ def metadata(task: Any) -> Info:
     return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
 
 
-def limited(row: Row, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
-    """Options whose step limit is the smaller of a row's and Gymnasium's (None or -1 for none)."""
+def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
+    """Options whose step limit is the smaller of a simulation's and Gymnasium's (None or -1 for none)."""
     options = dict(task_kwargs or {})
     if max_episode_steps is None or max_episode_steps == -1:
         return options
     if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
         raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
-    own = options.get('step_limit', row.step_limit)
+    own = options.get('step_limit', spec.step_limit)
     options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
     return options
 
@@ -241,7 +246,7 @@ def limited(row: Row, task_kwargs: Info | None, max_episode_steps: int | None) -
 def observation_space(
     shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any, n: tuple[int, ...] = ()
 ) -> spaces.Box | spaces.Dict:
-    """Returns the space of blocks of these shapes, flat or not; of n rows if n is given."""
+    """Returns the space of blocks of these shapes, flat or not; of n simulations if n is given."""
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f'dtype is {np.dtype(dtype)}; expected float32 or float64')
     bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
@@ -258,14 +263,14 @@ def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, shape, dtype)
 
 
-def masked(info: Info, rows: np.ndarray) -> Info:
-    """Info as Gymnasium has it: 0 in other rows, and beside each key '_key', the mask of rows."""
+def masked(info: Info, env_ids: np.ndarray) -> Info:
+    """Info as Gymnasium has it: 0 in other simulations, and beside each key '_key', the mask of simulations."""
     result: Info = {}
     for name, value in info.items():
-        result[name] = masked(value, rows) if isinstance(value, dict) else value.copy()
+        result[name] = masked(value, env_ids) if isinstance(value, dict) else value.copy()
         if not isinstance(value, dict):
-            result[name][~rows] = 0
-        result[f'_{name}'] = rows.copy()
+            result[name][~env_ids] = 0
+        result[f'_{name}'] = env_ids.copy()
     return result
 
 

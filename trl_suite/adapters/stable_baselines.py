@@ -19,7 +19,7 @@ import numpy as np
 
 from trl_suite.adapters.gym import action_space, observation_space
 from trl_suite.environments.vector import VectorEnvironment
-from trl_suite.registry.catalogue import Row
+from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import errors
 
 try:
@@ -32,18 +32,18 @@ Indices = None | int | Iterable[int]
 
 
 class SuiteVecEnv(VecEnv):
-    """Many simulations on threads; a row that ends begins anew in the same step.
+    """Many simulations on threads; a simulation that ends begins anew in the same step.
 
-    The info of a row has 'fell', 'diverged', 'distance' (m), 'reward_terms' (a dict) and
-    'TimeLimit.truncated'; that of a row which ended also has 'terminal_observation'. `seed(s)` gives
-    row i the seed s + i at the next reset, as everywhere in Stable-Baselines3.
+    The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_terms' (a dict) and
+    'TimeLimit.truncated'; that of a simulation which ended also has 'terminal_observation'. `seed(s)` gives
+    simulation i the seed s + i at the next reset, as everywhere in Stable-Baselines3.
 
     Attributes:
       environment: the `trl_suite.environments.vector.VectorEnvironment` underneath.
     """
 
     def __init__(
-        self, environment: str | Row, num_envs: int, num_threads: int = 0,
+        self, environment: str | EnvSpec, num_envs: int, num_threads: int = 0,
         seed: int | Sequence[int] | None = None, *, flat_observation: bool = True,
         step_limit: int | None = -1, task_kwargs: dict[str, Any] | None = None,
         render_mode: str | None = None, render_kwargs: dict[str, Any] | None = None,
@@ -52,9 +52,9 @@ class SuiteVecEnv(VecEnv):
 
         Args:
           environment: id, alias, or row of the catalogue.
-          num_envs: number of rows.
+          num_envs: number of simulations.
           num_threads: threads that step the physics; 0 takes all cores.
-          seed: of the whole: row i gets a child seed; or a sequence of n seeds.
+          seed: of the whole: simulation i gets a child seed; or a sequence of n seeds.
           flat_observation: give one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
           render_mode: 'rgb_array', or None for no pictures.
           render_kwargs: options of `trl_suite.rendering.frame`.
@@ -77,7 +77,7 @@ class SuiteVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Begins an episode in every row; options of `set_options` have no meaning here."""
+        """Begins an episode in every simulation; options of `set_options` have no meaning here."""
         seeds = None if None in self._seeds else [int(seed) % 2**32 for seed in self._seeds]  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()
@@ -96,9 +96,9 @@ class SuiteVecEnv(VecEnv):
         infos = rows_of({**info, 'TimeLimit.truncated': truncated})
         if ended.any():
             begun = rows_of(self.environment.info)
-            for row in np.flatnonzero(ended).tolist():
-                infos[row]['terminal_observation'] = row_of(final, row)
-                self.reset_infos[row] = begun[row]
+            for env_id in np.flatnonzero(ended).tolist():
+                infos[env_id]['terminal_observation'] = row_of(final, env_id)
+                self.reset_infos[env_id] = begun[env_id]
         return observation, reward, terminated | truncated, infos
 
     def close(self) -> None:
@@ -106,40 +106,47 @@ class SuiteVecEnv(VecEnv):
         self.environment.close()
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Draws every row, (h, w, 3) uint8 each; None if render_mode is None."""
+        """Draws every simulation, (h, w, 3) uint8 each; None if render_mode is None."""
         if self.render_mode is None:
             return [None] * self.num_envs
-        return [self.environment.render(row, **self._render_kwargs) for row in range(self.num_envs)]
+        return [
+            self.environment.render(env_id, **self._render_kwargs)
+            for env_id in range(self.num_envs)
+        ]
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of this object or of `environment`, once for each row asked for."""
+        """Returns an attribute of this object or of `environment`, once for each simulation asked for."""
         owner = self if attr_name in ('render_mode', 'observation_space', 'action_space') else None
         value = getattr(owner or self.environment, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        raise NotImplementedError(f'rows share one object: set {attr_name} on its `environment`')
+        raise NotImplementedError(
+            f'simulations share one object: set {attr_name} on its `environment`'
+        )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        raise NotImplementedError(f'rows share one object: call {method_name} of its `environment`')
+        raise NotImplementedError(
+            f'simulations share one object: call {method_name} of its `environment`'
+        )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
-        """No row has a Gymnasium wrapper."""
+        """No simulation has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
 
 def rows_of(info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Turns a dict of arrays of n rows into n dicts of plain values."""
+    """Turns a dict of arrays of n simulations into n dicts of plain values."""
     columns = (
         rows_of(value) if isinstance(value, dict) else value.tolist() for value in info.values()
     )
     return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
-def row_of(observation: Any, row: int) -> Any:
-    """Returns the observation of one row."""
+def row_of(observation: Any, env_id: int) -> Any:
+    """Returns the observation of one simulation."""
     if isinstance(observation, dict):
-        return {name: value[row] for name, value in observation.items()}
-    return observation[row]
+        return {name: value[env_id] for name, value in observation.items()}
+    return observation[env_id]

@@ -29,8 +29,8 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from trl_suite.characters.character import CharacterRow, Joint
-from trl_suite.characters.inspect import KINDS, Found, check_numbers, named, problem
+from trl_suite.characters.character import CharacterSpec, Joint
+from trl_suite.characters.inspect import KINDS, ModelInspector, check_numbers, named, problem
 from trl_suite.characters.specs import CHARACTERS
 from trl_suite.util import errors
 from trl_suite.util.files import existing
@@ -58,7 +58,7 @@ def from_file(
     stumble_exempt: Sequence[str] | None = None,
     name: str | None = None,
     description: str = "A user's own character.",
-) -> CharacterRow:
+) -> CharacterSpec:
     """Reads a character, for `suite.build`, `characters.make` and what else takes a row.
 
     Links are all bodies with mass, in the order of the file; joints keep their names.
@@ -91,7 +91,7 @@ def from_file(
         model = spec.compile()
     except ValueError as error:
         raise problem(file, ' '.join(str(error).split())) from None
-    found = Found(file, model, root, spatial)
+    found = ModelInspector(file, model, root, spatial)
     found.check_names('end effector', end_effectors)
     found.check_names('fall link', fall_links, solid=True)
     exempt = tuple(end_effectors if stumble_exempt is None else stumble_exempt)
@@ -102,7 +102,7 @@ def from_file(
             raise problem(file, errors.unknown('joint', joint, figures))
     tree = _tree(file, spec, found)
     tree.model = name
-    return CharacterRow(
+    return CharacterSpec(
         name=name,
         joints={**figures, **(joints or {})},
         fall_links=tuple(fall_links),
@@ -114,12 +114,12 @@ def from_file(
         xml=tree.to_xml_string(),
         assets=tree.get_assets(),
         bodies=found.links,
-        solids=found.solids,
+        collision_geoms=found.collision_geoms,
         notes=tuple(found.notes),
     )
 
 
-def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: Found) -> mjcf.RootElement:
+def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjcf.RootElement:
     """Returns the character alone: no world, root joints, actuators or options; figures explicit."""
     model = found.model
     try:

@@ -116,7 +116,7 @@ def _in_package(file: pathlib.Path, name: str) -> str:
     return str(next((place for place in places if place.is_file()), name))
 
 
-class Found:
+class ModelInspector:
     """What a compiled file holds of a character."""
 
     def __init__(
@@ -139,7 +139,7 @@ class Found:
                 file, 'no geom of the character can touch the ground: expected some whose contype '
                 'and conaffinity are not both 0 (in URDF, <collision> elements)',
             )  # fmt: skip
-        self.solids = tuple(model.geom(i).name for i in self.geoms)
+        self.collision_geoms = tuple(model.geom(i).name for i in self.geoms)
         heavy = model.body_mass[self.ids] > 0
         heavy[0] = True
         self.links = tuple(np.array(self.bodies)[heavy].tolist())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from trl_suite.characters.character import CharacterRow, Joint
+from trl_suite.characters.character import CharacterSpec, Joint
 
 # The dog's pelvis box is rotated; the original measures these two limits against it (they act 0.61
 # rad higher), but scales actions by the file's numbers.
@@ -139,7 +139,7 @@ _BIPED3D_SIMBICON_JOINTS = {
     'left_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
 }
 
-DOG = CharacterRow(
+DOG = CharacterSpec(
     name='dog',
     joints=_DOG_JOINTS,
     fall_links=(
@@ -153,7 +153,7 @@ DOG = CharacterRow(
 _GOAT_JOINTS = {name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()}
 _GOAT_JOINTS['neck0'] = dataclasses.replace(_GOAT_JOINTS['neck0'], target=0.40041)
 
-GOAT = CharacterRow(
+GOAT = CharacterSpec(
     name='goat',
     joints=_GOAT_JOINTS,
     fall_links=('root', 'spine0'),
@@ -162,7 +162,7 @@ GOAT = CharacterRow(
     description='Goat, 21 links: the skeleton of the dog with horns; only its rump is a fall.',
 )
 
-RAPTOR = CharacterRow(
+RAPTOR = CharacterSpec(
     name='raptor',
     joints=_RAPTOR_JOINTS,
     fall_links=('root', 'spine0', 'spine1', 'spine2', 'spine3', 'head'),
@@ -171,7 +171,7 @@ RAPTOR = CharacterRow(
     description='Raptor, 19 links: a heavy pelvis between a neck, a tail and two bird legs.',
 )
 
-BIPED2D = CharacterRow(
+BIPED2D = CharacterSpec(
     name='biped2d',
     joints=_BIPED2D_JOINTS,
     fall_links=('root',),
@@ -180,7 +180,7 @@ BIPED2D = CharacterRow(
     description='Biped, 7 links: a trunk of 25 kg and two legs; the feet are the ankle links.',
 )
 
-BIPED2D_SIMBICON = CharacterRow(
+BIPED2D_SIMBICON = CharacterSpec(
     name='biped2d_simbicon',
     joints=_BIPED2D_SIMBICON_JOINTS,
     fall_links=('root',),
@@ -189,7 +189,7 @@ BIPED2D_SIMBICON = CharacterRow(
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
 )
 
-BIPED2D_FULL = CharacterRow(
+BIPED2D_FULL = CharacterSpec(
     name='biped2d_full',
     joints=_BIPED2D_FULL_JOINTS,
     fall_links=(
@@ -201,7 +201,7 @@ BIPED2D_FULL = CharacterRow(
     description='Biped with arms and head, 12 links, with human torque limits.',
 )  # fmt: skip
 
-HOPPER = CharacterRow(
+HOPPER = CharacterSpec(
     name='hopper',
     joints=_HOPPER_JOINTS,
     fall_links=('root',),
@@ -210,7 +210,7 @@ HOPPER = CharacterRow(
     description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
 )
 
-BIPED3D = CharacterRow(
+BIPED3D = CharacterSpec(
     name='biped3d',
     joints=_BIPED3D_JOINTS,
     fall_links=('root', 'torso'),
@@ -243,7 +243,7 @@ BIPED3D_FULL_MOCAP = dataclasses.replace(
     description='Biped in 3D with arms and head, 16 links; these are all but rigid.',
 )
 
-BIPED3D_SIMBICON = CharacterRow(
+BIPED3D_SIMBICON = CharacterSpec(
     name='biped3d_simbicon',
     joints=_BIPED3D_SIMBICON_JOINTS,
     fall_links=('root',),
@@ -253,9 +253,9 @@ BIPED3D_SIMBICON = CharacterRow(
     spatial=True,
 )
 
-CHARACTERS: dict[str, CharacterRow] = {
-    row.name: row
-    for row in (
+CHARACTERS: dict[str, CharacterSpec] = {
+    spec.name: spec
+    for spec in (
         DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER, BIPED3D, BIPED3D_MOCAP,
         BIPED3D_MOCAP_RUN, BIPED3D_FULL_MOCAP, BIPED3D_SIMBICON,
     )

@@ -26,7 +26,7 @@ ID = 'PD_Biped2D_Gaps_Terrain-v0'
 ROWS = 64
 CONTROL_TIMESTEP = 1 / 30  # s; longer steps have controllers inside
 SECONDS = 2.0  # per measurement
-WARM = 4 / 3  # s of simulated time; most rows have fallen once by then
+WARM = 4 / 3  # s of simulated time; most simulations have fallen once by then
 RESET = 30  # calls between two resets of what is stepped raw, a second of simulated time
 ROUNDS = 8  # in which environment and raw batch take turns: machines are now faster, now slower
 PROJECTED = (16, 64)  # cores
@@ -70,43 +70,43 @@ def actions(low: Any, high: Any, shape: tuple[int, ...]) -> Iterator[np.ndarray]
         yield from drawn
 
 
-def warmed(id: str, rows: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
-    """Makes a vector environment whose rows are over their first episodes, and random actions."""
-    environments = VectorEnvironment(id, rows, threads, seed=0)
+def warmed(id: str, env_ids: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
+    """Makes a vector environment whose simulations are over their first episodes, and random actions."""
+    environments = VectorEnvironment(id, env_ids, threads, seed=0)
     environments.reset()
-    drawn = actions(-1, 1, (rows, len(environments.action_map)))
-    while physics_steps(environments) * environments.task.physics_timestep < WARM * rows:
+    drawn = actions(-1, 1, (env_ids, len(environments.action_map)))
+    while physics_steps(environments) * environments.task.physics_timestep < WARM * env_ids:
         environments.step(next(drawn))
     return environments, drawn
 
 
 def physics_steps(environments: VectorEnvironment) -> int:
-    """Returns how many physics steps the rows have taken, in all."""
+    """Returns how many physics steps the simulations have taken, in all."""
     return int(environments.task.world.engine.steps.sum())
 
 
-def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
+def vector(id: str, env_ids: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
     """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
     Args:
       id: of the environment.
-      rows: number of simulations.
+      env_ids: number of simulations.
       threads: that step them; 0 takes all cores.
       seconds: for the environment, and as many for the raw batch.
 
     Returns:
-      'control' and 'physics': steps per second of all rows; 'engine': physics steps per second of
-      MuJoCo alone, terrains included, whose bodies are never reset; 'serial': us per row and control
+      'control' and 'physics': steps per second of all simulations; 'engine': physics steps per second of
+      MuJoCo alone, terrains included, whose bodies are never reset; 'serial': us per simulation and control
       step in which one thread works; 'resets': share of the threads' time that resets take; 'reset': ms
-      per row.
+      per simulation.
     """
     threads = threads or machine.cores()
-    environments, drawn = warmed(id, rows, threads)
-    others, _ = warmed(id, rows, threads)
+    environments, drawn = warmed(id, env_ids, threads)
+    others, _ = warmed(id, env_ids, threads)
     world: Any = others._world
     begin = Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
-    parallel = Stopwatch(environments._share, lambda *_: rows)
+    parallel = Stopwatch(environments._share, lambda *_: env_ids)
     environments._share = parallel  # type: ignore[method-assign]
     before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
@@ -116,8 +116,8 @@ def vector(id: str, rows: int, threads: int, seconds: float = SECONDS) -> dict[s
         controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
         world.share(lambda part: world.step(substeps, part), world.all_ids)
 
-    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: rows)
-    alone = Stopwatch(step, lambda: rows * substeps)
+    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: env_ids)
+    alone = Stopwatch(step, lambda: env_ids * substeps)
     for _ in range(ROUNDS):
         for turn in (control, alone):
             rate(turn, seconds / ROUNDS)
@@ -145,7 +145,7 @@ def projection(found: dict[str, float], threads: int) -> dict[str, float]:
       Number of cores -> how many times as many control steps per second as one core. Only what one
       thread does is counted against it, not caches and memory that the cores share.
     """
-    total = 1e6 / found['control']  # us per row and control step
+    total = 1e6 / found['control']  # us per simulation and control step
     serial = found['serial']
     parallel = threads * (total - serial)
     return {
@@ -225,21 +225,21 @@ def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
 
 
 def bench(
-    id: str = ID, rows: int = ROWS, threads: int = 0, seconds: float = SECONDS
+    id: str = ID, env_ids: int = ROWS, threads: int = 0, seconds: float = SECONDS
 ) -> dict[str, Any]:
     """Measures an environment on this machine.
 
     Args:
       id: of the environment, or an alias.
-      rows: of the vector environment.
+      env_ids: of the vector environment.
       threads: that step them; 0 takes all cores that may be used.
       seconds: per measurement, of which there are four.
 
     Returns:
-      What JSON can hold: 'machine', 'id', 'rows', 'threads'; 'control steps per second' of all rows,
+      What JSON can hold: 'machine', 'id', 'simulations', 'threads'; 'control steps per second' of all simulations,
       and of a 'single environment'; 'ratio to the engine' (MuJoCo alone on as many
       threads) and 'ratio to mj_step' (on one thread) of the physics steps per second; 'serial' (us per
-      row and control step); 'reset' (ms per row); and 'projection': the speed-up that 16 and 64 cores
+      simulation and control step); 'reset' (ms per simulation); and 'projection': the speed-up that 16 and 64 cores
       would give, by Amdahl's law from the part that one thread does.
 
     Raises:
@@ -248,9 +248,9 @@ def bench(
     if not 0 < seconds < float('inf'):
         raise ValueError(f'seconds is {seconds}; expected a positive number')
     id, threads = suite.find(id).id, threads or machine.cores()
-    many, one = vector(id, rows, threads, seconds), single(id, seconds)
+    many, one = vector(id, env_ids, threads, seconds), single(id, seconds)
     return {
-        'machine': machine.sentence(), 'id': id, 'rows': rows, 'threads': threads,
+        'machine': machine.sentence(), 'id': id, 'simulations': env_ids, 'threads': threads,
         'control steps per second': round(many['control']),
         'ratio to the engine': round(many['physics'] / many['engine'], 3),
         'ratio to mj_step': round(many['physics'] / one['mj_step'], 3),
@@ -264,17 +264,19 @@ def run(arguments: argparse.Namespace) -> None:
     """Measures, and prints what was found."""
     if arguments.json is not None:
         files.check_path(arguments.json, ('.json',))
-    result = bench(arguments.id, arguments.rows, arguments.threads, arguments.seconds)
+    result = bench(arguments.id, arguments.num_envs, arguments.threads, arguments.seconds)
     if arguments.json is not None:
         files.write_json(result, arguments.json)
-    print(f'{result["id"]}, {result["rows"]} rows, {result["threads"]} threads, random actions')
+    print(
+        f'{result["id"]}, {result["simulations"]} simulations, {result["threads"]} threads, random actions'
+    )
     print(f'  on {result["machine"]}')
     for name, text in (
         ('control steps', f'{result["control steps per second"]} per second, resets included'),
         ('physics', f'{result["ratio to the engine"]:.2f} of the rate of MuJoCo alone on these threads'),
         ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
-        ('serial', f'{result["serial"]:.2f} us per row and control step in one thread'),
-        ('reset', f'{result["reset"]:.2f} ms per row'),
+        ('serial', f'{result["serial"]:.2f} us per simulation and control step in one thread'),
+        ('reset', f'{result["reset"]:.2f} ms per simulation'),
         (
             'projected',
             ', '.join(f'{v:.3g} times on {k} cores' for k, v in result['projection'].items())

@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise ValueError(f'--cycle: {len(arguments.cycle)} times; expected none or two')
     engine.load()
     from trl_suite import retargeting
-    from trl_suite.rendering.kinematic_viewer import Mannequin
+    from trl_suite.rendering.kinematic_viewer import KinematicViewer
     from trl_suite.retargeting import clip_check
 
     chosen = None
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
     motion = retargeting.read(arguments.file, name, arguments.skeleton)
     clip = retargeting.retarget(motion, name, chosen, arguments.scale)
     if clip is not motion:
-        joints = Mannequin(name).layout.joints
+        joints = KinematicViewer(name).layout.joints
         followed = retargeting.counterparts(motion, joints, chosen)
         still = [joint for joint in joints if joint not in followed]
         print('joints:', ', '.join(f'{own} from {other}' for own, other in followed.items()))
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
         clip.save(arguments.output)
         print(arguments.output)
     if arguments.strip is not None:
-        image = Mannequin(name).film_strip(clip, height=240, width=320)
+        image = KinematicViewer(name).film_strip(clip, height=240, width=320)
         rendering.film_strip([image], arguments.strip)
         print(arguments.strip)
 

@@ -13,13 +13,13 @@ def run(arguments: argparse.Namespace) -> None:
     """Runs a policy for whole episodes, and prints the sums."""
     if arguments.json is not None:
         files.check_path(arguments.json, ('.json',))
-    row = engine.load().find(arguments.id)
+    spec = engine.load().find(arguments.id)
     from trl_suite import evaluation
 
     baseline = evaluation.BASELINES.get(arguments.policy)
     limits = {} if arguments.step_limit is None else {'step_limit': arguments.step_limit}
     result = evaluation.evaluate(
-        row, baseline or acting.trained(arguments.policy, row.id), arguments.episodes, arguments.seed,
+        spec, baseline or acting.trained(arguments.policy, spec.id), arguments.episodes, arguments.seed,
         arguments.threads, limits, factory=baseline is not None, progress=True,
     )  # fmt: skip
     if arguments.json is not None:
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
             'return',
             f'{result["return"]:.2f}'
             + ('' if interval is None else f' +- {interval:.2f} (95 % confidence)')
-            + f', {result["fraction"]:.1%} of the maximum {result["step_limit"]}',
+            + f', {result["normalized_return"]:.1%} of the maximum {result["step_limit"]}',
         ),
         ('length', f'{result["length"]:.1f} of {result["step_limit"]} steps'),
         (
@@ -45,9 +45,9 @@ def run(arguments: argparse.Namespace) -> None:
             )
             + f', median {result["median_distance"]:.2f} m, at {result["speed"]:.2f} m/s',
         ),
-        ('full length', f'{result["full"]:.0%} of the episodes'),
+        ('full length', f'{result["completion_rate"]:.0%} of the episodes'),
         ('falls', f'{result["falls"]:.0%} of the episodes'),
     )
-    print(row.id)
+    print(spec.id)
     for name, text in lines:
         print(f'  {name:<12} {text}')

@@ -11,10 +11,10 @@ from trl_suite.cli import engine
 def run(arguments: argparse.Namespace) -> None:
     """Prints everything about one environment."""
     suite = engine.load()
-    row = suite.find(arguments.id)
-    environment = suite.build_row(row, {}, {})
-    print(f'{row.id}\n  {row.description}')
-    print(f'  also {", ".join((f"{row.domain}/{row.task}", *row.aliases))}; tags:', end=' ')
-    print(', '.join(sorted(row.tags)))
-    for title, text in describe.sections(row, environment):
+    spec = suite.find(arguments.id)
+    environment = suite.build_row(spec, {}, {})
+    print(f'{spec.id}\n  {spec.description}')
+    print(f'  also {", ".join((f"{spec.domain}/{spec.task}", *spec.aliases))}; tags:', end=' ')
+    print(', '.join(sorted(spec.tags)))
+    for title, text in describe.sections(spec, environment):
         print(f'\n{title}\n{text}')

@@ -13,23 +13,23 @@ FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
 
 def run(arguments: argparse.Namespace) -> None:
     """Prints the environments of the catalogue that pass the filters, one a line."""
-    chosen = list(catalogue.ROWS)
+    chosen = list(catalogue.SPECS)
     for name in FILTERS:
         value = getattr(arguments, name)
         if value is None:
             continue
-        known = {item for row in catalogue.ROWS for item in _values(row, name)}
+        known = {item for spec in catalogue.SPECS for item in _values(spec, name)}
         if value not in known:
             raise ValueError(errors.unknown(name, value, known))
         chosen = [row for row in chosen if value in _values(row, name)]
     if arguments.trained:
         shipped = policies.available()
-        chosen = [row for row in chosen if row.id in shipped]
+        chosen = [spec for spec in chosen if spec.id in shipped]
     if chosen:
-        cells = [(row.id, f'{row.domain}/{row.task}', row.description) for row in chosen]
+        cells = [(spec.id, f'{spec.domain}/{spec.task}', spec.description) for spec in chosen]
         print(describe.table(('id', 'domain/task', 'description'), cells, indent=''))
     print(f'{len(chosen)} environment{"" if len(chosen) == 1 else "s"}')
 
 
-def _values(row: catalogue.Row, name: str) -> frozenset[str]:
-    return row.tags if name == 'tag' else frozenset({str(getattr(row, name))})
+def _values(spec: catalogue.EnvSpec, name: str) -> frozenset[str]:
+    return spec.tags if name == 'tag' else frozenset({str(getattr(spec, name))})

@@ -9,7 +9,7 @@
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite doctor
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
-    trl-suite gallery --only Dog2D_Gaps
+    trl-suite gallery --filter Dog2D_Gaps
 
 Bad input ends with one line on stderr and exit status 2. A command NAME is the function `run` of the
 module `trl_suite.cli.NAME`; the engine is imported only by those that need it.
@@ -138,7 +138,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--draws', type=_positive, default=3, help='how many')
     command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
     command.add_argument('--seed', type=int, default=0, help='of the draws')
-    command.add_argument('--blend', type=float, default=0.0, help='which of the parameter sets')
+    command.add_argument(
+        '--terrain-level', type=float, default=0.0, help='which of the parameter sets'
+    )
     command.add_argument(
         '--output', type=pathlib.Path, metavar='FILE',
         help='a .png; or a mesh of the first draw, .obj, .glb or .stl',
@@ -170,7 +172,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         'id', metavar='ID', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0', help="or 'domain/task'"
     )
-    command.add_argument('--rows', type=_positive, default=64, help='of the vector environment')
+    command.add_argument('--num-envs', type=_positive, default=64, help='of the vector environment')
     command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
     command.add_argument('--seconds', type=float, default=2.0, help='of each of four measurements')
     command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
@@ -180,9 +182,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='where to'
     )
     command.add_argument(
-        '--only', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
+        '--filter', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
     )
-    command.add_argument('--again', action='store_true', help='also what is there already')
+    command.add_argument('--overwrite', action='store_true', help='also what is there already')
     return parser
 
 

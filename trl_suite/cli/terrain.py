@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     rendering.plot_terrain(
         arguments.terrain, output, arguments.draws, arguments.length, arguments.seed,
-        arguments.blend,
+        arguments.terrain_level,
     )  # fmt: skip
     print(output)
 
@@ -35,9 +35,11 @@ def _write_mesh(arguments: argparse.Namespace, output: pathlib.Path) -> None:
     source, length = terrain.load(arguments.terrain), arguments.length
     if not 0 < length <= LONGEST:
         raise ValueError(f'length is {length}; expected metres in (0, {LONGEST:g}]')
-    draw = terrain.Ground if source.spatial else terrain.Strip
+    draw = terrain.SpatialGround if source.spatial else terrain.PlanarGround
     # As the first of the plots.
-    ground = draw(source, np.random.SeedSequence((arguments.seed, 0)), blend=arguments.blend)
+    ground = draw(
+        source, np.random.SeedSequence((arguments.seed, 0)), terrain_level=arguments.terrain_level
+    )
     low, high = (-0.5 * length, 0.5 * length) if source.spatial else (-BEFORE, length)
     terrain.save_mesh(ground, output, low, high)
     print(output)

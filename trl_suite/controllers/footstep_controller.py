@@ -54,7 +54,7 @@ class Controller:
             return
         self.policy.check(task)
         trained = self.policy.info.get('character')
-        own = characters.fingerprint(task.character.row)
+        own = characters.fingerprint(task.character.spec)
         if trained is not None and trained != own:
             warnings.warn(
                 f'controller {self.name} was trained with body {trained}; this one is {own}',
@@ -66,7 +66,7 @@ class Controller:
 
         Raises:
           ValueError: the controller gives no array of numbers, another shape, or anything but
-            finite numbers; the message names the row.
+            finite numbers; the message names the simulation.
         """
         answer = self._function(observation)
         try:
@@ -77,11 +77,13 @@ class Controller:
         if action.ndim != 2 or len(action) != n or size not in (None, action.shape[1]):
             raise ValueError(
                 f'controller {self.name} gives actions of shape {action.shape}; expected '
-                f'({n}, {"k" if size is None else size}), one row for each body'
+                f'({n}, {"k" if size is None else size}), one simulation for each body'
             )
         if not np.isfinite(action).all():
-            row = int(np.argwhere(~np.isfinite(action))[0, 0])
-            raise ValueError(f'controller {self.name} gives no finite action for row {row}')
+            env_id = int(np.argwhere(~np.isfinite(action))[0, 0])
+            raise ValueError(
+                f'controller {self.name} gives no finite action for simulation {env_id}'
+            )
         return action
 
 

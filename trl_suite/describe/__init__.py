@@ -30,21 +30,21 @@ __all__ = [
 ]  # fmt: skip
 
 
-def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str, str]]:
+def sections(spec: catalogue.EnvSpec, environment: Environment) -> Iterator[tuple[str, str]]:
     """Yields titles and texts: character, observation, action, rules, time, differences."""
-    for title, parts_ in parts(row, environment):
+    for title, parts_ in parts(spec, environment):
         yield title, layout.text(parts_)
     yield (
         'Differs from the original (reasons in docs/differences.md)',
-        '\n'.join(f'  - {text}' for text in differences_of(row)),
+        '\n'.join(f'  - {text}' for text in differences_of(spec)),
     )
 
 
-def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
+def parts(spec: catalogue.EnvSpec, environment: Environment) -> Iterator[Section]:
     """Yields sections of paragraphs and tables: all of `sections` but the differences.
 
     Args:
-      row: of the environment.
+      spec: of the environment.
       environment: built from it, or from a row that differs by its terrain only.
     """
     # They import the engine, which the tables of the command line do without.
@@ -63,15 +63,15 @@ def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
     if family is None:  # one of the user's
         yield common.observation(environment, planar.blocks(task))
         yield common.action(environment)
-        yield common.time(row, task)
-        yield options.options(row, task_options(row))
+        yield common.time(spec, task)
+        yield options.options(spec, task_options(spec))
         return
     yield from common.character(environment)
     yield from family.before(task)
     yield common.observation(environment, family.blocks(task))
     yield from family.after(task)
     yield family.action(environment)
-    yield common.ground(row)
-    yield from family.rules(row, task)
-    yield family.time(row, task)
-    yield options.options(row, task_options(row))
+    yield common.ground(spec)
+    yield from family.rules(spec, task)
+    yield family.time(spec, task)
+    yield options.options(spec, task_options(spec))

@@ -31,27 +31,27 @@ _ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
 def character(environment: Environment) -> Iterator[Section]:
     """Yields the character of a task, and its links."""
     task: Any = environment.task
-    figure, row = task.character, task.character.row
+    figure, spec = task.character, task.character.spec
     # The last column: a weight in a reward that has none of a gait, or what a gait tracks.
     gait, above = getattr(task, 'gait', None), hasattr(task, 'controller')
-    title, last = REWARD_WEIGHT, [joint.weight for joint in row.joints.values()]
+    title, last = REWARD_WEIGHT, [joint.weight for joint in spec.joints.values()]
     if gait is not None:
         title = 'target is to'
-        last = ['the world' if j in gait.hips else 'its parent' for j in row.joints]
+        last = ['the world' if j in gait.hips else 'its parent' for j in spec.joints]
     elif above:
         title, last = '', [''] * len(last)
-    yield section(f'Character: {row.name}', row.description, figures(figure))
+    yield section(f'Character: {spec.name}', spec.description, figures(figure))
     yield section('Links', links(figure, environment.physics, (title, last)))
 
 
 def figures(figure: characters.Character) -> str:
     """Returns the whole-body figures of a character in one line."""
-    row = figure.row
-    own = characters.CHARACTERS.get(row.name) is not row
-    found = characters.body_figures(characters.make(row)) if own else _figures(row.name)
+    spec = figure.spec
+    own = characters.CHARACTERS.get(spec.name) is not spec
+    found = characters.body_figures(characters.make(spec)) if own else _figures(spec.name)
     return (
         f'{found["mass"]:.4g} kg, stands {found["standing_height"]:.3g} m high at the root, '
-        f'{len(row.links)} links, {len(row.joints)} joints'
+        f'{len(spec.links)} links, {len(spec.joints)} joints'
     )
 
 
@@ -69,10 +69,10 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
       last: title of one more column, and what is in it for each joint.
     """
     masses = floats(physics.bind(figure.bodies).mass)
-    own = figure.row.root_weight if last[0] == REWARD_WEIGHT else ''
+    own = figure.spec.root_weight if last[0] == REWARD_WEIGHT else ''
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', own)]
     for (name, joint), mass, (low, high), limit, slides, ball, more in zip(
-        figure.row.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
+        figure.spec.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
         figure.prismatic, figure.spherical, last[1], strict=True,
     ):  # fmt: skip
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
@@ -139,12 +139,12 @@ def action(environment: Environment) -> Section:
     action_map = environment.action_map
     title, limits = _limits(environment)
     unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
-    columns = (np.round(action_map.centre, 9) + 0.0, action_map.half_range, limits)
+    columns = (np.round(action_map.action_offset, 9) + 0.0, action_map.action_scale, limits)
     return section(
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = centre + '
-        'half range * action',
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '
+        'action_scale * action',
         Table(
-            ('drives', 'centre', 'half range', title),
+            ('drives', 'action_offset', 'action_scale', title),
             list(zip(action_map.names, *map(floats, columns), strict=True)),
             numbered=True,
         ),
@@ -169,27 +169,27 @@ def _limits(environment: Environment) -> tuple[str, Any]:
     return f'torque limit (N m{norm})', np.repeat(limits, np.where(ball, each, 1))
 
 
-def ground(row: catalogue.Row) -> Section:
+def ground(spec: catalogue.EnvSpec) -> Section:
     """Returns the terrain and its parameters."""
-    found = terrain.load(row.terrain)
+    found = terrain.load(spec.terrain)
     idle = terrain.IDLE.get(found.type, ())
     parameters = ', '.join(
         f'{name} {value:g}' for name, value in found.parameters().items() if name not in idle
     )
     sets = len(found.parameter_sets)
-    more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
+    more = f' (set 0 of {sets}; see the option terrain_level)' if sets > 1 else ''
     return section(
         f'Terrain: {found.name} ({found.type})', f'{parameters or "no parameters"}{more}'
     )
 
 
-def time(row: catalogue.Row, task: Any) -> Section:
+def time(spec: catalogue.EnvSpec, task: Any) -> Section:
     """Returns rates, and how long an episode is."""
     control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
     return section(
         'Time',
         f'control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
-        f'{row.step_limit} steps, {row.step_limit * task.control_timestep:.3g} s',
+        f'{spec.step_limit} steps, {spec.step_limit * task.control_timestep:.3g} s',
     )
 
 

@@ -50,9 +50,9 @@ _FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
 
 def blocks(task: Any) -> Meanings:
     """Returns units and meanings of the observation blocks."""
-    row = task.character.row
+    spec = task.character.spec
     ends = _PITCH_ENDS if task.gait.parameters.observe_pitch else {}
-    if row.mirror:
+    if spec.mirror:
         ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
     return {name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _BLOCKS.items()}
 
@@ -65,9 +65,11 @@ def before(task: Any) -> Iterator[Section]:
         Table(('state', 'ends'), list(zip(figures.states, task.gait.endings, strict=True))),
     )
     chosen = [
-        name for name, values in figures.sets.items() if np.array_equal(values, figures.centre)
+        name
+        for name, values in figures.sets.items()
+        if np.array_equal(values, figures.action_offset)
     ]
-    same = (figures.base_actions == figures.centre).all(1)
+    same = (figures.base_actions == figures.action_offset).all(1)
     chosen += [f'base action {i}' for i in np.flatnonzero(same)]
     blends = [
         (i, f'{a} {1 - share:g}, {b} {share:g}' if 0 < share < 1 else b if share else a)
@@ -75,7 +77,7 @@ def before(task: Any) -> Iterator[Section]:
     ]
     fixed = [
         f'{name} {value:g} {_unit(task, name)}' if value else f'{name} 0'
-        for i, (name, value) in enumerate(zip(figures.names, figures.centre, strict=True))
+        for i, (name, value) in enumerate(zip(figures.names, figures.action_offset, strict=True))
         if i not in figures.actions
     ]
     yield section(
@@ -104,12 +106,12 @@ def action(environment: Environment) -> Section:
     units = [_unit(task, name) for name in action_map.names]
     effects = [_effect(task, name) for name in action_map.names]
     columns = (
-        action_map.names, floats(action_map.centre), floats(action_map.half_range), units, effects,
+        action_map.names, floats(action_map.action_offset), floats(action_map.action_scale), units, effects,
     )  # fmt: skip
     return section(
-        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
+        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
         Table(
-            ('sets', 'centre', 'half range', 'unit', 'which is'),
+            ('sets', 'action_offset', 'action_scale', 'unit', 'which is'),
             list(zip(*columns, strict=True)),
             numbered=True,
         ),
@@ -129,9 +131,9 @@ def _effect(task: Any, parameter: str) -> str:
     return _EFFECTS.get(own, 'a target')
 
 
-def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
+def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
     """Yields reward and termination."""
-    figure, parameters = task.character.row, task.gait.parameters
+    figure, parameters = task.character.spec, task.gait.parameters
     weights = parameters.reward
     weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
     lines = [
@@ -166,7 +168,7 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
 def running_share(rule: Any) -> str:
     """Returns when links have been seen on the ground too often, from a module with the rule."""
     return (
-        f'd > {rule.FALLEN:g}: with every look d becomes {rule.FADING:g} d, and 1/{1 / rule.SHARE:.0f} '
+        f'd > {rule.FALL_THRESHOLD:g}: with every look d becomes {rule.CONTACT_DECAY:g} d, and 1/{1 / rule.CONTACT_GAIN:.0f} '
         'more if one touches'
     )
 
@@ -174,12 +176,12 @@ def running_share(rule: Any) -> str:
 def looks_until_fall(rule: Any) -> int:
     """Returns how often in a row a link must be seen on the ground, from a module with the rule."""
     down, count = 0.0, 0
-    while down <= rule.FALLEN:
-        down, count = rule.FADING * down + rule.SHARE, count + 1
+    while down <= rule.FALL_THRESHOLD:
+        down, count = rule.CONTACT_DECAY * down + rule.CONTACT_GAIN, count + 1
     return count
 
 
-def time(row: catalogue.Row, task: Any) -> Section:
+def time(spec: catalogue.EnvSpec, task: Any) -> Section:
     """Returns rates, and how long a step and an episode are."""
     control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
     step = f'one cycle, at most {gait.LONGEST_CYCLE * gait.FRAME:.3g} s'
@@ -188,5 +190,5 @@ def time(row: catalogue.Row, task: Any) -> Section:
     return section(
         'Time',
         f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
-        f'(discount 1) after {row.step_limit} steps',
+        f'(discount 1) after {spec.step_limit} steps',
     )

@@ -36,36 +36,39 @@ _MEANINGS = {
 
 def blocks(task: Any) -> Meanings:
     """Returns units and meanings of the observation blocks."""
-    return {**spatial.BLOCKS, **_BLOCKS, 'target': spatial.TARGETS['ball' in task.blocks]}
+    return {**spatial.BLOCKS, **_BLOCKS, 'goal': spatial.TARGETS['ball' in task.blocks]}
 
 
 def action(environment: Environment) -> Section:
     """Returns what the actions plan."""
     action_map = environment.action_map
     cells = [
-        (name, centre, half_range, _MEANINGS.get(name, 'of the footstep controller'))
-        for name, centre, half_range in zip(
-            action_map.names, floats(action_map.centre), floats(action_map.half_range), strict=True
+        (name, action_offset, action_scale, _MEANINGS.get(name, 'of the footstep controller'))
+        for name, action_offset, action_scale in zip(
+            action_map.names,
+            floats(action_map.action_offset),
+            floats(action_map.action_scale),
+            strict=True,
         )
     ]
     return section(
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = centre + half range * action',
-        Table(('sets', 'centre', 'half range', 'unit and meaning'), cells, numbered=True),
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
+        Table(('sets', 'action_offset', 'action_scale', 'unit and meaning'), cells, numbered=True),
     )
 
 
-def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
+def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
     """Yields controller, goal, reward and termination."""
     yield section(
         'Footstep controller',
         f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
     )
-    yield spatial.start(row)
+    yield spatial.start(spec)
     if task.ball:
         yield spatial.goal_and_ball(task._goal_distance)
         formulas, full = spatial.ball_terms(task._target_speed, task._goal_reached)
     else:
-        yield spatial.goal(row, task, 'hike')
+        yield spatial.goal(spec, task, 'hike')
         formulas = [
             f'exp(-{high_level.SPEED_SHARPNESS:g} min(0, v - {task._target_speed:g})^2), v: speed of the '
             'centre of mass towards the goal, m/s',
@@ -86,18 +89,18 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     every = high_level.SAMPLE_FRAMES / 30
     yield section(
         f'Termination (discount 0), looked at every {every:g} s',
-        f'one of {", ".join(task.character.row.fall_links)} touches the ground in '
+        f'one of {", ".join(task.character.spec.fall_links)} touches the ground in '
         f'{looks_until_fall(high_level)} looks in a row, or so often that {running_share(high_level)}; '
         'or the physics diverges',
     )
 
 
-def time(row: catalogue.Row, task: Any) -> Section:
+def time(spec: catalogue.EnvSpec, task: Any) -> Section:
     """Returns rates, and how long a step and an episode are."""
     duration, physics = task.control_timestep, 1 / task.physics_timestep
     return section(
         'Time',
         f'a step is {duration:.3g} s, the first of an episode may be shorter; footstep controller 30 Hz, '
-        f'physics\n{physics:.4g} Hz; an episode is cut (discount 1) after {row.step_limit} steps, '
-        f'{row.step_limit * duration:.3g} s',
+        f'physics\n{physics:.4g} Hz; an episode is cut (discount 1) after {spec.step_limit} steps, '
+        f'{spec.step_limit * duration:.3g} s',
     )

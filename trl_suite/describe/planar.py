@@ -19,7 +19,7 @@ _BLOCKS = {
     'velocity': ('m/s', 'x, z velocity of each link centre'),
     'strain': ('1', 'strain of each muscle fibre'),
     'phase': ('1', 'phase of the clip in [0, 1); then the one-hot of its quarter'),
-    'target': (
+    'reference': (
         'm, m/s',
         "the clip's root height; its link centres from its root; their velocities",
     ),
@@ -44,10 +44,10 @@ def after(task: Any) -> Iterator[Section]:
         yield plan(task)
 
 
-def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
+def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
     """Yields clip, reward and termination."""
     clip = task.clip
-    notes, miss = [], ''
+    notes, missed = [], ''
     yield section(
         f'Clip: {clip.name}',
         f'{clip.description}; period {clip.duration:.4g} s, {clip.speed:.3g} m/s',
@@ -63,8 +63,8 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
             'landing place',
             'heading: the whole weight while the trunk faces ahead, 0 while it faces backwards',
         ]
-        if task.miss is not None:
-            miss = f'a foot lands more than {task.miss:g} m from its place; '
+        if task.max_landing_error is not None:
+            missed = f'a foot lands more than {task.miss:g} m from its place; '
     yield section(
         REWARD,
         tracking_terms(task, bool(notes)),
@@ -72,6 +72,6 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
     )
     yield section(
         'Termination (discount 0)',
-        f'a fall: one of {", ".join(task.character.row.fall_links)} touches the ground at the end of a step; '
-        f'{miss}or the physics diverges',
+        f'a fall: one of {", ".join(task.character.spec.fall_links)} touches the ground at the end of a step; '
+        f'{missed}or the physics diverges',
     )

@@ -13,7 +13,7 @@ from trl_suite.describe.layout import Section, Table, section
 from trl_suite.registry import catalogue
 from trl_suite.tasks.components import ball, goals
 from trl_suite.tasks.navigation import direct as journey
-from trl_suite.terrain import Ground
+from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import ground
 from trl_suite.terrain.spatial.layout import Layout
 
@@ -36,7 +36,7 @@ BLOCKS = {
         'velocity',
     ),
     'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
-    'target': (
+    'reference': (
         'm, m/s',
         "the clip's root height; its link centres from its root; their velocities",
     ),
@@ -91,7 +91,7 @@ def before(task: Any) -> Iterator[Section]:
 
 def after(task: Any) -> Iterator[Section]:
     """Yields where links and parts of a plan are in the observation."""
-    links = list(task.character.row.links)
+    links = list(task.character.spec.links)
     pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
     if task.mirrored:
         # In right stance; in left stance links change places.
@@ -126,11 +126,11 @@ def plan(task: Any, mirrored: bool = False) -> Section:
                 for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
             ],
         ),
-        *([] if task.character.row.spatial else ['in the plane y and the heading are 0']),
+        *([] if task.character.spec.spatial else ['in the plane y and the heading are 0']),
     )
 
 
-def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
+def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
     """Yields what is tracked, reward and termination."""
     motion = task.motion
     steps = hasattr(task, 'plans')
@@ -147,19 +147,19 @@ def rules(row: catalogue.Row, task: Any) -> Iterator[Section]:
             f'{motion.description}; period {motion.duration:.4g} s, {motion.speed:.3g} m/s',
         )
     if isinstance(task, journey.Journey):
-        yield start(row)
-        yield goal_and_ball() if 'ball' in task.blocks else goal(row, task, 'step')
+        yield start(spec)
+        yield goal_and_ball() if 'ball' in task.blocks else goal(spec, task, 'step')
     yield section(
         REWARD,
         *_reward(task, steps),
     )
-    miss = ''
-    if steps and task.miss is not None:
-        miss = f'a foot lands more than {task.miss:g} m from its place; '
+    missed = ''
+    if steps and task.max_landing_error is not None:
+        missed = f'a foot lands more than {task.miss:g} m from its place; '
     yield section(
         'Termination (discount 0)',
-        f'a fall: one of {", ".join(task.character.row.fall_links)} touches the ground at the end of a step; '
-        f'{miss}or the physics diverges',
+        f'a fall: one of {", ".join(task.character.spec.fall_links)} touches the ground at the end of a step; '
+        f'{missed}or the physics diverges',
     )
 
 
@@ -219,9 +219,9 @@ def span(values: tuple[float, float]) -> str:
     return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
 
 
-def start(row: catalogue.Row) -> Section:
+def start(spec: catalogue.EnvSpec) -> Section:
     """Returns where an episode begins."""
-    layout = _layout(row)
+    layout = _layout(spec)
     where = {
         'start': 'at the origin, heading along x',
         'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
@@ -232,9 +232,9 @@ def start(row: catalogue.Row) -> Section:
     return section('Start', where[layout.place])
 
 
-def goal(row: catalogue.Row, task: Any, rule: str) -> Section:
+def goal(spec: catalogue.EnvSpec, task: Any, rule: str) -> Section:
     """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
-    layout = _layout(row)
+    layout = _layout(spec)
     segments = '1 to 10 segments'
     near = f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y'
     if rule == 'step':
@@ -267,9 +267,9 @@ def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
     )
 
 
-def _layout(row: catalogue.Row) -> Layout:
+def _layout(spec: catalogue.EnvSpec) -> Layout:
     """Returns how ground of an environment's terrain is laid out."""
-    return Ground(terrain.load(row.terrain), 0).layout
+    return SpatialGround(terrain.load(spec.terrain), 0).layout
 
 
 def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:

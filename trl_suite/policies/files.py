@@ -49,7 +49,7 @@ and, if the network sees only a part of it, say of a map of the terrain what is 
 
 and, if it chooses among b actions instead of composing one, as mixtures of experts do:
 
-    choices      float (b, a)  the action is the row whose output is the largest
+    choices      float (b, a)  the action is the simulation whose output is the largest
 
 and, if the first l of its inputs are a line, say of ground heights, that goes through C convolutions
 before the other c - l inputs join what comes out, position by position:

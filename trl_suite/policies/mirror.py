@@ -82,7 +82,7 @@ class Mirror:
             observation = np.where(left[:, None], self.observation(observation), observation)
         return observation, left
 
-    def answered(self, action: np.ndarray, left: np.ndarray) -> np.ndarray:
+    def unmirror_action(self, action: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Returns actions, those that answer to left stance reflected."""
         if left.all():
             return self.action(action)

@@ -99,7 +99,7 @@ class Convolution:
             width, channels, filters = weight.shape
             places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
             windows = line[:, places].reshape(len(x), len(places), width * channels)
-            # One product per row, so that it does not depend on how many rows there are.
+            # One product per simulation, so that it does not depend on how many simulations there are.
             line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
         return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
 
@@ -108,7 +108,7 @@ class Convolution:
 class Policy:
     """A network from observations to actions in [-1, 1].
 
-    Row i of a batch gets, bit for bit, the action that it would get alone.
+    Simulation i of a batch gets, bit for bit, the action that it would get alone.
 
     Attributes:
       id: environment in which the policy was trained.
@@ -333,7 +333,7 @@ class Policy:
         if self.choices is not None:
             x = self.choices[x.argmax(1)]
         if self.mirror is not None and left is not None:
-            x = self.mirror.answered(x, left)
+            x = self.mirror.unmirror_action(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
 
 

@@ -19,7 +19,7 @@ PLAID_SAMPLES = 50  # heights that a PLAiD environment sees, unless it is blind
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class EnvSpec:
     """One environment.
 
     Attributes:
@@ -57,8 +57,8 @@ class Row:
         return _row, ({**values, 'options': dict(self.options)},)
 
 
-def _row(values: dict[str, Any]) -> Row:
-    return Row(**{**values, 'options': MappingProxyType(values['options'])})
+def _row(values: dict[str, Any]) -> EnvSpec:
+    return EnvSpec(**{**values, 'options': MappingProxyType(values['options'])})
 
 
 # The original's name of each character in ids, and the words for descriptions.
@@ -97,12 +97,12 @@ def _status(id_: str, original: bool) -> str:
     return 'original' if original and id_ not in _NOT_REGISTERED else 'completion'
 
 
-def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> Row:
+def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> EnvSpec:
     clip = _PLAID_CHARACTERS[character]
     id_ = f'PD_{_IN_ID[character]}_{name}{"" if blind else "_Terrain"}-v0'
     figure = _IN_ID[character][:-2].lower()
     sight = 'without seeing the ground' if blind else 'seeing 3 m of ground ahead'
-    return Row(
+    return EnvSpec(
         id=id_,
         domain='plaid',
         task=f'{figure}_{name.lower()}{"_blind" if blind else ""}',
@@ -110,7 +110,7 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> R
         actuation='position',
         terrain=preset,
         clip=clip,
-        options=MappingProxyType({} if blind else {'terrain_samples': PLAID_SAMPLES}),
+        options=MappingProxyType({} if blind else {'terrain_observation': PLAID_SAMPLES}),
         description=f'The {figure} tracks a {_GAIT[clip]} over {words}, {sight}.',
         tags=frozenset({'planar', _status(id_, True), *(['blind'] if blind else [])}),
     )
@@ -122,17 +122,17 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> R
 _FLIGHT = ((0.25, 0.5), (0.75, 1.0))
 
 
-def _imitation(character: str, model: str, clip: str, original: bool) -> Row:
+def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec:
     run = '_Run' if clip == 'biped2d_run' else ''
     # Where servos or torques drive joints hard into their limits, limits hold at 600 Hz; see
     # benchmarks/physics_rate.md.
     fine = model == 'velocity' or (model == 'torque' and character != 'biped2d')
     id_ = f'{_PREFIX[model]}_{_IN_ID[character]}_LLC_Imitate{run}_Flat-v0'
     figure = _IN_ID[character][:-2].lower()
-    options: dict[str, Any] = {'target': True, **({'substeps': 20} if fine else {})}
+    options: dict[str, Any] = {'reference_observation': True, **({'substeps': 20} if fine else {})}
     if (character, model) == ('raptor', 'muscle'):
         options['start_phase'] = _FLIGHT
-    return Row(
+    return EnvSpec(
         id=id_,
         domain='imitation',
         task=f'{_PREFIX[model].lower()}_{figure}{run.lower()}',
@@ -175,9 +175,9 @@ _MORE_GAITS = (
 )
 
 
-def _gait(character: str, name: str, preset: str, words: str, original: bool) -> Row:
+def _gait(character: str, name: str, preset: str, words: str, original: bool) -> EnvSpec:
     figure = {**_GAIT_CHARACTERS, 'goat': 'Goat2D'}[character]
-    return Row(
+    return EnvSpec(
         id=f'FSM_{figure}_Terrain_{name}-v0',
         domain='terrainrl',
         task=f'{figure[:-2].lower()}_{name.lower()}',
@@ -203,12 +203,12 @@ _SPATIAL_TERRAINS = (
 
 def _imitation3d(
     name: str, preset: str, words: str, original: bool, clip: str = 'biped3d_walk', **options: Any
-) -> Row:
+) -> EnvSpec:
     gait = 'run' if clip.endswith('run') else 'walk'
-    seeing = options.get('terrain_map', False)
+    seeing = options.get('terrain_observation', False)
     sight = ', seeing the ground around it,' if seeing else ''
-    sight = ', whose state it sees,' if options.get('target') else sight
-    return Row(
+    sight = ', whose state it sees,' if options.get('reference_observation') else sight
+    return EnvSpec(
         id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}{"_Terrain" if seeing else ""}-v0',
         domain='imitation',
         task=f'pd_biped3d{"_" if name else ""}{name.lower()}{"_terrain" if seeing else ""}',
@@ -233,8 +233,8 @@ def _step(
     original: bool = True,
     aliases: tuple[str, ...] = (),
     **options: Any,
-) -> Row:
-    return Row(
+) -> EnvSpec:
+    return EnvSpec(
         id=id_,
         domain='deeploco',
         task=task,
@@ -250,7 +250,7 @@ def _step(
     )
 
 
-_STEP2D = Row(
+_STEP2D = EnvSpec(
     id='PD_Biped2D_LLC_Flat_Step-v0',
     domain='deeploco',
     task='llc_flat_step',
@@ -302,8 +302,8 @@ RUN_LIMIT = 667  # the same of a run, whose footsteps last 0.3 s
 def _hike(
     name: str, preset: str, words: str, *, character: str = 'biped3d_mocap', original: bool = True,
     rules: str = 'hike', limit: int = HIKE_LIMIT, aliases: tuple[str, ...] = (), **options: Any,
-) -> Row:  # fmt: skip
-    return Row(
+) -> EnvSpec:  # fmt: skip
+    return EnvSpec(
         id=f'PD_Biped3D_HLC_{name}-v0',
         domain='deeploco',
         task=f'hlc_{name.lower()}',
@@ -354,8 +354,8 @@ _HIKES = (
 def _hard(
     name: str, preset: str, words: str, *, original: bool = True, rules: str = 'journey',
     aliases: tuple[str, ...] = (), **options: Any,
-) -> Row:  # fmt: skip
-    return Row(
+) -> EnvSpec:  # fmt: skip
+    return EnvSpec(
         id=f'PD_Biped3D_Terrain_{name}_Hard-v0',
         domain='deeploco',
         task=f'{name.lower()}_hard',
@@ -381,13 +381,13 @@ _JOURNEYS = (
     ),
     _hard(
         'Soccer', 'plane', 'dribbles a ball to a goal', original=False, rules='ball_journey',
-        terrain_map=False,
+        terrain_observation=False,
     ),
 )  # fmt: skip
 
 _BLIND = (('biped2d_full', 0), ('biped2d_full', 1), ('dog', 0), ('raptor', 0))  # terrain by index
 
-ROWS: tuple[Row, ...] = (
+SPECS: tuple[EnvSpec, ...] = (
     *(
         _plaid(character, *terrain, blind=False)
         for character in _PLAID_CHARACTERS
@@ -417,8 +417,8 @@ ROWS: tuple[Row, ...] = (
     *(_gait(*row, original=False) for row in _MORE_GAITS),
     *(_imitation3d(*terrain) for terrain in _SPATIAL_TERRAINS),
     # The original is blind on all of them.
-    *(_imitation3d(*terrain[:3], False, terrain_map=True) for terrain in _SPATIAL_TERRAINS[1:]),
-    _imitation3d('Track', 'plane', 'flat ground', True, target=True),
+    *(_imitation3d(*terrain[:3], False, terrain_observation=True) for terrain in _SPATIAL_TERRAINS[1:]),
+    _imitation3d('Track', 'plane', 'flat ground', True, reference_observation=True),
     _imitation3d('Run', 'plane', 'flat ground', False, clip='biped3d_run'),
     *_STEPS,
     _STEP2D,
@@ -426,20 +426,20 @@ ROWS: tuple[Row, ...] = (
     *_JOURNEYS,
 )  # fmt: skip
 
-BY_ID: dict[str, Row] = {row.id: row for row in ROWS}
-BY_TASK: dict[tuple[str, str], Row] = {(row.domain, row.task): row for row in ROWS}
-ALIASES: dict[str, Row] = {
-    alias: row for row in ROWS for alias in (*row.aliases, f'{row.domain}/{row.task}')
+BY_ID: dict[str, EnvSpec] = {spec.id: spec for spec in SPECS}
+BY_TASK: dict[tuple[str, str], EnvSpec] = {(spec.domain, spec.task): spec for spec in SPECS}
+ALIASES: dict[str, EnvSpec] = {
+    alias: spec for spec in SPECS for alias in (*spec.aliases, f'{spec.domain}/{spec.task}')
 }
 
 
-def find(id: str) -> Row:
+def find(id: str) -> EnvSpec:
     """Returns the row of an id or alias.
 
     Raises:
       ValueError: unknown id; the message has the closest matches.
     """
-    row = BY_ID.get(id) or ALIASES.get(id)
-    if row is None:
+    spec = BY_ID.get(id) or ALIASES.get(id)
+    if spec is None:
         raise ValueError(errors.unknown('environment', id, ALIASES if '/' in str(id) else BY_ID))
-    return row
+    return spec

@@ -1,9 +1,9 @@
 """A character without its physics: put into poses, measured, and drawn on a level floor.
 
 from trl_suite import motion
-from trl_suite.rendering import kinematic_viewer as mannequin
+from trl_suite.rendering import kinematic_viewer as kinematic viewer
 
-figure = mannequin.Mannequin('raptor')
+figure = kinematic viewer.KinematicViewer('raptor')
 figure.put(motion.load('raptor_run_050').pose(0.1))
 image = figure.picture(camera='side')  # (480, 640, 3) uint8
 """
@@ -28,18 +28,18 @@ TILE = 1.0  # m; edge of a square of the floor, so that distances can be seen
 _SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-class Mannequin:
+class KinematicViewer:
     """One character on a level floor at height 0.
 
     Attributes:
       character: the entity.
       layout: what the columns of its poses are, as of a `Clip`.
-      links: names of the links that have solids, in the order of `corners`; some occur twice if
+      links: names of the links that have collision geoms, in the order of `corners`; some occur twice if
         they have more than one.
       environment: a `composer.Environment` without any task, as `rendering` takes it.
     """
 
-    def __init__(self, character: str | characters.CharacterRow) -> None:
+    def __init__(self, character: str | characters.CharacterSpec) -> None:
         """Compiles a character.
 
         Args:
@@ -70,9 +70,9 @@ class Mannequin:
         self.environment = composer.Environment(composer.NullTask(arena), random_state=0)
         self.environment.reset()
         physics = self._physics = self.environment.physics
-        kind = 'free' if figure.row.spatial else 'planar'
+        kind = 'free' if figure.spec.spatial else 'planar'
         self.layout = Layout(
-            kind, tuple(figure.row.joints), np.where(figure.spherical, 4, 1).tolist()
+            kind, tuple(figure.spec.joints), np.where(figure.spherical, 4, 1).tolist()
         )
         joints = [*root_joints, *figure.joints]
         starts = np.concatenate([np.atleast_1d(physics.bind(joint).qposadr) for joint in joints])
@@ -86,7 +86,7 @@ class Mannequin:
         bodies = [model.name2id(body.full_identifier, 'body') for body in figure.bodies]
         self._bodies = np.array(bodies)
         self.links = tuple(
-            figure.row.links[bodies.index(body)] for body in model.geom_bodyid[self._geoms]
+            figure.spec.links[bodies.index(body)] for body in model.geom_bodyid[self._geoms]
         )
         box = model.geom_aabb[self._geoms]
         self._local = box[:, None, :3] + _SIGNS * box[:, None, 3:]
@@ -117,7 +117,7 @@ class Mannequin:
         mujoco.mj_fwdPosition(self._physics.model.ptr, data.ptr)
 
     def corners(self) -> np.ndarray:
-        """Returns the corners of the bounding boxes of all solids, m, (solids, 8, 3)."""
+        """Returns the corners of the bounding boxes of all collision geoms, m, (collision geoms, 8, 3)."""
         data = self._physics.data
         frames = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         return data.geom_xpos[self._geoms][:, None] + self._local @ frames.transpose(0, 2, 1)

@@ -168,7 +168,7 @@ def plot_terrain(
     draws: int = 3,
     length: float = 40.0,
     seed: int = 0,
-    blend: float = 0.0,
+    terrain_level: float = 0.0,
 ) -> None:
     """Plots several draws of a terrain: profiles below each other, or maps side by side.
 
@@ -180,7 +180,7 @@ def plot_terrain(
       draws: how many.
       length: how far ahead of the start, m; of a map its side, about the origin, at most 300 m.
       seed: draw i is the strip or ground with the seed sequence (seed, i).
-      blend: which of the terrain's parameter sets.
+      terrain_level: which of the terrain's parameter sets.
 
     Raises:
       ValueError: bad arguments; see also `trl_suite.terrain.load`.
@@ -200,16 +200,21 @@ def plot_terrain(
     make = _optional('matplotlib.figure').Figure
     if terrain.spatial:
         figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
-        _plot_maps(figure, terrain, draws, length, seed, blend)
+        _plot_maps(figure, terrain, draws, length, seed, terrain_level)
     else:
         figure = make(figsize=(10, 0.8 + 1.3 * draws), layout='constrained')
-        _plot_profiles(figure, terrain, draws, length, seed, blend)
+        _plot_profiles(figure, terrain, draws, length, seed, terrain_level)
     with replacing(target) as part:
         figure.savefig(part, dpi=100)
 
 
 def _plot_profiles(
-    figure: Any, terrain: terrains.Terrain, draws: int, length: float, seed: int, blend: float
+    figure: Any,
+    terrain: terrains.Terrain,
+    draws: int,
+    length: float,
+    seed: int,
+    terrain_level: float,
 ) -> None:
     panels = figure.subplots(draws, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     first = round(-2 / terrains.SPACING)
@@ -217,7 +222,9 @@ def _plot_profiles(
     x = (first + np.arange(count)) * terrains.SPACING
     grounds = []
     for i in range(draws):
-        strip = terrains.Strip(terrain, np.random.SeedSequence((seed, i)), blend=blend)
+        strip = terrains.PlanarGround(
+            terrain, np.random.SeedSequence((seed, i)), terrain_level=terrain_level
+        )
         grounds.append(strip.window(first, count)[0])
     low, high = min(map(np.min, grounds)), max(map(np.max, grounds))
     room = 0.15 * max(high - low, 1.0)
@@ -233,7 +240,12 @@ def _plot_profiles(
 
 
 def _plot_maps(
-    figure: Any, terrain: terrains.Terrain, draws: int, length: float, seed: int, blend: float
+    figure: Any,
+    terrain: terrains.Terrain,
+    draws: int,
+    length: float,
+    seed: int,
+    terrain_level: float,
 ) -> None:
     panels = figure.subplots(1, draws, sharex=True, sharey=True, squeeze=False)[0]
     count = min(MAP_POINTS, max(2, round(length / (0.25 * terrains.GRID))))
@@ -242,7 +254,7 @@ def _plot_maps(
     maps, starts = [], []
     for i in range(draws):
         sequence = np.random.SeedSequence((seed, i))
-        ground = terrains.Ground(terrain, sequence, blend=blend)
+        ground = terrains.SpatialGround(terrain, sequence, terrain_level=terrain_level)
         starts.append(ground.spawn(np.random.default_rng(sequence)))
         # Line by line, each of which meets few of the boxes.
         maps.append(np.stack([ground.height(places, y) for y in places]))
@@ -276,7 +288,7 @@ def height_map(
     mirrored.
 
     Args:
-      environment: one whose task observes such a map (`terrain_map=True`), after `reset`.
+      environment: one whose task observes such a map (`terrain_observation=True`), after `reset`.
       path: where to write it as .png; not written if None.
       reach: height, up or down, of the full colour, m.
 
@@ -293,7 +305,7 @@ def height_map(
     if part.stop - part.start != SAMPLES**2:
         raise ValueError(
             f'the task {type(task).__name__}, which observes no map of {SAMPLES} x {SAMPLES} heights, has '
-            'none to draw; 3D imitation and footsteps observe one with the option terrain_map=True'
+            'none to draw; 3D imitation and footsteps observe one with the option terrain_observation=True'
         )
     if not 0 < reach < np.inf:
         raise ValueError(f'reach is {reach}; expected a positive number of metres')
@@ -305,10 +317,10 @@ def height_map(
     image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
     # The middle of a sample's square is where it was taken.
     behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
-    row = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
+    env_id = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
     column = round(0.5 * SAMPLES * MAP_PIXELS)
     mark = MAP_PIXELS // 2
-    image[row - mark : row + mark, column - mark : column + mark] = ROOT_COLOUR
+    image[env_id - mark : env_id + mark, column - mark : column + mark] = ROOT_COLOUR
     if path is not None:
         imageio = _optional('imageio.v3')
         with replacing(check_path(path, IMAGE_SUFFIXES)) as file:

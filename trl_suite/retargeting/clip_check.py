@@ -18,7 +18,7 @@ import numpy as np
 
 from trl_suite import characters, describe
 from trl_suite.motion import Clip, quaternion
-from trl_suite.rendering.kinematic_viewer import Mannequin
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
 
 # What is a fault. Our own clips have none of these, see mocap/README.md.
 EXCESS = 1e-3  # rad beyond a joint's limits (m of a slide)
@@ -104,7 +104,7 @@ class Report:
         return f'{title}\n{describe.table(header, rows)}'
 
 
-def check(clip: Clip, character: str | characters.CharacterRow, near: float = NEAR) -> Report:
+def check(clip: Clip, character: str | characters.CharacterSpec, near: float = NEAR) -> Report:
     """Measures a clip on level ground at height 0, at its own frames.
 
     Args:
@@ -115,12 +115,12 @@ def check(clip: Clip, character: str | characters.CharacterRow, near: float = NE
     Raises:
       ValueError: an unknown character, or a clip of other joints.
     """
-    figure = Mannequin(character)
+    figure = KinematicViewer(character)
     layout, own = figure.layout, clip.layout
     if (own.root, own.joints, own.sizes) != (layout.root, layout.joints, layout.sizes):
         raise ValueError(
             f'clip {clip.name!r} (root {own.root}, joints {", ".join(own.joints)}) is none of '
-            f'{figure.character.row.name!r} (root {layout.root}, joints {", ".join(layout.joints)})'
+            f'{figure.character.spec.name!r} (root {layout.root}, joints {", ".join(layout.joints)})'
         )
     corners = np.empty((len(clip.times), len(figure.links), 8, 3))
     for i, pose in enumerate(clip.poses):
@@ -132,7 +132,7 @@ def check(clip: Clip, character: str | characters.CharacterRow, near: float = NE
         depth[name] = np.maximum(values, depth.get(name, 0.0))
     slide = {
         foot: _slide(corners[:, [name == foot for name in figure.links]], near)
-        for foot in figure.character.row.end_effectors
+        for foot in figure.character.spec.end_effectors
     }
     units = dict(
         zip(layout.joints, np.where(figure.character.prismatic, 'm', 'rad').tolist(), strict=True)
@@ -140,7 +140,7 @@ def check(clip: Clip, character: str | characters.CharacterRow, near: float = NE
     return Report(clip.name, clip.times, _excess(clip, figure), units, depth, slide)
 
 
-def _excess(clip: Clip, figure: Mannequin) -> dict[str, np.ndarray]:
+def _excess(clip: Clip, figure: KinematicViewer) -> dict[str, np.ndarray]:
     found = {}
     for joint, size, (low, high) in zip(
         clip.joints, clip.sizes, figure.character.joint_ranges, strict=True

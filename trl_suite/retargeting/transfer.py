@@ -24,7 +24,7 @@ from trl_suite import characters
 from trl_suite.motion import Capture, Clip, quaternion, readers
 from trl_suite.motion import clip as clips
 from trl_suite.motion.capture import read_amc, read_bvh
-from trl_suite.rendering.kinematic_viewer import Mannequin
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import errors
 from trl_suite.util.files import Path, existing
 
@@ -54,7 +54,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     '{side}_wrist': ('{side}_wrist', '{s}hand', '{side}hand', '{side}wrist'),
 }  # fmt: skip
 
-CharacterLike = str | characters.CharacterRow
+CharacterLike = str | characters.CharacterSpec
 
 
 def read(
@@ -97,7 +97,7 @@ def read(
     # The two differ in how they say that a motion repeats.
     if isinstance(content, dict) and isinstance(content.get('Loop'), str):
         return readers.read_deepmimic(path)
-    layout = Mannequin(character).layout
+    layout = KinematicViewer(character).layout
     return readers.read_terrainrl(path, layout.joints, layout.sizes, layout.root)
 
 
@@ -180,7 +180,7 @@ def retarget(
     Raises:
       ValueError: unknown joints, no root in the map, or a scale that is not positive.
     """
-    figure = Mannequin(character)
+    figure = KinematicViewer(character)
     layout = figure.layout
     if isinstance(motion, Clip) and joint_map is None and scale is None:
         own = motion.layout
@@ -210,7 +210,7 @@ def retarget(
     return Clip(
         motion.name, motion.times, poses, layout.root, layout.joints,
         layout.sizes, getattr(motion, 'loop', False),
-        f'{motion.name}, carried over to {figure.character.row.name}',
+        f'{motion.name}, carried over to {figure.character.spec.name}',
     )  # fmt: skip
 
 
@@ -230,7 +230,7 @@ def _yaw(path: np.ndarray, turns: np.ndarray) -> float:
     return float(quaternion.heading(turns[0]))
 
 
-def _bones(figure: Mannequin, chosen: Mapping[str, str]) -> dict[int, int]:
+def _bones(figure: KinematicViewer, chosen: Mapping[str, str]) -> dict[int, int]:
     """Returns the links of limbs, by number: those with one child that follows the motion."""
     ours = ('root', *figure.layout.joints)
     children: dict[int, list[int]] = {}
@@ -241,7 +241,7 @@ def _bones(figure: Mannequin, chosen: Mapping[str, str]) -> dict[int, int]:
 
 
 def _vectors(
-    figure: Mannequin, motion: Capture, chosen: Mapping[str, str]
+    figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Returns what each limb is in its zero pose and in the rest pose of the motion, m."""
     ours = ('root', *figure.layout.joints)
@@ -257,7 +257,7 @@ def _vectors(
     return {link: pair for link, pair in found.items() if min(map(np.linalg.norm, pair)) > 1e-6}
 
 
-def _limbs(figure: Mannequin, motion: Capture, chosen: Mapping[str, str]) -> float:
+def _limbs(figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]) -> float:
     """Returns the length of the character's limbs over that of the motion's."""
     pairs = _vectors(figure, motion, chosen).values()
     mine, other = (sum(float(np.linalg.norm(pair[i])) for pair in pairs) for i in (0, 1))
@@ -265,7 +265,7 @@ def _limbs(figure: Mannequin, motion: Capture, chosen: Mapping[str, str]) -> flo
 
 
 def _captured(
-    figure: Mannequin, motion: Capture, chosen: Mapping[str, str], upright: np.ndarray
+    figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str], upright: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Returns the world orientations (n, 4) that links should have, by number."""
     ours = ('root', *figure.layout.joints)
@@ -284,7 +284,7 @@ def _captured(
 
 
 def _poses(
-    figure: Mannequin,
+    figure: KinematicViewer,
     motion: Clip | Capture,
     chosen: Mapping[str, str],
     path: np.ndarray,
@@ -346,7 +346,7 @@ def _turns(motion: Clip, joint: str) -> np.ndarray:
     return quaternion.from_vector(motion.poses[:, column, None] * _LATERAL)
 
 
-def _lowest(figure: Mannequin, poses: np.ndarray) -> np.ndarray:
+def _lowest(figure: KinematicViewer, poses: np.ndarray) -> np.ndarray:
     """Returns the height of the lowest corner in every pose, (n,)."""
     heights = np.empty(len(poses))
     for i, pose in enumerate(poses):

@@ -30,9 +30,9 @@ OPTIONS = ('rewards', 'observations', 'failures')
 class Composed(Task):
     """Rules of another task, and some more.
 
-    A function is given this task and returns an array with a row per simulation. What it may read:
+    A function is given this task and returns an array with a simulation per simulation. What it may read:
     `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], all attributes of the other
-    task, and `trl_suite.tasks.parts`. It must treat rows alike and by themselves, and draw nothing.
+    task, and `trl_suite.tasks.parts`. It must treat simulations alike and by themselves, and draw nothing.
 
     Attributes:
       task: the other one.

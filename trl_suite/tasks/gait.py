@@ -15,7 +15,7 @@ import numpy as np
 
 from trl_suite import actuation
 from trl_suite.actuation.action_map import ActionMap
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, gaits
 from trl_suite.controllers.machine import GaitRules, touches
@@ -40,8 +40,8 @@ from trl_suite.tasks.task import (
     outcome,
     too_fast,
 )
-from trl_suite.terrain import Strip
-from trl_suite.terrain.planar.windows import PlanarGround
+from trl_suite.terrain import PlanarGround
+from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
@@ -54,7 +54,11 @@ INTERFACES = ('parameters', 'base_action')
 
 # Falls, all looked at every SAMPLE.
 SAMPLE = 0.1  # s
-FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples with a fall link down
+CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
+    0.9,
+    1 / 11,
+    0.25,
+)  # of the running share of samples with a fall link down
 TURNED = 0.8 * np.pi  # rad
 PATIENCE, PROGRESS = 5.0, 0.5  # s, m; who moves less than that in that time is stuck
 MAX_JOINT_SPEED = 1000.0  # rad/s; feet whip: there is no damping in these joints
@@ -107,8 +111,8 @@ class Options(NamedTuple):
     Attributes:
       by_cycle: whether a step is a cycle, not a frame.
       substeps: physics steps per control step.
-      centre: parameters of the gait at action 0, (P,).
-      half_range: what action 1 adds to those that actions set, (k,).
+      action_offset: parameters of the gait at action 0, (P,).
+      action_scale: what action 1 adds to those that actions set, (k,).
       places: which these are, (k,).
       base_actions: parameters that a preference chooses, (B, P).
       controls: addresses of the joints' torques in ctrl, (J,).
@@ -123,8 +127,8 @@ class Options(NamedTuple):
 
     by_cycle: bool
     substeps: int
-    centre: np.ndarray
-    half_range: np.ndarray
+    action_offset: np.ndarray
+    action_scale: np.ndarray
     places: np.ndarray
     base_actions: np.ndarray
     controls: np.ndarray
@@ -150,7 +154,7 @@ class Rules(NamedTuple):
 
     engine: native.Engine
     body: PlanarBody
-    ground: PlanarGround
+    ground: PlanarWindows
     gait: GaitRules
     ctrl: np.ndarray
     options: Options
@@ -183,16 +187,16 @@ def set_gait(i: int, rules: Rules) -> None:
     options, action, vector = rules.options, rules.state.action, rules.gait.state.vector
     rules.state.waiting[i] = False
     if options.by_cycle:
-        for k in range(len(options.centre)):
-            vector[i, k] = options.centre[k]
+        for k in range(len(options.action_offset)):
+            vector[i, k] = options.action_offset[k]
         for k in range(len(options.places)):
-            vector[i, options.places[k]] += options.half_range[k] * action[i, k]
+            vector[i, options.places[k]] += options.action_scale[k] * action[i, k]
     else:
         choice = 0
         for k in range(1, len(options.base_actions)):
             if action[i, k] > action[i, choice]:
                 choice = k
-        for k in range(len(options.centre)):
+        for k in range(len(options.action_offset)):
             vector[i, k] = options.base_actions[choice, k]
     gaits.apply(i, rules.gait)
 
@@ -248,13 +252,13 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 def look(i: int, rules: Rules) -> None:
     """Looks whether the episode has failed."""
     state, body, physics = rules.state, rules.body, rules.gait.physics
-    state.down[i] *= FADING
+    state.down[i] *= CONTACT_DECAY
     if any_touches(i, rules.options.fall, rules.gait):
-        state.down[i] += SHARE
+        state.down[i] += CONTACT_GAIN
     pitch = physics.qpos[i, body.qpos[2]]
     turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
     backwards = rules.options.forward_only and physics.qvel[i, body.dof[0]] < 0.0
-    state.fell[i] = state.down[i] > FALLEN or turn > TURNED or backwards
+    state.fell[i] = state.down[i] > FALL_THRESHOLD or turn > TURNED or backwards
     if state.age[i] % _PATIENCE_STEPS == 0:
         x, z = physics.qpos[i, body.qpos[0]], physics.qpos[i, body.qpos[1]]
         moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
@@ -323,7 +327,7 @@ def observe(i: int, rules: Rules) -> None:
 def begin_episode(i: int, rules: Rules) -> None:
     """Puts machine, outcome and what the task remembers to their starts."""
     state, body, physics = rules.state, rules.body, rules.gait.physics
-    gaits.begin(i, rules.options.centre, rules.gait)
+    gaits.begin(i, rules.options.action_offset, rules.gait)
     begin(i, rules.outcome)
     state.going[i], state.waiting[i] = False, True
     state.lasted[i] = state.stumbled[i] = state.age[i] = 0
@@ -403,12 +407,12 @@ class GaitTask(Task):
     def __init__(
         self,
         character: Character,
-        arena: PlanarTerrain,
+        arena: PlanarArena,
         *,
         interface: str = 'parameters',
         substeps: int = SUBSTEPS,
         spawn: str = 'intended',
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
         start_noise: float = 0.0,
     ) -> None:
         """Attaches character and gait to an arena.
@@ -421,8 +425,8 @@ class GaitTask(Task):
             s, and an action is one preference per base action, of which the largest counts when
             the next cycle begins.
           substeps: physics steps per control step of 1/600 s.
-          spawn: where the ground begins, see `trl_suite.terrain.Strip`.
-          blend: which of the terrain's parameter sets.
+          spawn: where the ground begins, see `trl_suite.terrain.PlanarGround`.
+          terrain_level: which of the terrain's parameter sets.
           start_noise: standard deviation that is added to the joints' angles (rad) at the start,
             and ten times that to their rates and to the speed (m/s).
 
@@ -438,7 +442,7 @@ class GaitTask(Task):
         self.character, self.arena, self.interface = character, arena, interface
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model)
-        self._spawn, self._blend, self._noise = spawn, blend, float(start_noise)
+        self._spawn, self._terrain_level, self._noise = spawn, terrain_level, float(start_noise)
         self._control_substeps = int(substeps)
         timestep = CONTROL_TIMESTEP / substeps
         self.set_timesteps(FRAME, timestep)
@@ -449,8 +453,8 @@ class GaitTask(Task):
         if interface == 'parameters':
             names = tuple(parameters.names[i] for i in parameters.actions)
             self.action_map = ActionMap(
-                names, 'gait parameter', 'rad, m, N or 1', parameters.centre[parameters.actions],
-                parameters.half_range[parameters.actions],
+                names, 'gait parameter', 'rad, m, N or 1', parameters.action_offset[parameters.actions],
+                parameters.action_scale[parameters.actions],
             )  # fmt: skip
         else:
             count = len(parameters.base_actions)
@@ -458,18 +462,18 @@ class GaitTask(Task):
                 tuple(f'base_action_{i}' for i in range(count)), 'preference', '1',
                 np.zeros(count), np.ones(count),
             )  # fmt: skip
-        links = len(character.row.links)
+        links = len(character.spec.links)
         self.blocks = consecutive({
             'terrain': SAMPLES, 'pose': 2 * links - 1, 'velocity': 2 * links,
         })  # fmt: skip
 
     @property
-    def root_entity(self) -> PlanarTerrain:
+    def root_entity(self) -> PlanarArena:
         return self.arena
 
     @property
     def signature(self) -> str:
-        parts = self.character.row.name, self.arena.terrain.name, self.interface
+        parts = self.character.spec.name, self.arena.terrain.name, self.interface
         return f'{super().signature} of {" / ".join(parts)}'
 
     def bind(self, world: World) -> None:
@@ -516,17 +520,17 @@ class GaitTask(Task):
         self._start = self._start_pose()
 
     def _options(self, body: PlanarBody) -> Options:
-        parameters, row = self.gait.parameters, self.character.row
+        parameters, spec = self.gait.parameters, self.character.spec
         scope = f'{self.character.mjcf_model.model}/'
-        controls = self.world.control_addresses([scope + name for name in row.joints])
-        fall = [self.gait.link[name] for name in row.fall_links]
-        stumble = [i for i, name in enumerate(row.links) if name not in row.stumble_exempt]
+        controls = self.world.control_addresses([scope + name for name in spec.joints])
+        fall = [self.gait.link[name] for name in spec.fall_links]
+        stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
         pitch = parameters.observe_pitch
         return Options(
             by_cycle=self.interface == 'parameters',
             substeps=self._control_substeps,
-            centre=parameters.centre.copy(),
-            half_range=parameters.half_range[parameters.actions],
+            action_offset=parameters.action_offset.copy(),
+            action_scale=parameters.action_scale[parameters.actions],
             places=parameters.actions,
             base_actions=parameters.base_actions,
             controls=controls,
@@ -543,10 +547,10 @@ class GaitTask(Task):
 
     def _columns(self, body: PlanarBody) -> np.ndarray:
         """Columns of the measurement that make an observation, by stance leg, (2, size)."""
-        links = self.character.row.links
+        links = self.character.spec.links
         order = np.arange(len(links))
         mirrored = order.copy()
-        for right, left in self.character.row.mirror:
+        for right, left in self.character.spec.mirror:
             i, j = links.index(right), links.index(left)
             mirrored[i], mirrored[j] = j, i
         arranged = []
@@ -579,10 +583,10 @@ class GaitTask(Task):
             poses[k, 3:] += noise[0]
             rates[k, 3:] += 10 * noise[1]
             rates[k, 0] += 10 * push
-            strip = Strip(
+            strip = PlanarGround(
                 self.arena.terrain,
                 drawn_seed(random_state),
-                blend=self._blend,
+                terrain_level=self._terrain_level,
                 spawn=self._spawn,
                 centre=UPSTREAM_CENTRE,
             )

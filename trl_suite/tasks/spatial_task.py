@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import actuation
 from trl_suite.actuation.action_map import Drive, drive
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.kinematics.spatial import (
@@ -36,18 +36,18 @@ from trl_suite.tasks.task import (
     start_phases,
     too_fast,
 )
-from trl_suite.terrain import Ground
+from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SpatialGround
+from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
-HALF_RANGE = 1.0  # rad per unit action about the mean pose of the motion
+ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
 PHASE_BINS = 4
 MIRRORED_BINS = 2  # of the phase of a single step
-CENTRES = ('clip', 'posture', 'original')  # of position control
+ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 _DIGITS = 1e9  # per cycle, to which the clock is rounded
 
 
@@ -116,7 +116,7 @@ class SpatialRules(NamedTuple):
     engine: native.Engine
     body: SpatialBody
     physics: SpatialState
-    ground: SpatialGround
+    ground: SpatialWindows
     drive: Drive
     ctrl: np.ndarray
     period: float
@@ -266,17 +266,17 @@ class SpatialTask(Task):
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         motion: Clip | Steps,
         *,
         actuation_model: str = 'position',
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_map: bool = False,
+        terrain_observation: bool = False,
         mirrored: bool = False,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
         phase: bool = True,
         extras: Mapping[str, int],
     ) -> None:
@@ -285,32 +285,32 @@ class SpatialTask(Task):
         Raises:
           ValueError: options out of range, or a motion that does not fit the character.
         """
-        row = character.row
+        spec = character.spec
         check_motion(character, motion)
-        check_drive(actuation_model, centre, half_range, substeps)
-        if mirrored and not row.mirror:
+        check_drive(actuation_model, action_offset, action_scale, substeps)
+        if mirrored and not spec.mirror:
             raise ValueError(
-                f'character {row.name!r} has no pairs of right and left links; mirrored observations '
+                f'character {spec.name!r} has no pairs of right and left links; mirrored observations '
                 'need them'
             )
         if mirrored and not phase:
             raise ValueError('mirrored observations need the phase, which tells left from right')
         self.character, self.arena, self.motion = character, arena, motion
-        self.actuation_model, self.terrain_map = actuation_model, terrain_map
+        self.actuation_model, self.terrain_observation = actuation_model, terrain_observation
         self.mirrored = mirrored
-        self._start_phase, self._blend = start_phases(start_phase), blend
-        self.figure = SpatialFigure(character, arena, terrain_map)
+        self._start_phase, self._terrain_level = start_phases(start_phase), terrain_level
+        self.figure = SpatialFigure(character, arena, terrain_observation)
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
         options: dict[str, Any] = {}
         if actuation_model == 'position':
-            options = position_range(self._typical_poses(), motion, centre, half_range)
+            options = position_range(self._typical_poses(), motion, action_offset, action_scale)
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
         self.joint_map = self.action_map  # from actions to the actuators
         full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
         self._full = self.blocks = consecutive(full)
-        self._reflection = self._reflected() if phase and row.mirror else None
+        self._reflection = self._reflected() if phase and spec.mirror else None
         self.mirror: Mirror | None = self._reflection
         self._kept: np.ndarray = np.zeros(0, int)  # all
         if mirrored:
@@ -354,12 +354,12 @@ class SpatialTask(Task):
     # Binding.
 
     @property
-    def root_entity(self) -> SpatialTerrain:
+    def root_entity(self) -> SpatialArena:
         return self.arena
 
     @property
     def signature(self) -> str:
-        parts = self.character.row.name, self.arena.terrain.name, self.motion.name
+        parts = self.character.spec.name, self.arena.terrain.name, self.motion.name
         return f'{super().signature} of {" / ".join(parts)}'
 
     def _bind_rules(self, world: World) -> SpatialRules:
@@ -439,7 +439,9 @@ class SpatialTask(Task):
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            ground = SpatialGround(
+                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+            )
             self._random[i] = np.random.default_rng(drawn_seed(random_state))
             spawns[k] = ground.spawn(self._random[i])
             self.arena.begin_episode(i, ground, spawns[k, :2])
@@ -505,31 +507,35 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
     Raises:
       ValueError: it is not; the message has the joints of both.
     """
-    row = character.row
-    if not row.spatial or tuple(motion.joints) != tuple(row.joints):
+    spec = character.spec
+    if not spec.spatial or tuple(motion.joints) != tuple(spec.joints):
         raise ValueError(
             f'motion {motion.name!r} (joints {", ".join(motion.joints)}) does not fit character '
-            f'{row.name!r}: expected a spatial character with these joints, not '
-            f'{"one" if row.spatial else "a planar one"} with {", ".join(row.joints)}'
+            f'{spec.name!r}: expected a spatial character with these joints, not '
+            f'{"one" if spec.spatial else "a planar one"} with {", ".join(spec.joints)}'
         )
 
 
-def check_drive(actuation_model: str, centre: str, half_range: float | None, substeps: int) -> None:
+def check_drive(
+    actuation_model: str, action_offset: str, action_scale: float | None, substeps: int
+) -> None:
     """Checks the options of actuation and time.
 
     Raises:
       ValueError: they are out of range, or do not fit each other.
     """
-    if centre not in CENTRES:
-        raise ValueError(errors.unknown('centre of position control', centre, CENTRES))
-    if actuation_model != 'position' and (centre != 'clip' or half_range is not None):
+    if action_offset not in ACTION_OFFSETS:
         raise ValueError(
-            f'centre and half_range shape position control, not {actuation_model} control'
+            errors.unknown('action_offset of position control', action_offset, ACTION_OFFSETS)
         )
-    if centre == 'original' and half_range is not None:
-        raise ValueError("centre 'original' has ranges of its own: give no half_range")
-    if half_range is not None and not 0 < half_range < np.inf:
-        raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
+    if actuation_model != 'position' and (action_offset != 'clip' or action_scale is not None):
+        raise ValueError(
+            f'action_offset and action_scale shape position control, not {actuation_model} control'
+        )
+    if action_offset == 'original' and action_scale is not None:
+        raise ValueError("action_offset 'original' has ranges of its own: give no action_scale")
+    if action_scale is not None and not 0 < action_scale < np.inf:
+        raise ValueError(f'action_scale is {action_scale}; expected a positive number of radians')
     if int(substeps) != substeps or substeps < 6:
         raise ValueError(
             f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
@@ -537,13 +543,13 @@ def check_drive(actuation_model: str, centre: str, half_range: float | None, sub
 
 
 def position_range(
-    typical_poses: np.ndarray, motion: Clip | Steps, centre: str, half_range: float | None
+    typical_poses: np.ndarray, motion: Clip | Steps, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
-    """Returns the options of position control for a centre and a half range."""
-    if centre == 'original':
+    """Returns the options of position control for a action_offset and a half range."""
+    if action_offset == 'original':
         return {'rotations': 'angle_axis'}
-    options: dict[str, Any] = {} if half_range is None else {'half_range': half_range}
-    if centre == 'clip':
-        options.setdefault('half_range', HALF_RANGE)
-        options['centre'] = mean_targets(typical_poses, motion)
+    options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}
+    if action_offset == 'clip':
+        options.setdefault('action_scale', ACTION_SCALE)
+        options['action_offset'] = mean_targets(typical_poses, motion)
     return options

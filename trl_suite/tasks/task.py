@@ -41,7 +41,7 @@ class Marker(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step of each simulation came to; rows of simulations.
+    """What a step of each simulation came to; simulations of simulations.
 
     Attributes:
       observation: all observation blocks side by side, (n, observation size).
@@ -121,8 +121,8 @@ class Task(composer.Task):
       action_map: what an action means.
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
-      saved: tuples of arrays with n rows that make up the state of the task, `outcome` among them.
-      info_arrays: what `info` tells, arrays of n rows by name, or dicts of such; kept up to date.
+      saved: tuples of arrays with n simulations that make up the state of the task, `outcome` among them.
+      info_arrays: what `info` tells, arrays of n simulations by name, or dicts of such; kept up to date.
     """
 
     world: World
@@ -139,7 +139,7 @@ class Task(composer.Task):
 
     @abc.abstractmethod
     def bind(self, world: World) -> None:
-        """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
+        """Resolves ids in a compiled world and allocates arrays of `world.n` simulations."""
 
     @abc.abstractmethod
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
@@ -175,7 +175,7 @@ class Task(composer.Task):
         self.world.step(self._substeps, env_ids)
 
     def info(self) -> dict[str, Any]:
-        """Returns what happened beyond observation and reward: arrays of n rows, or dicts of such."""
+        """Returns what happened beyond observation and reward: arrays of n simulations, or dicts of such."""
         return _each(self.info_arrays, np.copy)
 
     def info_of(self, env_id: int) -> dict[str, Any]:
@@ -289,7 +289,7 @@ def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dic
 
 
 def check_simulated(lasted: np.ndarray) -> None:
-    """Checks that rows have run the physics of a step of a task that does so by itself.
+    """Checks that simulations have run the physics of a step of a task that does so by itself.
 
     Args:
       lasted: how long each has, 0 where it has not.

@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import actuation
 from trl_suite.actuation.action_map import Drive, drive
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.kinematics import planar, spatial
@@ -45,10 +45,10 @@ from trl_suite.tasks.task import (
     outcome,
     too_fast,
 )
-from trl_suite.terrain import Ground, Strip
-from trl_suite.terrain.planar.windows import PlanarGround
+from trl_suite.terrain import PlanarGround, SpatialGround
+from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.terrain.spatial.windows import SpatialGround
+from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 SAMPLES = 50  # heights on the line that a planar character sees
@@ -61,12 +61,12 @@ class WalkState(NamedTuple):
 
     Attributes:
       origin: x, y of the start, (n, 2) m.
-      course: direction in which it is to go, rad to the left of +x, (n,).
-      distance: travelled along the course, (n,) m.
+      target_heading: direction in which it is to go, rad to the left of +x, (n,).
+      distance: travelled along the target_heading, (n,) m.
     """
 
     origin: np.ndarray
-    course: np.ndarray
+    target_heading: np.ndarray
     distance: np.ndarray
 
 
@@ -76,7 +76,7 @@ class PlanarRules(NamedTuple):
     engine: native.Engine
     body: PlanarBody
     physics: PlanarState
-    ground: PlanarGround
+    ground: PlanarWindows
     drive: Drive
     ctrl: np.ndarray
     found: PlanarMeasurement
@@ -89,20 +89,20 @@ class SpatialRules(NamedTuple):
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      terrain, pose, velocity, course: where these blocks begin; -1: not observed.
+      terrain, pose, velocity, target_heading: where these blocks begin; -1: not observed.
       leaving: whether the window of ground has to be laid anew, (n,).
     """
 
     engine: native.Engine
     body: SpatialBody
     physics: SpatialState
-    ground: SpatialGround
+    ground: SpatialWindows
     drive: Drive
     ctrl: np.ndarray
     terrain: int
     pose: int
     velocity: int
-    course: int
+    target_heading: int
     found: SpatialMeasurement
     state: WalkState
     leaving: np.ndarray
@@ -165,11 +165,13 @@ def look_spatial(i: int, rules: SpatialRules) -> None:
     spatial.measure(i, rules.body, rules.physics, rules.ground, found)
     write_terrain(i, rules.terrain, rules.ground, found, observation)
     write_body(i, rules.pose, rules.velocity, found, observation)
-    bearing = state.course[i] - found.heading[i]
-    observation[i, rules.course] = math.cos(bearing)
-    observation[i, rules.course + 1] = math.sin(bearing)
+    bearing = state.target_heading[i] - found.heading[i]
+    observation[i, rules.target_heading] = math.cos(bearing)
+    observation[i, rules.target_heading + 1] = math.sin(bearing)
     x, y = found.root[i, 0] - state.origin[i, 0], found.root[i, 1] - state.origin[i, 1]
-    state.distance[i] = math.cos(state.course[i]) * x + math.sin(state.course[i]) * y
+    state.distance[i] = (
+        math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
+    )
 
 
 @compiled_loop
@@ -215,22 +217,22 @@ class Walk(Task):
 
     Observation blocks, in this order: terrain (if seen), pose and velocity as in `Imitation` and
     `SpatialImitation`; of a spatial character
-      course: cosine and sine of the bearing of the way it is to go, that of its start; 2.
+      target_heading: cosine and sine of the bearing of the way it is to go, that of its start; 2.
 
     Attributes:
-      pace: speed of a full reward, m/s.
+      speed_ratio: speed of a full reward, m/s.
     """
 
     def __init__(
         self,
         character: Character,
-        arena: PlanarTerrain | SpatialTerrain,
+        arena: PlanarArena | SpatialArena,
         *,
         actuation_model: str = 'position',
-        terrain_view: bool = False,
+        terrain_observation: bool = False,
         substeps: int = SUBSTEPS,
-        half_range: float | None = None,
-        blend: float = 0.0,
+        action_scale: float | None = None,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -238,11 +240,11 @@ class Walk(Task):
           character: without actuators; it is attached to the arena.
           arena: where it moves, of as many dimensions.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_view: observe the ground: 50 heights from 0.5 m behind to 3 m ahead, or the 32 x 32
+          terrain_observation: observe the ground: 50 heights from 0.5 m behind to 3 m ahead, or the 32 x 32
             map of a spatial character.
           substeps: physics steps per control step of 1/30 s.
-          half_range: for position control, rad per unit action about the working posture.
-          blend: which mixture of the terrain's parameter sets to draw from.
+          action_scale: for position control, rad per unit action about the working posture.
+          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
           ValueError: options out of range.
@@ -250,44 +252,44 @@ class Walk(Task):
         if int(substeps) != substeps or substeps < 4:
             raise ValueError(f'substeps is {substeps}; expected an integer of at least 4')
         self.character, self.arena = character, arena
-        self._blend, self._spatial = blend, character.row.spatial
-        self.terrain_map = terrain_view and self._spatial
+        self._terrain_level, self._spatial = terrain_level, character.spec.spatial
+        self.terrain_observation = terrain_observation and self._spatial
         self.figure: Any
-        if isinstance(arena, SpatialTerrain):
-            self.figure = SpatialFigure(character, arena, terrain_view)
+        if isinstance(arena, SpatialArena):
+            self.figure = SpatialFigure(character, arena, terrain_observation)
             self.fields = SpatialFigure.fields
         else:
-            samples = SAMPLES if terrain_view else 0
+            samples = SAMPLES if terrain_observation else 0
             self.figure = PlanarFigure(character, arena, VIEW_BEHIND, VIEW_AHEAD, samples)
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
-        options = {} if half_range is None else {'half_range': half_range}
+        options = {} if action_scale is None else {'action_scale': action_scale}
         if options and actuation_model != 'position':
-            raise ValueError(f'half_range shapes position control, not {actuation_model} control')
+            raise ValueError(f'action_scale shapes position control, not {actuation_model} control')
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
-        self.blocks = consecutive({**self.figure.blocks, 'course': 2 * self._spatial})
+        self.blocks = consecutive({**self.figure.blocks, 'target_heading': 2 * self._spatial})
 
     @property
-    def root_entity(self) -> PlanarTerrain | SpatialTerrain:
+    def root_entity(self) -> PlanarArena | SpatialArena:
         return self.arena
 
     @property
     def signature(self) -> str:
-        parts = self.character.row.name, self.arena.terrain.name
+        parts = self.character.spec.name, self.arena.terrain.name
         return f'{super().signature} of {" / ".join(parts)}'
 
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure = self.figure
-        if isinstance(self.arena, SpatialTerrain):
+        if isinstance(self.arena, SpatialArena):
             figure.bind(world)
         else:
             figure.bind(world, self.blocks)
         self._pose, self._extents = self._posture(world)
         # In m; of the root over the ground, in the working posture.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
-        self.pace = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
+        self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
         self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
         self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), 0)
         self.saved = (self.state, self.outcome)
@@ -312,7 +314,7 @@ class Walk(Task):
         if self._spatial:
             rules = SpatialRules(  # type: ignore[call-arg]
                 *common, world.ctrl,
-                *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'course')),
+                *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'target_heading')),
                 figure.found, self.state, np.zeros(n, bool), self.outcome,
             )  # fmt: skip
             self._leaving, self._waiting = rules.leaving, np.zeros(n, bool)
@@ -327,15 +329,15 @@ class Walk(Task):
         self._pack = packed(rules)
 
     @property
-    def course(self) -> np.ndarray:
+    def target_heading(self) -> np.ndarray:
         """Direction in which each walker is to go, rad to the left of +x, (n,)."""
-        return self.state.course
+        return self.state.target_heading
 
     def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
         """Returns the pose of the start about the origin, and the extents of its geoms."""
-        figure, row = self.figure, self.character.row
+        figure, spec = self.figure, self.character.spec
         values: list[float] = [0, 0, 0, 1, 0, 0, 0] if self._spatial else [0, 0, 0]
-        for joint, ball in zip(row.joints.values(), self.character.spherical, strict=True):
+        for joint, ball in zip(spec.joints.values(), self.character.spherical, strict=True):
             if ball:
                 vector = np.broadcast_to(joint.target, 3).astype(float)
                 values += quaternion.from_vector(vector).tolist()
@@ -354,17 +356,19 @@ class Walk(Task):
         spawns = np.zeros((count, 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             seed = drawn_seed(random_state)
-            if isinstance(self.arena, SpatialTerrain):
-                ground = Ground(terrain, seed, blend=self._blend)
+            if isinstance(self.arena, SpatialArena):
+                ground = SpatialGround(terrain, seed, terrain_level=self._terrain_level)
                 spawns[k] = ground.spawn(random_state)
                 self.arena.begin_episode(i, ground, spawns[k, :2])
             else:
-                self.arena.begin_episode(i, Strip(terrain, seed, blend=self._blend))
+                self.arena.begin_episode(
+                    i, PlanarGround(terrain, seed, terrain_level=self._terrain_level)
+                )
         if self._spatial:
             self.figure.place(env_ids, poses, rates, spawns)
         else:
             self.figure.place(env_ids, poses, rates, np.tile(self._extents, (count, 1, 1)))
-        self.state.origin[env_ids], self.course[env_ids] = spawns[:, :2], spawns[:, 2]
+        self.state.origin[env_ids], self.target_heading[env_ids] = spawns[:, :2], spawns[:, 2]
         for array in self.outcome[1:]:  # all but the observation
             array[env_ids] = 0
         self.observe(env_ids)
@@ -373,7 +377,7 @@ class Walk(Task):
         if self._act(env_ids, action, self._pack):
             # Ground is laid before the physics, so that what is rendered afterwards is up to date.
             leaving = env_ids[self._leaving[env_ids]]
-            if isinstance(self.arena, SpatialTerrain):
+            if isinstance(self.arena, SpatialArena):
                 self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
             else:
                 self.figure.follow(leaving)
@@ -390,22 +394,25 @@ class Walk(Task):
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
         """Draws the ground that some simulations look back on; returns which have waited for it."""
         waiting = env_ids[self._waiting[env_ids]]
-        assert isinstance(self.arena, PlanarTerrain)
+        assert isinstance(self.arena, PlanarArena)
         for i in waiting.tolist():
             self.arena.widen(i)
         return waiting
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
-        """Returns the parts of horizontal vectors (n, 2) that go along the course, (n,)."""
-        return np.cos(self.course) * vectors[:, 0] + np.sin(self.course) * vectors[:, 1]
+        """Returns the parts of horizontal vectors (n, 2) that go along the target_heading, (n,)."""
+        return (
+            np.cos(self.target_heading) * vectors[:, 0]
+            + np.sin(self.target_heading) * vectors[:, 1]
+        )
 
 
-def pace(task: Any) -> np.ndarray:
-    """Speed along the course in shares of that of a full reward, in [0, 1], (n,)."""
+def speed_ratio(task: Any) -> np.ndarray:
+    """Speed along the target_heading in shares of that of a full reward, in [0, 1], (n,)."""
     velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
-    if not task.character.row.spatial:
+    if not task.character.spec.spatial:
         velocity = velocity * [1.0, 0.0]  # the other one is upward
-    return np.clip(task.along(velocity) / task.pace, 0, 1)
+    return np.clip(task.along(velocity) / task.full_speed, 0, 1)
 
 
 def upright(task: Any) -> np.ndarray:
@@ -413,9 +420,13 @@ def upright(task: Any) -> np.ndarray:
     return np.maximum(parts.upright(task), 0)
 
 
-def ease(task: Any) -> np.ndarray:
+def low_effort(task: Any) -> np.ndarray:
     """1 less the mean square of the action, (n,)."""
     return 1 - parts.effort(task)
 
 
-WALK = {'pace': (0.7, pace), 'upright': (0.2, upright), 'ease': (0.1, ease)}
+WALK = {
+    'speed_ratio': (0.7, speed_ratio),
+    'upright': (0.2, upright),
+    'low_effort': (0.1, low_effort),
+}

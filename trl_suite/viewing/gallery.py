@@ -1,6 +1,6 @@
 """Re-makes all pictures: environments, terrains, characters, learning curves, and the suite at once.
 
-    trl-suite gallery --output gallery --only '*Dog2D*'
+    trl-suite gallery --output gallery --filter '*Dog2D*'
 
 Files, FOLDER/...: environments/ID.jpg, a film strip; curves/ID.png, of a policy that is shipped;
 terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg. At
@@ -33,7 +33,7 @@ from trl_suite import terrain as terrains
 from trl_suite.environments import named_policies as acting
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
-from trl_suite.rendering.kinematic_viewer import Mannequin
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
 
 LARGEST = 40_000  # bytes of a picture
@@ -185,7 +185,7 @@ def make(
 
 def character(name: str) -> np.ndarray:
     """Draws a character: in the first pose of its clip if it has one, else standing straight."""
-    figure = Mannequin(name)
+    figure = KinematicViewer(name)
     if name in suite.DEFAULT_CLIPS:
         figure.put(motion.load(suite.DEFAULT_CLIPS[name]).pose(0.0))
     height, width = CHARACTER_SIZE
@@ -214,12 +214,12 @@ def scene(id: str) -> tuple[int, float, float, str]:
 
     Plans are seen from behind, with what is ahead, unless obstacles would stand in between.
     """
-    row = suite.find(id)
-    if row.id in SCENES:
-        return SCENES[row.id]
-    if 'hierarchical' not in row.tags:
+    spec = suite.find(id)
+    if spec.id in SCENES:
+        return SCENES[spec.id]
+    if 'hierarchical' not in spec.tags:
         return SEED, 0.0, SECONDS, 'side'
-    hidden = 'obstacles' in terrains.load(row.terrain).type
+    hidden = 'obstacles' in terrains.load(spec.terrain).type
     return SEED, 0.0, LONGER, 'above' if hidden else 'back'
 
 
@@ -297,13 +297,13 @@ def curve(id: str) -> np.ndarray:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    found, row = record(id), suite.find(id)
+    found, spec = record(id), suite.find(id)
     if found is None:
         raise ValueError(f'no policy is shipped for {id!r}')
-    gait = row.rules == 'gait'  # whose return says little
-    value = 'distance' if gait else 'fraction'
+    gait = spec.rules == 'gait'  # whose return says little
+    value = 'distance' if gait else 'normalized_return'
     unit, name = (1e6, 'million control steps')
-    if gait or 'hierarchical' in row.tags:
+    if gait or 'hierarchical' in spec.tags:
         unit, name = 1e3, f'thousand {"decisions" if gait else "plans"}'
     figure = Figure(figsize=(4.2, 2.4), layout='constrained')
     axis = figure.subplots()
@@ -366,7 +366,7 @@ def _source(path: pathlib.Path) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Makes pictures, and returns 1 if any failed."""
-    written, failed = make(arguments.output, arguments.only, arguments.again)
+    written, failed = make(arguments.output, arguments.filter, arguments.overwrite)
     for path, error in failed.items():
         print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
     noun = 'picture' if len(written) == 1 else 'pictures'

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
 from trl_suite.tasks.components.goals import GOAL_COLOUR
@@ -162,17 +162,17 @@ def _speed_along(
 
 @compiled
 def observe_ball(
-    i: int, target: int, goal: np.ndarray, physics: SpatialState, found: SpatialMeasurement,
+    i: int, column: int, goal: np.ndarray, physics: SpatialState, found: SpatialMeasurement,
     ball: BallRules, observation: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes the goal as seen from the ball, and the block ball, in the heading frame.
 
-    Of the goal (n, 3) bearing and distance, rad and m, in column `target` and the next. Of the ball
+    Of the goal (n, 3) bearing and distance, rad and m, in `column` and the next. Of the ball
     bearing, distance and height, rad, m and m; velocity, m/s; angular velocity, rad/s.
     """
     x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
     bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, found)
-    observation[i, target], observation[i, target + 1] = bearing, distance
+    observation[i, column], observation[i, column + 1] = bearing, distance
     bearing, distance = polar(i, x - found.root[i, 0], y - found.root[i, 1], found)
     column = ball.column
     observation[i, column], observation[i, column + 1] = bearing, distance
@@ -193,7 +193,7 @@ class Ball:
       qpos, dof: its columns of positions (7) and of velocities (6).
     """
 
-    def __init__(self, arena: SpatialTerrain) -> None:
+    def __init__(self, arena: SpatialArena) -> None:
         """Adds it to an arena; `bind` ties it to the compiled world.
 
         Raises:
@@ -226,9 +226,9 @@ class Ball:
         (self._body,) = world.body_ids(['ball'])
         inertia = 0.4 * MASS * RADIUS**2
         rate = -np.log(DRAG)
-        for row, model in enumerate(world.models):
+        for env_id, model in enumerate(world.models):
             model.dof_damping[self.dof] = np.repeat([MASS * rate, inertia * rate], 3)
-            world.set_const(row)
+            world.set_const(env_id)
 
         self.state = ball_state(world.n)
 

@@ -24,9 +24,9 @@ POSE = (*VECTOR, *QUATERNION)  # of what the block of the pose has for each link
 
 def body(character: Character) -> dict[str, Reflection]:
     """The blocks of the body and of the map around it."""
-    row = character.row
-    names = list(row.links)
-    pairs = [(names.index(a), names.index(b)) for a, b in row.mirror]
+    spec = character.spec
+    names = list(spec.links)
+    pairs = [(names.index(a), names.index(b)) for a, b in spec.mirror]
     links = exchanged(len(names), pairs)
     grid = np.arange(SAMPLES**2).reshape(SAMPLES, SAMPLES)[::-1]  # lines from the left
     index, sign = blocks(links, POSE)
@@ -44,8 +44,8 @@ def phase(bins: int) -> Reflection:
 
 def actions(character: Character, action_map: ActionMap) -> Reflection:
     """What joints are told."""
-    row = character.row
-    joints = list(row.joints)
+    spec = character.spec
+    joints = list(spec.joints)
     ball = ANGLE_AXIS if isinstance(action_map, AngleAxisMap) else SPIN
     starts: list[int] = []
     signs: list[float] = []
@@ -53,7 +53,7 @@ def actions(character: Character, action_map: ActionMap) -> Reflection:
         starts.append(len(signs))
         signs += ball if spherical else (1.0,)
     index = np.arange(len(signs))
-    for a, b in row.mirror:
+    for a, b in spec.mirror:
         i, j = (starts[joints.index(name)] for name in (a, b))
         width = len(ball) if character.spherical[joints.index(a)] else 1
         index[i : i + width] = np.arange(j, j + width)

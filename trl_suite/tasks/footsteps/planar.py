@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import PlanarTerrain
-from trl_suite.characters import Character, CharacterRow
+from trl_suite.arenas import PlanarArena
+from trl_suite.characters import Character, CharacterSpec
 from trl_suite.engine import World
 from trl_suite.kinematics.planar import has_fallen, measure, must_wait
 from trl_suite.kinematics.planar_reference import feature
@@ -64,7 +64,7 @@ class Options(NamedTuple):
     Attributes:
       shortest, longest: of the steps, m.
       change: probability that a step has another length than the one before.
-      miss: landing error that ends an episode, m.
+      max_landing_error: landing error that ends an episode, m.
       footstep_scale: times the squared distance between swing foot and landing place.
       contact_block, plan_block: first columns.
     """
@@ -72,7 +72,7 @@ class Options(NamedTuple):
     shortest: float
     longest: float
     change: float
-    miss: float
+    max_landing_error: float
     footstep_scale: float
     contact_block: int
     plan_block: int
@@ -120,7 +120,7 @@ def land(
         plan.landing[i, 0, axis] = plan.landing[i, 1, axis]
     plan.landing[i, 1, 0] += next_length(i, plan, options)
     put_on_ground(i, rules, plan)
-    return plan.landing_error[i] > options.miss
+    return plan.landing_error[i] > options.max_landing_error
 
 
 @compiled
@@ -264,20 +264,20 @@ class PlanarFootsteps(Imitation):
     def __init__(
         self,
         character: Character,
-        arena: PlanarTerrain,
+        arena: PlanarArena,
         clip: Clip,
         *,
         actuation_model: str = 'position',
         plans: StraightPlans | Mapping[str, Any] | None = None,
-        miss: float | None = None,
+        max_landing_error: float | None = None,
         footstep_scale: float = 1.0,
-        terrain_samples: int = 0,
+        terrain_observation: int = 0,
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
         spawn: str = 'intended',
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -288,27 +288,29 @@ class PlanarFootsteps(Imitation):
           clip: a looping planar clip for this character, of two steps; the right foot stands first.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
           plans: how plans are drawn; or keyword arguments of `StraightPlans`.
-          miss: an episode fails where a foot lands farther than this from its place, m.
+          max_landing_error: an episode fails where a foot lands farther than this from its place, m.
           footstep_scale: times the squared distance between swing foot and landing place in the
             reward; more than 1 teaches accuracy sooner.
-          terrain_samples, substeps, centre, half_range, start_phase, spawn, blend: as for
+          terrain_observation, substeps, action_offset, action_scale, start_phase, spawn, terrain_level: as for
             `Imitation`.
 
         Raises:
           ValueError: options out of range, a character without two feet, or a clip that does not fit
             it; when the world is bound, a clip whose left foot stands first.
         """
-        check_feet(character.row)
-        if miss is not None and not 0 < miss < np.inf:
-            raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
+        check_feet(character.spec)
+        if max_landing_error is not None and not 0 < max_landing_error < np.inf:
+            raise ValueError(
+                f'max_landing_error is {max_landing_error}; expected a positive number of metres, or None'
+            )
         if not 0 <= footstep_scale < np.inf:
             raise ValueError(f'footstep_scale is {footstep_scale}; expected 0 or more')
         self.plans = plans_from(StraightPlans, 'plans', {} if plans is None else plans)
-        self.miss, self._footstep_scale = miss, footstep_scale
+        self.max_landing_error, self._footstep_scale = max_landing_error, footstep_scale
         super().__init__(
             character, arena, clip, actuation_model=actuation_model,
-            terrain_samples=terrain_samples, substeps=substeps, centre=centre,
-            half_range=half_range, start_phase=start_phase, spawn=spawn, blend=blend,
+            terrain_observation=terrain_observation, substeps=substeps, action_offset=action_offset,
+            action_scale=action_scale, start_phase=start_phase, spawn=spawn, terrain_level=terrain_level,
         )  # fmt: skip
 
     def bind(self, world: World) -> None:
@@ -336,7 +338,7 @@ class PlanarFootsteps(Imitation):
         }
         plans = self.plans
         options = Options(
-            plans.length[0], plans.length[1], plans.change, np.inf if self.miss is None else float(self.miss),
+            plans.length[0], plans.length[1], plans.change, np.inf if self.max_landing_error is None else float(self.max_landing_error),
             float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
         )  # fmt: skip
         self._packs = self._pack, packed(self.plan), packed(options)
@@ -354,27 +356,27 @@ class PlanarFootsteps(Imitation):
         if observe_all(env_ids, fresh, *self._packs):
             observe_all(self._widened(env_ids), fresh, *self._packs)
 
-    def markers(self, row: int) -> list[Marker]:
+    def markers(self, env_id: int) -> list[Marker]:
         """Where the feet are to land."""
         return [
             Marker('box', (x + SOLE_AHEAD, y, z + SOLE[2]), SOLE, colour)
             for (x, y, z), colour in zip(
-                self.plan.landing[row].tolist(), (SWING_COLOUR, STANCE_COLOUR), strict=True
+                self.plan.landing[env_id].tolist(), (SWING_COLOUR, STANCE_COLOUR), strict=True
             )
         ]
 
-    def reference_pose(self, row: int) -> np.ndarray:
+    def reference_pose(self, env_id: int) -> np.ndarray:
         """Pose of the reference where the character was at the last switch: x, z, pitch, joints."""
-        begun, x = self.plan.begun[row]
+        begun, x = self.plan.begun[env_id]
         first, pose = self.clip.pose(
-            np.array([begun, self.state.cycles[row]]) * self.reference.period
+            np.array([begun, self.state.cycles[env_id]]) * self.reference.period
         )
         pose[0] += x - first[0]
-        pose[1] += self.figure.ground_heights(row, pose[:1])[0]
+        pose[1] += self.figure.ground_heights(env_id, pose[:1])[0]
         return pose
 
 
-def check_feet(character: CharacterRow) -> None:
+def check_feet(character: CharacterSpec) -> None:
     """Checks that a character has a right and a left foot, and no others.
 
     Raises:

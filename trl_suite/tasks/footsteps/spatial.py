@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement, polar
@@ -258,24 +258,24 @@ class Footsteps(SpatialTask):
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         steps: Steps,
         *,
         actuation_model: str = 'position',
         plans: Plans | Mapping[str, Any] | None = None,
         goal: bool = False,
         pushes: Pushes | Mapping[str, Any] | None = None,
-        miss: float | None = None,
-        grace: float = 0.0,
+        max_landing_error: float | None = None,
+        grace_period: float = 0.0,
         footstep_scale: float | Sequence[float] = 1.0,
         heading_scale: float = 1.0,
-        terrain_map: bool = False,
+        terrain_observation: bool = False,
         mirrored: bool = False,
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
         hidden_plan: bool = False,
     ) -> None:
         """Composes the task.
@@ -288,14 +288,14 @@ class Footsteps(SpatialTask):
           plans: how plans are drawn; or keyword arguments of `Plans`.
           pushes: forces on the torso; or keyword arguments of `Pushes`. None without.
           goal: plans head for a goal on the terrain instead, one after the other.
-          miss: an episode fails where a foot lands farther than this from its place, m. The original
+          max_landing_error: an episode fails where a foot lands farther than this from its place, m. The original
             meant to fail at 1 m and does not.
-          grace: s after a push or a sharp turn in which no foot misses its place.
+          grace_period: s after a push or a sharp turn in which no foot misses its place.
           footstep_scale: times the squared distance between swing foot and landing place in the
             reward; more than 1 teaches accuracy sooner. Of several, the mean of their rewards counts:
             a small one reaches far, a large one is accurate.
           heading_scale: the same of the error of the heading.
-          terrain_map, mirrored, substeps, centre, half_range, start_phase, blend: as for
+          terrain_observation, mirrored, substeps, action_offset, action_scale, start_phase, terrain_level: as for
             `SpatialImitation`; the middle of position control is the mean pose of a straight step.
           hidden_plan: observe bearing (rad) and distance (m) of a goal that stays where it is, in a
             block goal, instead of contact and plan, which the reward is still about: what the
@@ -304,12 +304,14 @@ class Footsteps(SpatialTask):
         Raises:
           ValueError: options out of range, or steps that do not fit the character.
         """
-        if len(character.row.end_effectors) != 2:
-            raise ValueError(f'character {character.row.name!r} has no two feet to place')
-        if miss is not None and not 0 < miss < np.inf:
-            raise ValueError(f'miss is {miss}; expected a positive number of metres, or None')
-        if not 0 <= grace < np.inf:
-            raise ValueError(f'grace is {grace}; expected seconds, 0 or more')
+        if len(character.spec.end_effectors) != 2:
+            raise ValueError(f'character {character.spec.name!r} has no two feet to place')
+        if max_landing_error is not None and not 0 < max_landing_error < np.inf:
+            raise ValueError(
+                f'max_landing_error is {max_landing_error}; expected a positive number of metres, or None'
+            )
+        if not 0 <= grace_period < np.inf:
+            raise ValueError(f'grace_period is {grace_period}; expected seconds, 0 or more')
         for name, given in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
             scales = np.atleast_1d(given)
             if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
@@ -320,16 +322,16 @@ class Footsteps(SpatialTask):
         self.pushes = None if pushes is None else options(Pushes, 'pushes', pushes)
         self.steps, self.period = steps, 2 * steps.duration
         self.goal_given, self.hidden_plan = goal, hidden_plan
-        self.miss = miss
-        self._largest_miss = np.inf if miss is None else float(miss)
-        self._grace = round(grace / CONTROL_TIMESTEP)
+        self.max_landing_error = max_landing_error
+        self._max_landing_error = np.inf if max_landing_error is None else float(max_landing_error)
+        self._grace_steps = round(grace_period / CONTROL_TIMESTEP)
         # The straight step of about the planned length, from which episodes start.
         self._first = straight_step(steps, float(np.mean(self.plans.length)))
         extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * hidden_plan}
         super().__init__(
             character, arena, steps, actuation_model=actuation_model, substeps=substeps,
-            centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
-            mirrored=mirrored, blend=blend, extras=extras,
+            action_offset=action_offset, action_scale=action_scale, start_phase=start_phase, terrain_observation=terrain_observation,
+            mirrored=mirrored, terrain_level=terrain_level, extras=extras,
         )  # fmt: skip
         if hidden_plan:
             if mirrored:
@@ -373,7 +375,7 @@ class Footsteps(SpatialTask):
         rules = FootstepRules(
             common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
             starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
-            self._heading_scale, self._largest_miss,
+            self._heading_scale, self._max_landing_error,
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
@@ -516,7 +518,7 @@ class Footsteps(SpatialTask):
             state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
             state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
             state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
-            state.excused[i] = state.push_end[i] + self._grace
+            state.excused[i] = state.push_end[i] + self._grace_steps
         pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
         self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
 
@@ -550,7 +552,7 @@ class Footsteps(SpatialTask):
                     self.goal[i] = self.arena.goal(i, random, root, 'step')
             elif plans.sharp and random.uniform() < plans.sharp:
                 turns[k] = random.uniform(-np.pi, np.pi)
-                self.state.excused[i] = self.clock.steps[i] + self._grace
+                self.state.excused[i] = self.clock.steps[i] + self._grace_steps
             elif plans.turn:
                 turns[k] = random.normal(0, plans.turn)
             sizes[k, 1] = self._next_size(i)

@@ -17,7 +17,7 @@ from trl_suite import actuation
 from trl_suite.actuation import hill
 from trl_suite.actuation.action_map import Drive, drive
 from trl_suite.actuation.muscles import PLAIN, Muscle
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.kinematics.planar import (
@@ -45,8 +45,8 @@ from trl_suite.tasks.task import (
     start_phases,
     too_fast,
 )
-from trl_suite.terrain import Strip
-from trl_suite.terrain.planar.windows import PlanarGround
+from trl_suite.terrain import PlanarGround
+from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
@@ -55,7 +55,7 @@ SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 
 VIEW_BEHIND = 0.5  # m; where the line of terrain samples begins
 VIEW_AHEAD = 3.0  # m; where it ends
 PHASE_BINS = 4
-CENTRES = ('clip', 'posture', 'original')  # of position control
+ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 
 POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
@@ -79,8 +79,8 @@ class Layout(NamedTuple):
 
     Attributes:
       angles, rates, effectors, com_velocity, height, positions, phase: first columns of features.
-      strain_block, phase_block, target_block: where these blocks begin.
-      target: number of columns in the target block.
+      strain_block, phase_block, reference_block: where these blocks begin.
+      reference: number of columns in the reference block.
     """
 
     angles: int
@@ -92,8 +92,8 @@ class Layout(NamedTuple):
     phase: int
     strain_block: int
     phase_block: int
-    target_block: int
-    target: int
+    reference_block: int
+    reference: int
 
 
 _FEATURES = Layout._fields[:7]  # that are columns of the clip's table
@@ -112,7 +112,7 @@ class Rules(NamedTuple):
     engine: native.Engine
     body: PlanarBody
     physics: PlanarState
-    ground: PlanarGround
+    ground: PlanarWindows
     clip: ClipTable
     drive: Drive
     ctrl: np.ndarray
@@ -195,7 +195,7 @@ def compare(i: int, rules: Rules) -> None:
 
 @compiled
 def observe(i: int, rules: Rules) -> None:
-    """Writes the blocks behind terrain, pose and velocity: muscles, and phase or target."""
+    """Writes the blocks behind terrain, pose and velocity: muscles, and phase or reference."""
     layout, clip, observation = rules.layout, rules.clip, rules.outcome.observation
     phase = rules.state.phase[i]
     for k in range(len(rules.rest)):
@@ -204,8 +204,8 @@ def observe(i: int, rules: Rules) -> None:
     if layout.phase_block >= 0:
         for k in range(1 + PHASE_BINS):
             observation[i, layout.phase_block + k] = feature(phase, layout.phase + k, clip)
-    for k in range(layout.target):
-        observation[i, layout.target_block + k] = feature(phase, layout.height + k, clip)
+    for k in range(layout.reference):
+        observation[i, layout.reference_block + k] = feature(phase, layout.height + k, clip)
 
 
 # Loops over simulations; they take packs.
@@ -261,7 +261,7 @@ class Imitation(Task):
       velocity: (x, z) velocity of every link centre, m/s; 2N.
       strain: fibre strain of every muscle, if the character is driven by muscles.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
-      target: height of the reference's root, then its link positions relative to its root and its
+      reference: height of the reference's root, then its link positions relative to its root and its
         link velocities; 4N + 1.
     """
 
@@ -272,19 +272,19 @@ class Imitation(Task):
     def __init__(
         self,
         character: Character,
-        arena: PlanarTerrain,
+        arena: PlanarArena,
         clip: Clip,
         *,
         actuation_model: str = 'position',
-        terrain_samples: int = 0,
-        target: bool = False,
+        terrain_observation: int = 0,
+        reference_observation: bool = False,
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         muscle_set: str = PLAIN,
         start_phase: float | Sequence[Sequence[float]] | None = None,
         spawn: str = 'intended',
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -293,36 +293,48 @@ class Imitation(Task):
           arena: where it moves.
           clip: a looping planar clip for this character.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_samples: heights observed on the line from 0.5 m behind to 3 m ahead; 0 is blind.
-          target: observe the reference's state instead of the phase.
+          terrain_observation: heights observed on the line from 0.5 m behind to 3 m ahead; 0 is blind.
+          reference_observation: observe the reference's state instead of the phase.
           substeps: physics steps per control step of 1/30 s.
-          centre: for position control, the pose at action 0: the mean pose of the 'clip', the
+          action_offset: for position control, the pose at action 0: the mean pose of the 'clip', the
             character's working 'posture', or the 'original' map, whose [-1, 1] spans four times the
             joint range about its middle.
-          half_range: for position control, rad per unit action (default 1.5).
+          action_scale: for position control, rad per unit action (default 1.5).
           muscle_set: for muscle control, 'plain' or the motion that the muscles were optimised for.
           start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
             drawn uniformly if None.
           spawn: where the flat start lies: 'intended' (1 m to both sides of the start) or
             'upstream' (where the original's construction puts it, depending on the start phase).
-          blend: which mixture of the terrain's parameter sets to draw from.
+          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
           ValueError: options out of range, or a clip that does not fit the character.
         """
-        self._check(character, clip, actuation_model, centre, half_range, substeps, terrain_samples)
+        self._check(
+            character,
+            clip,
+            actuation_model,
+            action_offset,
+            action_scale,
+            substeps,
+            terrain_observation,
+        )
         self.character, self.arena, self.clip = character, arena, clip
         self.actuation_model = actuation_model
-        self._start_phase, self._spawn, self._blend = start_phases(start_phase), spawn, blend
+        self._start_phase, self._spawn, self._terrain_level = (
+            start_phases(start_phase),
+            spawn,
+            terrain_level,
+        )
         self.figure = PlanarFigure(
-            character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_samples, 'contact' in self.EXTRAS
+            character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_observation, 'contact' in self.EXTRAS
         )
         self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
 
         options: dict[str, Any] = {}
         muscles: tuple[Muscle, ...] = ()
         if actuation_model == 'position':
-            options = position_range(character, clip, centre, half_range)
+            options = position_range(character, clip, action_offset, action_scale)
         elif actuation_model == 'muscle':
             options = {'muscle_set': muscle_set}
             muscles = actuation.character_muscles(character, muscle_set)
@@ -334,8 +346,8 @@ class Imitation(Task):
         self.blocks = consecutive({
             **self.figure.blocks,
             'strain': len(muscles),
-            'phase': 0 if target else 1 + PHASE_BINS,
-            'target': 4 * len(character.row.links) + 1 if target else 0,
+            'phase': 0 if reference_observation else 1 + PHASE_BINS,
+            'reference': 4 * len(character.spec.links) + 1 if reference_observation else 0,
             **self.EXTRAS,
         })  # fmt: skip
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
@@ -343,42 +355,54 @@ class Imitation(Task):
 
     @staticmethod
     def _check(
-        character: Character, clip: Clip, model: str, centre: str, half_range: float | None,
-        substeps: int, terrain_samples: int,
+        character: Character, clip: Clip, model: str, action_offset: str, action_scale: float | None,
+        substeps: int, terrain_observation: int,
     ) -> None:  # fmt: skip
-        if tuple(clip.joints) != tuple(character.row.joints) or clip.root != 'planar':
+        if tuple(clip.joints) != tuple(character.spec.joints) or clip.root != 'planar':
             raise ValueError(
                 f'clip {clip.name!r} (root {clip.root}, joints {", ".join(clip.joints)}) does not '
-                f'fit character {character.row.name!r}, whose root is planar and whose joints are '
-                f'{", ".join(character.row.joints)}'
+                f'fit character {character.spec.name!r}, whose root is planar and whose joints are '
+                f'{", ".join(character.spec.joints)}'
             )
         if not clip.loop:
             raise ValueError(f'clip {clip.name!r} does not loop; an imitation task needs a cycle')
-        if centre not in CENTRES:
-            raise ValueError(errors.unknown('centre of position control', centre, CENTRES))
-        if model != 'position' and (centre != 'clip' or half_range is not None):
-            raise ValueError(f'centre and half_range shape position control, not {model} control')
-        if half_range is not None and not 0 < half_range < np.inf:
-            raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-        if int(terrain_samples) != terrain_samples or terrain_samples < 0 or terrain_samples == 1:
-            raise ValueError(f'terrain_samples is {terrain_samples}; expected 0, or at least 2')
+        if action_offset not in ACTION_OFFSETS:
+            raise ValueError(
+                errors.unknown('action_offset of position control', action_offset, ACTION_OFFSETS)
+            )
+        if model != 'position' and (action_offset != 'clip' or action_scale is not None):
+            raise ValueError(
+                f'action_offset and action_scale shape position control, not {model} control'
+            )
+        if action_scale is not None and not 0 < action_scale < np.inf:
+            raise ValueError(
+                f'action_scale is {action_scale}; expected a positive number of radians'
+            )
+        if (
+            int(terrain_observation) != terrain_observation
+            or terrain_observation < 0
+            or terrain_observation == 1
+        ):
+            raise ValueError(
+                f'terrain_observation is {terrain_observation}; expected 0, or at least 2'
+            )
         if int(substeps) != substeps or substeps < 4:
             raise ValueError(
                 f'substeps is {substeps}; expected an integer of at least 4 (physics at 120 Hz)'
             )
 
     @property
-    def root_entity(self) -> PlanarTerrain:
+    def root_entity(self) -> PlanarArena:
         return self.arena
 
     @property
     def signature(self) -> str:
-        parts = self.character.row.name, self.arena.terrain.name, self.clip.name
+        parts = self.character.spec.name, self.arena.terrain.name, self.clip.name
         return f'{super().signature} of {" / ".join(parts)}'
 
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
-        figure, row = self.figure, self.character.row
+        figure, spec = self.figure, self.character.spec
         figure.bind(world, self.blocks, self.ABOUT)
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
@@ -401,7 +425,7 @@ class Imitation(Task):
         terms = np.array(list(self.TERMS.values()))
         self.rules = Rules(
             world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
-            by, world.ctrl, self._layout(), np.asarray(row.weights), terms[:, 0].copy(), terms[:, 1].copy(),
+            by, world.ctrl, self._layout(), np.asarray(spec.weights), terms[:, 0].copy(), terms[:, 1].copy(),
             self._rest, self._scale, self._found, self.state, self.outcome,
         )  # fmt: skip
         self._pack = packed(self.rules)
@@ -409,13 +433,13 @@ class Imitation(Task):
     def _layout(self) -> Layout:
         columns = {name: part.start for name, part in self.reference.columns.items()}
         starts = {name: part.start for name, part in self.blocks.items()}
-        target = self.blocks.get('target', slice(0, 0))
+        reference = self.blocks.get('reference', slice(0, 0))
         return Layout(
             **{name: columns[name] for name in _FEATURES},
             strain_block=starts.get('strain', -1),
             phase_block=starts.get('phase', -1),
-            target_block=starts.get('target', -1),
-            target=target.stop - target.start,
+            reference_block=starts.get('reference', -1),
+            reference=reference.stop - reference.start,
         )
 
     @property
@@ -434,7 +458,9 @@ class Imitation(Task):
                 # Where the original's segments meet: it builds them before it moves the root to 0.
                 centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
             seed = drawn_seed(random_state)
-            strip = Strip(terrain, seed, blend=self._blend, spawn=self._spawn, centre=centre)
+            strip = PlanarGround(
+                terrain, seed, terrain_level=self._terrain_level, spawn=self._spawn, centre=centre
+            )
             self.arena.begin_episode(i, strip)
         for array in self.state:
             array[env_ids] = phases
@@ -468,7 +494,7 @@ class Imitation(Task):
             self.arena.widen(i)
         return waiting
 
-    def clip_action(self, row: int) -> np.ndarray:
+    def clip_action(self, env_id: int) -> np.ndarray:
         """Action that drives joints along the clip, without feedback on balance.
 
         Raises:
@@ -479,36 +505,36 @@ class Imitation(Task):
                 f'{self.actuation_model} control cannot follow a clip open loop; position and '
                 'velocity control can'
             )
-        time = self.phase[row : row + 1] * self.reference.period
+        time = self.phase[env_id : env_id + 1] * self.reference.period
         sample = self.clip.pose if self.actuation_model == 'position' else self.clip.velocity
         return self.action_map.action(sample(time)[0, 3:])
 
-    def reference_pose(self, row: int) -> np.ndarray:
+    def reference_pose(self, env_id: int) -> np.ndarray:
         """Pose of the reference beside the simulated character: x, z, pitch, joints."""
-        cycles = np.array([self.state.start[row], self.state.cycles[row]])
+        cycles = np.array([self.state.start[env_id], self.state.cycles[env_id]])
         first, pose = self.clip.pose(cycles * self.reference.period)
         pose[0] -= first[0]
-        pose[1] += self.figure.ground_heights(row, pose[:1])[0]
+        pose[1] += self.figure.ground_heights(env_id, pose[:1])[0]
         return pose
 
 
 def position_range(
-    character: Character, clip: Clip, centre: str, half_range: float | None
+    character: Character, clip: Clip, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
     """Centre and half range of position control, rad (see `Imitation`)."""
-    if centre == 'original':
+    if action_offset == 'original':
         ranges = np.array([
             joint.original_range or limits
             for joint, limits in zip(
-                character.row.joints.values(), character.joint_ranges.tolist(), strict=True
+                character.spec.joints.values(), character.joint_ranges.tolist(), strict=True
             )
         ])  # fmt: skip
         free = ~np.isfinite(ranges).all(1)
         ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
-        scale = 2 * (ranges[:, 1] - ranges[:, 0]) if half_range is None else half_range
-        return {'centre': ranges.mean(1), 'half_range': scale}
-    options: dict[str, Any] = {} if half_range is None else {'half_range': half_range}
-    if centre == 'clip':
+        scale = 2 * (ranges[:, 1] - ranges[:, 0]) if action_scale is None else action_scale
+        return {'action_offset': ranges.mean(1), 'action_scale': scale}
+    options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}
+    if action_offset == 'clip':
         times = np.linspace(0, clip.duration, 256, endpoint=False)
-        options['centre'] = clip.pose(times)[:, 3:].mean(0)
+        options['action_offset'] = clip.pose(times)[:, 3:].mean(0)
     return options

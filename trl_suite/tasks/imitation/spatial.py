@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import polar
@@ -40,7 +40,7 @@ from trl_suite.tasks.spatial_task import (
     tick,
 )
 from trl_suite.tasks.task import conclude, drawn_seed
-from trl_suite.terrain import Ground
+from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 GOAL_AHEAD = 3.0  # m along x; where the goal on the line through the start lies
@@ -53,14 +53,14 @@ class ImitationRules(NamedTuple):
     """All that the rules of imitation work on.
 
     Attributes:
-      target: where the target block begins in the full observation; -1: not observed.
+      reference: where the reference block begins in the full observation; -1: not observed.
       goal: where the goal block begins.
       links: number of links.
     """
 
     common: SpatialRules
     comparison: Comparison
-    target: int
+    reference: int
     goal: int
     links: int
 
@@ -108,12 +108,12 @@ def observe(i: int, rules: ImitationRules) -> None:
     """Writes the observation."""
     common, by = rules.common, rules.comparison
     observe_body(i, common)
-    if rules.target >= 0:
+    if rules.reference >= 0:
         row, rest = moment(common.clock.phase[i], 0, by.tracks)
-        common.full[i, rules.target] = feature(row, rest, by.height, by.tracks)
+        common.full[i, rules.reference] = feature(row, rest, by.height, by.tracks)
         for k in range(6 * rules.links):  # positions and velocities of the links
             value = feature(row, rest, by.positions + k, by.tracks)
-            common.full[i, rules.target + 1 + k] = value
+            common.full[i, rules.reference + 1 + k] = value
     aside = common.travel.origin[i, 1] - common.found.root[i, 1]
     bearing, distance = polar(i, GOAL_AHEAD, aside, common.found)
     common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
@@ -150,7 +150,7 @@ class SpatialImitation(SpatialTask):
       velocity: of every link the velocity of its centre (3), m/s, against the ground under the
         root, and its angular velocity (3), rad/s; 6N.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
-      target: height of the reference's root, then its link positions relative to its root, then
+      reference: height of the reference's root, then its link positions relative to its root, then
         its link velocities, in the reference's heading frame; 6N + 1.
       goal: bearing (rad, positive to the left) and distance (m) of the point on the line through
         the start along +x that is 3 m further along than the root: which way is straight on. The
@@ -165,18 +165,18 @@ class SpatialImitation(SpatialTask):
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         clip: Clip,
         *,
         actuation_model: str = 'position',
-        terrain_map: bool = False,
-        target: bool = False,
+        terrain_observation: bool = False,
+        reference_observation: bool = False,
         mirrored: bool = False,
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -185,36 +185,39 @@ class SpatialImitation(SpatialTask):
           arena: where it moves.
           clip: a looping clip for this character, with a free root.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_map: observe the heights around.
-          target: observe the reference's state instead of the phase.
+          terrain_observation: observe the heights around.
+          reference_observation: observe the reference's state instead of the phase.
           mirrored: observe and act as if the right foot always stood first.
           substeps: physics steps per control step of 1/30 s.
-          centre: for position control, the pose at action 0: the mean pose of the 'clip', left and
+          action_offset: for position control, the pose at action 0: the mean pose of the 'clip', left and
             right made alike, the character's working 'posture', or the 'original' map: an angle and
             an axis for every ball joint, in the original's range.
-          half_range: for position control, rad per unit action (1 about the clip, 1.5 about the
+          action_scale: for position control, rad per unit action (1 about the clip, 1.5 about the
             posture).
           start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
             drawn uniformly if None.
-          blend: which mixture of the terrain's parameter sets to draw from.
+          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
           ValueError: options out of range, or a clip that does not fit the character.
         """
         check_cycle(clip)
         self.clip, self.period = clip, clip.duration
-        extras = {'target': 1 + 6 * len(character.row.links) if target else 0, 'goal': 2}
+        extras = {
+            'reference': 1 + 6 * len(character.spec.links) if reference_observation else 0,
+            'goal': 2,
+        }
         super().__init__(
             character, arena, clip, actuation_model=actuation_model, substeps=substeps,
-            centre=centre, half_range=half_range, start_phase=start_phase, terrain_map=terrain_map,
-            mirrored=mirrored, blend=blend, phase=not target, extras=extras,
+            action_offset=action_offset, action_scale=action_scale, start_phase=start_phase, terrain_observation=terrain_observation,
+            mirrored=mirrored, terrain_level=terrain_level, phase=not reference_observation, extras=extras,
         )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
         return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
 
     def _extra_mirror(self, name: str) -> Reflection:
-        assert name == 'goal', name  # mirrored observations have no target
+        assert name == 'goal', name  # mirrored observations have no reference
         return np.arange(2), np.array([-1.0, 1.0])
 
     def bind(self, world: World) -> None:
@@ -223,7 +226,7 @@ class SpatialImitation(SpatialTask):
         starts = {name: part.start for name, part in self._full.items()}
         rules = ImitationRules(
             common, comparison(self.character, self.reference, self.TERMS),
-            starts.get('target', -1), starts['goal'], len(self.character.row.links),
+            starts.get('reference', -1), starts['goal'], len(self.character.spec.links),
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
 
@@ -234,7 +237,9 @@ class SpatialImitation(SpatialTask):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            ground = SpatialGround(
+                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+            )
             self.arena.begin_episode(i, ground)
         self._begin_clocks(env_ids)
         return *pose_of_clip(self.clip, self.clock.start[env_ids]), np.zeros((len(env_ids), 3))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import polar
@@ -231,18 +231,18 @@ class Journey(SpatialTask):
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         clip: Clip,
         ball: Ball | None = None,
         *,
         actuation_model: str = 'position',
-        terrain_map: bool = True,
+        terrain_observation: bool = True,
         goal_reached: float = GOAL_REACHED,
         substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
+        action_offset: str = 'clip',
+        action_scale: float | None = None,
         start_phase: float | Sequence[Sequence[float]] | None = None,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -252,9 +252,9 @@ class Journey(SpatialTask):
           clip: a looping clip for this character, with a free root.
           ball: a ball of the arena that is to be dribbled.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_map: observe the heights around.
+          terrain_observation: observe the heights around.
           goal_reached: m; nearer, a goal is drawn anew. With a ball: nearer, the ball is at the goal.
-          substeps, centre, half_range, start_phase, blend: as for `SpatialImitation`.
+          substeps, action_offset, action_scale, start_phase, terrain_level: as for `SpatialImitation`.
 
         Raises:
           ValueError: options out of range, or a clip that does not fit the character.
@@ -268,9 +268,9 @@ class Journey(SpatialTask):
         self.TERMS = BALL_TERMS if ball else rewards.JOURNEY_TERMS
         self._goal_reached = goal_reached
         super().__init__(
-            character, arena, clip, actuation_model=actuation_model, terrain_map=terrain_map,
-            substeps=substeps, centre=centre, half_range=half_range, start_phase=start_phase,
-            blend=blend, extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
+            character, arena, clip, actuation_model=actuation_model, terrain_observation=terrain_observation,
+            substeps=substeps, action_offset=action_offset, action_scale=action_scale, start_phase=start_phase,
+            terrain_level=terrain_level, extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
         )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
@@ -372,19 +372,19 @@ class Journey(SpatialTask):
 
 def journey(
     character: Character,
-    arena: SpatialTerrain,
+    arena: SpatialArena,
     clip: Clip,
     steps: Steps | None,
     *,
     reward: str = 'goal',
     actuation_model: str = 'position',
     goal_reached: float | None = None,
-    terrain_map: bool = True,
+    terrain_observation: bool = True,
     substeps: int = SUBSTEPS,
-    centre: str = 'clip',
-    half_range: float | None = None,
+    action_offset: str = 'clip',
+    action_scale: float | None = None,
     start_phase: float | Sequence[Sequence[float]] | None = None,
-    blend: float = 0.0,
+    terrain_level: float = 0.0,
 ) -> Journey | Footsteps:
     """Composes what one of the rewards is for.
 
@@ -400,8 +400,8 @@ def journey(
       ValueError: options out of range, or that do not fit each other.
     """
     options: dict[str, Any] = {
-        'actuation_model': actuation_model, 'terrain_map': terrain_map, 'substeps': substeps,
-        'centre': centre, 'half_range': half_range, 'start_phase': start_phase, 'blend': blend,
+        'actuation_model': actuation_model, 'terrain_observation': terrain_observation, 'substeps': substeps,
+        'action_offset': action_offset, 'action_scale': action_scale, 'start_phase': start_phase, 'terrain_level': terrain_level,
     }  # fmt: skip
     if reward not in REWARDS:
         raise ValueError(errors.unknown('reward', reward, REWARDS))

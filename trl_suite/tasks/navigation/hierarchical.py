@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trl_suite.actuation.action_map import ActionMap
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller as llc
 from trl_suite.engine import World
@@ -67,7 +67,7 @@ from trl_suite.tasks.task import (
     drawn_seed,
     drawn_way,
 )
-from trl_suite.terrain import Ground
+from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util import errors
@@ -79,15 +79,19 @@ SIGHTS = ('height', 'velocity')
 # m, and turn of the heading, rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
 PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
-PLAN_CENTRE = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
+PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
-PLAN_HALF_RANGE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
+PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
 GOAL_REACHED = 1.0  # m; by default
 GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # reward for being on one's feet
 HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
-FADING, SHARE, FALLEN = 0.9, 1 / 11, 0.25  # of the running share of samples that touch the ground
+CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
+    0.9,
+    1 / 11,
+    0.25,
+)  # of the running share of samples that touch the ground
 SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
 FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
 LONGEST = 60  # control steps of a step; the clock switches stance long before
@@ -125,7 +129,7 @@ class PlanningRules(NamedTuple):
     Attributes:
       contact, plan_block: where these blocks begin in the full observation.
       by_plan: whether a step is a footstep, not a control step.
-      terrain, surface, pose, velocity, target, low_level: where these blocks begin in the
+      terrain, surface, pose, velocity, goal, low_level: where these blocks begin in the
         observation; -1: not observed.
       plan_offset, plan_scale: what an action means.
       target_speed, goal_reached: of the reward, m/s and m.
@@ -144,7 +148,7 @@ class PlanningRules(NamedTuple):
     surface: int
     pose: int
     velocity: int
-    target: int
+    goal: int
     low_level: int
     plan_offset: np.ndarray
     plan_scale: np.ndarray
@@ -219,9 +223,9 @@ def finish_control_step(i: int, rules: PlanningRules) -> bool:
     measure(i, common)
     count, found = common.clock.steps[i], common.found
     if count % SAMPLE_FRAMES == 0:
-        state.down[i] *= FADING
-        state.down[i] += SHARE * found.fallen[i]
-    outcome.failed[i] = state.down[i] > FALLEN
+        state.down[i] *= CONTACT_DECAY
+        state.down[i] += CONTACT_GAIN * found.fallen[i]
+    outcome.failed[i] = state.down[i] > FALL_THRESHOLD
     if update_stance(i, common.clock.phase[i], found, rules.plan):
         rules.plan.landed[i] = True
     follow(i, count, found.com, rules.trace)
@@ -295,11 +299,11 @@ def observe(i: int, rules: PlanningRules) -> None:
     write_body(i, rules.pose, rules.velocity, found, observation)
     place = rules.goals.place
     if rules.with_ball:
-        observe_ball(i, rules.target, place, common.physics, found, rules.ball, observation)
+        observe_ball(i, rules.goal, place, common.physics, found, rules.ball, observation)
     else:
         x, y = place[i, 0] - found.root[i, 0], place[i, 1] - found.root[i, 1]
         bearing, distance = polar(i, x, y, found)
-        observation[i, rules.target], observation[i, rules.target + 1] = bearing, distance
+        observation[i, rules.goal], observation[i, rules.goal + 1] = bearing, distance
     if rules.low_level >= 0:
         observe_low(i, rules)
         for k in range(common.full.shape[1]):
@@ -379,7 +383,7 @@ class HighLevel(SpatialTask):
       terrain: the 32 x 32 map of `Surroundings.height_map`, m, if it sees heights.
       surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if it sees velocities.
       pose, velocity: as in `SpatialImitation`.
-      target: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
+      goal: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
         the ball.
       ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
       low_level: what the footstep controller observes, with interface 'frame' only; see `Footsteps`.
@@ -394,7 +398,7 @@ class HighLevel(SpatialTask):
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         steps: Steps,
         ball: Ball | None = None,
         *,
@@ -407,7 +411,7 @@ class HighLevel(SpatialTask):
         goal_distance: tuple[float, float] | None = None,
         start_phases: Sequence[float] = (0.1, 0.6),
         substeps: int = SUBSTEPS,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -429,7 +433,7 @@ class HighLevel(SpatialTask):
             where the terrain has them.
           start_phases: of the clock, one of which every episode starts with.
           substeps: physics steps per 1/30 s.
-          blend: which mixture of the terrain's parameter sets to draw from.
+          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
           ValueError: options out of range, or parts that do not fit each other.
@@ -456,14 +460,14 @@ class HighLevel(SpatialTask):
                 )
         if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
             raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
-        if len(character.row.end_effectors) != 2:
-            raise ValueError(f'character {character.row.name!r} has no two feet to place')
+        if len(character.spec.end_effectors) != 2:
+            raise ValueError(f'character {character.spec.name!r} has no two feet to place')
         self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
         self.TERMS = SOCCER_TERMS if ball else HIKE_TERMS
-        self._goal_signs = {'target': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        self._goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
         super().__init__(
-            character, arena, steps, substeps=substeps, blend=blend,
+            character, arena, steps, substeps=substeps, terrain_level=terrain_level,
             extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
         )  # fmt: skip
         self.controller = llc.load(controller)
@@ -476,15 +480,17 @@ class HighLevel(SpatialTask):
         self._start_phases = tuple(start_phases)
         self._frame = substeps
         low = max(part.stop for part in self._full.values())
-        centre, half_range, names = step_length * PLAN_CENTRE, PLAN_HALF_RANGE, PLAN_NAMES
+        action_offset, action_scale, names = step_length * PLAN_OFFSET, PLAN_SCALE, PLAN_NAMES
         if interface == 'frame':
             joints = self.joint_map
             names = (*names, *joints.names)
-            centre = np.concatenate([centre, np.zeros(len(joints))])
-            half_range = np.concatenate([half_range, np.ones(len(joints))])
+            action_offset = np.concatenate([action_offset, np.zeros(len(joints))])
+            action_scale = np.concatenate([action_scale, np.ones(len(joints))])
         else:
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / substeps)
-        self.action_map = ActionMap(names, 'footstep plan', 'm (turn: rad)', centre, half_range)
+        self.action_map = ActionMap(
+            names, 'footstep plan', 'm (turn: rad)', action_offset, action_scale
+        )
         pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
         self.blocks = consecutive({
             'terrain': SAMPLES**2 if 'height' in sight else 0,
@@ -493,7 +499,7 @@ class HighLevel(SpatialTask):
             **{name: len(signs) for name, signs in self._goal_signs.items()},
             'low_level': low if interface == 'frame' else 0,
         })  # fmt: skip
-        mirrors = interface == 'plan' and self.character.row.mirror
+        mirrors = interface == 'plan' and self.character.spec.mirror
         self.mirror = self._plan_mirror() if mirrors else None
 
     def _typical_poses(self) -> np.ndarray:
@@ -511,8 +517,8 @@ class HighLevel(SpatialTask):
         for name, signs in self._goal_signs.items():
             parts[name] = np.arange(len(signs)), np.array(signs)
         index, sign = reflection3d.joined(self.blocks, parts)
-        links = list(self.character.row.links)
-        feet = [links.index(name) for name in self.character.row.end_effectors]
+        links = list(self.character.spec.links)
+        feet = [links.index(name) for name in self.character.spec.end_effectors]
         right, left = self.blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
         return Mirror(
             index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
@@ -542,12 +548,12 @@ class HighLevel(SpatialTask):
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         low = self._full
-        names = 'terrain', 'surface', 'pose', 'velocity', 'target', 'low_level'
+        names = 'terrain', 'surface', 'pose', 'velocity', 'goal', 'low_level'
         rules = PlanningRules(
             common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
             contact=low['contact'].start, plan_block=low['plan'].start,
-            by_plan=self.interface == 'plan', plan_offset=self.action_map.centre,
-            plan_scale=self.action_map.half_range, target_speed=self._target_speed,
+            by_plan=self.interface == 'plan', plan_offset=self.action_map.action_offset,
+            plan_scale=self.action_map.action_scale, target_speed=self._target_speed,
             goal_reached=self._goal_reached, with_ball=self.ball is not None, ball=balls,
             **{name: starts.get(name, -1) for name in names},
         )  # fmt: skip
@@ -583,7 +589,9 @@ class HighLevel(SpatialTask):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         spawns = np.zeros((len(env_ids), 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            ground = SpatialGround(
+                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+            )
             random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
             self.clock.start[i] = random.choice(self._start_phases)
             spawns[k] = ground.spawn(random)

@@ -60,7 +60,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
 
     def policy(observation: np.ndarray) -> np.ndarray:
         parts = {name: observation[:, part] for name, part in blocks.items()}
-        bearing, distance = towards_ball(parts) if task.ball else parts['target'].T
+        bearing, distance = towards_ball(parts) if task.ball else parts['goal'].T
         way, room = free_way(parts, bearing, distance)
         length = task.step_length * lengths(way, distance, room)
         plan = steps(way, length, task.stance, task.step_length)
@@ -72,7 +72,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
 def towards_ball(parts: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Bearing and distance of the place from which a ball is best walked into."""
     ball = parts['ball'][:, 1, None] * direction(parts['ball'][:, 0])
-    shot = direction(parts['target'][:, 0])
+    shot = direction(parts['goal'][:, 0])
     off = np.abs(np.arctan2(*_cross_dot(ball, shot)))
     aim = np.where((off < ALIGNED)[:, None], ball + 0.3 * shot, ball - BEHIND_BALL * shot)
     return np.arctan2(aim[:, 1], aim[:, 0]), np.sqrt((aim**2).sum(1))

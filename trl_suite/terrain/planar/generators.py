@@ -112,7 +112,7 @@ class Generator(NamedTuple):
     """A terrain type: its function, and its parameters with their defaults.
 
     Ground that is the same in every episode has a `line` besides, heights (k,) at x (k,), m; a
-    `Strip` then takes its vertices from there.
+    `PlanarGround` then takes its vertices from there.
     """
 
     function: Function

@@ -29,7 +29,7 @@ _UNUSED = np.random.default_rng(0)  # for level ground, which draws nothing
 _FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # draws between two parts; 2**128 by the golden ratio
 
 
-class Strip:
+class PlanarGround:
     """Planar ground without end, drawn in stretches of 20 m as it is asked for.
 
     Vertex i stands at x = i * SPACING, for any integer i; the ground is linear in between. Ground
@@ -56,7 +56,7 @@ class Strip:
         terrain: Terrain,
         seed: int | np.random.SeedSequence | np.random.Generator,
         *,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
         spawn: str = 'intended',
         centre: float = 0.0,
     ):
@@ -66,7 +66,7 @@ class Strip:
           terrain: what ground.
           seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
             Generator (from which four numbers are drawn).
-          blend: which of the parameter sets, see `Terrain.parameters`.
+          terrain_level: which of the parameter sets, see `Terrain.parameters`.
           spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start of the
             original as run.
           centre: where the first two stretches meet if spawn is 'upstream', m; else not used. In
@@ -75,7 +75,7 @@ class Strip:
 
         Raises:
           ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or further
-            than LONGEST, or a blend that is no number.
+            than LONGEST, or a terrain_level that is no number.
           TypeError: the seed is something else.
         """
         if terrain.spatial:
@@ -88,7 +88,7 @@ class Strip:
         if not abs(centre) <= LONGEST:
             raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
         self.type = terrain.type
-        self.parameters = terrain.parameters(blend)
+        self.parameters = terrain.parameters(terrain_level)
         # Heights of the vertices from number _low on; one fewer flags for the cells between them.
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
@@ -173,7 +173,7 @@ class Strip:
         }
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Strip:
+    def from_state(cls, state: Mapping[str, Any]) -> PlanarGround:
         """Returns a strip as it was when `state` was taken."""
         strip = cls.__new__(cls)
         strip.set_state(state)

@@ -12,7 +12,7 @@ from trl_suite.util.compiled import compiled_inline
 _CELLS_PER_METRE = 1 / SPACING
 
 
-class PlanarGround(NamedTuple):
+class PlanarWindows(NamedTuple):
     """Windows of W vertices, SPACING apart, of n grounds. The arrays are never replaced.
 
     Attributes:
@@ -36,10 +36,10 @@ class PlanarGround(NamedTuple):
     is_wide: np.ndarray
 
 
-def empty(n: int, vertices: int, reach: float) -> PlanarGround:
+def empty(n: int, vertices: int, reach: float) -> PlanarWindows:
     """Returns room for n windows."""
     heights, rises = np.zeros((2, n, vertices))
-    return PlanarGround(
+    return PlanarWindows(
         start=np.full(n, np.nan),
         centre=np.zeros(n),
         reach=reach,
@@ -52,7 +52,7 @@ def empty(n: int, vertices: int, reach: float) -> PlanarGround:
 
 
 @compiled_inline
-def height(i: int, x: float, ground: PlanarGround) -> float:
+def height(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the height in m of the ground of simulation i at x, m.
 
     Beyond the window it has no meaning, but is finite where x is: see `far_height`.
@@ -64,24 +64,24 @@ def height(i: int, x: float, ground: PlanarGround) -> float:
 
 
 @compiled_inline
-def slope(i: int, x: float, ground: PlanarGround) -> float:
+def slope(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the slope dh/dx of the ground of simulation i at x, m."""
     whole = np.floor(x * _CELLS_PER_METRE - ground.start[i])
     return ground.rises[i, _within(whole, ground.heights.shape[1])] / SPACING
 
 
 @compiled_inline
-def is_outside(i: int, x: float, ground: PlanarGround) -> bool:
+def is_outside(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether x, m, lies beyond the window of simulation i."""
     u = x * _CELLS_PER_METRE - ground.start[i]
     return u < 0.0 or u >= ground.heights.shape[1] - 1
 
 
 @compiled_inline
-def far_height(i: int, x: float, ground: PlanarGround) -> float:
+def far_height(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the height in m at x, m, up to the length of a window beyond the window.
 
-    Only where `is_wide`; further away the ends go on. The last bit is that of `Strip.height`, not of
+    Only where `is_wide`; further away the ends go on. The last bit is that of `PlanarGround.height`, not of
     `height`: of a character that looks beyond its window all heights are taken from here.
     """
     position = x / SPACING
@@ -97,7 +97,7 @@ def far_height(i: int, x: float, ground: PlanarGround) -> float:
 
 
 @compiled_inline
-def has_left(i: int, x: float, ground: PlanarGround) -> bool:
+def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether a character at x, m, is so far that its window must be laid anew."""
     return abs(x - ground.centre[i]) > ground.reach
 

@@ -27,7 +27,7 @@ RULES = ('hike', 'step')
 Random = np.random.Generator | np.random.RandomState
 
 
-class Ground:
+class SpatialGround:
     """Ground of one episode, without end.
 
     What stands where depends on the seed alone. Queries here are exact anywhere, but one ground at
@@ -44,7 +44,7 @@ class Ground:
         terrain: Terrain,
         seed: int | np.random.SeedSequence | np.random.Generator,
         *,
-        blend: float = 0.0,
+        terrain_level: float = 0.0,
     ) -> None:
         """Draws the ground.
 
@@ -52,10 +52,10 @@ class Ground:
           terrain: what ground; three-dimensional.
           seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
             Generator (from which four numbers are drawn).
-          blend: which of the parameter sets, see `Terrain.parameters`.
+          terrain_level: which of the parameter sets, see `Terrain.parameters`.
 
         Raises:
-          ValueError: planar terrain, or a blend that is no number.
+          ValueError: planar terrain, or a terrain_level that is no number.
           TypeError: the seed is something else.
         """
         if not terrain.spatial:
@@ -63,7 +63,7 @@ class Ground:
                 f'terrain {terrain.name!r} ({terrain.type}) is planar, a Strip; a Ground is '
                 'three-dimensional'
             )
-        self._draw(terrain.type, terrain.parameters(blend), seed_sequence(seed))
+        self._draw(terrain.type, terrain.parameters(terrain_level), seed_sequence(seed))
 
     def _draw(
         self, type_: str, parameters: Mapping[str, float], sequence: np.random.SeedSequence
@@ -84,7 +84,7 @@ class Ground:
         }
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Ground:
+    def from_state(cls, state: Mapping[str, Any]) -> SpatialGround:
         """Returns the same ground again."""
         ground = cls.__new__(cls)
         sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
@@ -92,7 +92,7 @@ class Ground:
         return ground
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Ground.from_state, (self.state(),)
+        return SpatialGround.from_state, (self.state(),)
 
     def height(
         self, x: npt.ArrayLike, y: npt.ArrayLike, movers: np.ndarray | None = None
@@ -184,9 +184,9 @@ class Ground:
         """Heights of the grid at points (k,)."""
         i, j = (np.floor(part / GRID).astype(int) for part in (x, y))
         u, v = x / GRID - i, y / GRID - j
-        columns, rows = (np.arange(part.min(), part.max() + 2) for part in (i, j))
-        heights = self.layout.vertices(columns, rows)
-        i, j = i - columns[0], j - rows[0]
+        columns, env_ids = (np.arange(part.min(), part.max() + 2) for part in (i, j))
+        heights = self.layout.vertices(columns, env_ids)
+        i, j = i - columns[0], j - env_ids[0]
         corners = np.empty((len(x), 2, 2))
         for a in (0, 1):
             for b in (0, 1):

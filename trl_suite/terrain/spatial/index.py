@@ -15,7 +15,7 @@ from trl_suite.terrain.spatial.windows import (
     SINE,
     SLOPE,
     TOP,
-    SpatialGround,
+    SpatialWindows,
     X,
     Y,
     bin_of,
@@ -23,7 +23,7 @@ from trl_suite.terrain.spatial.windows import (
 from trl_suite.util.compiled import compiled
 
 
-def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialGround) -> None:
+def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialWindows) -> None:
     """Replaces the boxes and belts of a window.
 
     Args:
@@ -42,7 +42,7 @@ def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialGround) -> No
 
 
 @compiled
-def _put(i: int, first: int, boxes: Boxes, ground: SpatialGround) -> None:
+def _put(i: int, first: int, boxes: Boxes, ground: SpatialWindows) -> None:
     """Makes boxes those of these numbers on."""
     for k in range(len(boxes.top)):
         of = ground.boxes[i, first + k]
@@ -53,7 +53,7 @@ def _put(i: int, first: int, boxes: Boxes, ground: SpatialGround) -> None:
 
 
 @compiled
-def _sort(i: int, ground: SpatialGround) -> None:
+def _sort(i: int, ground: SpatialWindows) -> None:
     """Finds out which boxes of a window touch which bins, in order of their numbers."""
     bins, entries = ground.bins[i], ground.bin_boxes[i]
     boxes, columns, lines = ground.boxes.shape[1], bins.shape[0], bins.shape[1]
@@ -88,7 +88,7 @@ def _sort(i: int, ground: SpatialGround) -> None:
 
 
 @compiled
-def _touched(i: int, number: int, ground: SpatialGround) -> tuple[int, int, int, int]:
+def _touched(i: int, number: int, ground: SpatialWindows) -> tuple[int, int, int, int]:
     """Which bins a box touches: begin and end along x, begin and end along y."""
     of = ground.boxes[i, number]
     length, width = of[HALF_X], of[HALF_Y]

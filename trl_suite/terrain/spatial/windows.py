@@ -1,6 +1,6 @@
 """Windows of the three-dimensional grounds of n simulations, as arrays, and functions of one of them.
 
-The functions answer for a point as `Ground` would, as long as it lies within the window of its
+The functions answer for a point as `SpatialGround` would, as long as it lies within the window of its
 simulation, 32 m x 32 m; beyond the window they answer for its rim. `Surroundings` fills the arrays.
 """
 
@@ -36,7 +36,7 @@ _FAR_AWAY = TURN_DISTANCE**2
 _CELLS_PER_METRE = 1 / GRID
 _LAST = VERTICES - 1.0 - 1e-6
 
-# Columns of `SpatialGround.boxes`: all numbers of a box share a line of the processor's cache.
+# Columns of `SpatialWindows.boxes`: all numbers of a box share a line of the processor's cache.
 X, Y, HALF_X, HALF_Y, COSINE, SINE, TOP, SLOPE = range(8)
 
 
@@ -51,7 +51,7 @@ class Capacity(NamedTuple):
     strips: bool  # whether all boxes reach from the right rim to the left one
 
 
-class SpatialGround(NamedTuple):
+class SpatialWindows(NamedTuple):
     """Windows of n grounds, with room for B boxes (belts come last) and M moving boxes each.
 
     An array of what a terrain does not have has length 0 along its second axis. The arrays are
@@ -97,11 +97,11 @@ class SpatialGround(NamedTuple):
     mover_dof: np.ndarray
 
 
-def empty(n: int, capacity: Capacity) -> SpatialGround:
+def empty(n: int, capacity: Capacity) -> SpatialWindows:
     """Returns room for n windows of a terrain, with nothing in them."""
     boxes, movers = capacity.boxes + capacity.belts, capacity.movers
     bins = (STRIPS if capacity.strips else SQUARES) if boxes else (0, 0)
-    ground = SpatialGround(
+    ground = SpatialWindows(
         level=np.full(n, -np.inf),
         centre=np.zeros((n, 2)),
         grid=np.zeros((n, VERTICES**2 if capacity.grid else 0), np.float32),
@@ -129,20 +129,20 @@ def empty(n: int, capacity: Capacity) -> SpatialGround:
 
 
 @compiled
-def height(i: int, x: float, y: float, ground: SpatialGround) -> float:
+def height(i: int, x: float, y: float, ground: SpatialWindows) -> float:
     """Returns the height in m of the surface of simulation i at a point, m."""
     return _highest(i, x, y, ground)[0]
 
 
 @compiled
-def velocity(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, float]:
+def velocity(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, float]:
     """Returns the horizontal velocity in m/s of the surface of simulation i at a point, m."""
     return _velocity_of(i, _highest(i, x, y, ground)[1], ground)
 
 
 @compiled
 def height_map(
-    i: int, x: float, y: float, heading: float, ground: SpatialGround, out: np.ndarray
+    i: int, x: float, y: float, heading: float, ground: SpatialWindows, out: np.ndarray
 ) -> None:
     """Writes heights around a character, relative to the surface under it.
 
@@ -171,7 +171,7 @@ def height_map(
 
 @compiled
 def velocity_map(
-    i: int, x: float, y: float, heading: float, ground: SpatialGround, out: np.ndarray
+    i: int, x: float, y: float, heading: float, ground: SpatialWindows, out: np.ndarray
 ) -> None:
     """Writes velocities of the surface around a character, relative to the surface under it.
 
@@ -204,7 +204,7 @@ def velocity_map(
 
 
 @compiled
-def has_left(i: int, x: float, y: float, ground: SpatialGround) -> bool:
+def has_left(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
     """Returns whether a character is so far from the middle that its window must be laid anew."""
     if ground.grid.shape[1] + ground.boxes.shape[1] == 0:
         return False
@@ -212,7 +212,7 @@ def has_left(i: int, x: float, y: float, ground: SpatialGround) -> bool:
 
 
 @compiled
-def turn_movers(i: int, x: float, y: float, ground: SpatialGround) -> None:
+def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
     """Turns moving boxes round that are at an end of their path and far from the character at (x, y).
 
     Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
@@ -229,7 +229,7 @@ def turn_movers(i: int, x: float, y: float, ground: SpatialGround) -> None:
 
 
 @compiled
-def see_movers(i: int, qpos: np.ndarray, ground: SpatialGround) -> None:
+def see_movers(i: int, qpos: np.ndarray, ground: SpatialWindows) -> None:
     """Notes where the physics has taken moving boxes; qpos is of all simulations."""
     for k in range(ground.mover_top.shape[1]):
         moved = qpos[i, ground.mover_qpos[k]]
@@ -238,7 +238,7 @@ def see_movers(i: int, qpos: np.ndarray, ground: SpatialGround) -> None:
 
 @compiled
 def keep_moving(
-    i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialGround
+    i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialWindows
 ) -> bool:
     """Turns moving boxes round, and gives all of a simulation their speed again where one lacks it.
 
@@ -268,7 +268,7 @@ def keep_moving(
 
 
 @compiled_inline
-def _fixed(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, int]:
+def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
     """Height of the highest thing at a point that stays where it is, and the number of its box.
 
     It is -1 if that is no box.
@@ -299,7 +299,7 @@ def _fixed(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, in
 
 
 @compiled_inline
-def _highest(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, int]:
+def _highest(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
     """As `_fixed`, but with moving boxes, which are numbered on from B."""
     top, box = _fixed(i, x, y, ground)
     for k in range(ground.mover_top.shape[1]):
@@ -314,7 +314,7 @@ def _highest(i: int, x: float, y: float, ground: SpatialGround) -> tuple[float, 
 
 
 @compiled_inline
-def _velocity_of(i: int, box: int, ground: SpatialGround) -> tuple[float, float]:
+def _velocity_of(i: int, box: int, ground: SpatialWindows) -> tuple[float, float]:
     """Horizontal velocity of the surface of a box, m/s, by the number that `_highest` gives it."""
     if box >= ground.boxes.shape[1]:
         k = box - ground.boxes.shape[1]
@@ -326,7 +326,7 @@ def _velocity_of(i: int, box: int, ground: SpatialGround) -> tuple[float, float]
 
 
 @compiled_inline
-def _mover_middle(i: int, k: int, ground: SpatialGround) -> tuple[float, float]:
+def _mover_middle(i: int, k: int, ground: SpatialWindows) -> tuple[float, float]:
     """Middle of a moving box, m."""
     distance = ground.mover_distance[i, k]
     return (
@@ -336,7 +336,7 @@ def _mover_middle(i: int, k: int, ground: SpatialGround) -> tuple[float, float]:
 
 
 @compiled_inline
-def _on_grid(i: int, x: float, y: float, ground: SpatialGround) -> float:
+def _on_grid(i: int, x: float, y: float, ground: SpatialWindows) -> float:
     """Height of the grid at a point, m; see `ground.triangles`."""
     u = (x - (ground.centre[i, 0] - HALF)) * _CELLS_PER_METRE
     v = (y - (ground.centre[i, 1] - HALF)) * _CELLS_PER_METRE
@@ -385,7 +385,7 @@ def _sample(u: int, v: int, x: float, y: float, cosine: float, sine: float) -> t
 
 @compiled
 def _seen_part(
-    i: int, k: int, x: float, y: float, cosine: float, sine: float, ground: SpatialGround
+    i: int, k: int, x: float, y: float, cosine: float, sine: float, ground: SpatialWindows
 ) -> tuple[int, int, int, int]:
     """Which samples of a map may lie on a moving box: begin and end of u, begin and end of v."""
     half_x, half_y = ground.mover_half_size[i, k, 0], ground.mover_half_size[i, k, 1]

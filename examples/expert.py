@@ -1,9 +1,9 @@
-"""A guide for those who learn to plan footsteps: it has a map, and knows how boxes will move.
+"""An expert for those who learn to plan footsteps: it has a map, and knows how boxes will move.
 
-What a policy has to make out in coarse maps from its own eyes the guide looks up: heights every
+What a policy has to make out in coarse maps from its own eyes the expert looks up: heights every
 0.125 m on all sides, and velocities. It finds the way to the goal that is short and keeps its
 distance from everything that is no level ground, and steps along it. In training a policy is shown
-what the guide would do (learning by cheating, Chen et al. 2019, arXiv:1912.12294); it is no
+what the expert would do (learning by cheating, Chen et al. 2019, arXiv:1912.12294); it is no
 baseline.
 """
 
@@ -28,7 +28,7 @@ DISTANCE = 0.7  # m; a way that is nearer to something counts as longer than it 
 PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through something by so many
 DETOUR = 1.02  # a place is gone straight to if that costs no more times what the way there does
 AHEAD = 4.0  # step lengths; the same on a trail
-PACE = 1.0  # m/s; how fast the guide comes along where boxes move
+PACE = 1.0  # m/s; how fast the expert comes along where boxes move
 BEND, CLOSE = 0.35, 0.3  # rad, m; a sharper bend and what is closer are taken with small steps
 LOOKS = 33  # places on a straight line
 BEYOND = 1.5  # times the distance: what lies outside of the map is guessed to take
@@ -107,8 +107,8 @@ def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) ->
     return np.array([np.interp(on, begin, corner) for corner in corners.T]) - place
 
 
-def guide(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
-    """Makes a guide: like the values of `evaluation.BASELINES`.
+def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
+    """Makes an expert: like the values of `evaluation.BASELINES`.
 
     Raises:
       ValueError: a task whose steps are no plans, or whose way is that of a ball.
@@ -116,47 +116,47 @@ def guide(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]
     task = environments.task
     if not isinstance(task, HighLevel) or task.ball or task.interface != 'plan':
         raise ValueError(
-            f'the guide knows no way for the task {type(task).__name__}; it does for high-level '
+            f'the expert knows no way for the task {type(task).__name__}; it does for high-level '
             "tasks with the interface 'plan' and without a ball"
         )
     map_, arena = Map(), task.arena
     moves = arena.surroundings.capacity.movers > 0
 
-    def level(row: int, place: np.ndarray) -> np.ndarray:
+    def level(env_id: int, place: np.ndarray) -> np.ndarray:
         """How far every place is from what is not level, m."""
         x, y = np.moveaxis(place + map_.fine, -1, 0).reshape(2, 1, -1)
-        height = arena.height(x, y, np.array([row])).reshape(map_.fine.shape[:2])
-        free = np.abs(height - task.goal[row, 2]) < LEVEL
+        height = arena.height(x, y, np.array([env_id])).reshape(map_.fine.shape[:2])
+        free = np.abs(height - task.goal[env_id, 2]) < LEVEL
         if free.all():
             return np.full(len(map_.places), REACH)
         return FINE * ndimage.distance_transform_edt(free)[::COARSE, ::COARSE].ravel()
 
-    def apart(row: int, place: np.ndarray) -> np.ndarray:
-        """How far every place is from moving boxes when the guide may be there, m."""
+    def apart(env_id: int, place: np.ndarray) -> np.ndarray:
+        """How far every place is from moving boxes when the expert may be there, m."""
         s = arena.surroundings
-        velocity = (s.direction[row] * s.speed[row])[:, None] * s.axis[row]
-        centre = s.centres()[row] - place
+        velocity = (s.direction[env_id] * s.speed[env_id])[:, None] * s.axis[env_id]
+        centre = s.centres()[env_id] - place
         near = np.abs(centre).max(1) < 2 * REACH
         seconds = np.linalg.norm(map_.places, axis=1) / PACE
         then = centre[near] + seconds[:, None, None] * velocity[near]
-        gap = np.abs(map_.places[:, None] - then) - s.half_size[row][near]
+        gap = np.abs(map_.places[:, None] - then) - s.half_size[env_id][near]
         return np.linalg.norm(np.maximum(gap, 0), axis=2).min(1, initial=REACH)
 
     def policy(observation: np.ndarray) -> np.ndarray:
         found = task.figure.measure()
         root, goal = found.root[:, :2], task.goal[:, :2]
         off, length = np.empty_like(root), np.ones(len(root))
-        for row, place in enumerate(root):
-            trail = arena.grounds[row].layout.trail
+        for env_id, place in enumerate(root):
+            trail = arena.grounds[env_id].layout.trail
             if trail is not None:
-                off[row] = on_trail(trail, place, goal[row], AHEAD * task.step_length)
+                off[env_id] = on_trail(trail, place, goal[env_id], AHEAD * task.step_length)
                 continue
-            free = apart(row, place) if moves else level(row, place)
+            free = apart(env_id, place) if moves else level(env_id, place)
             cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= 0)
-            off[row] = map_.aim(cost, goal[row] - place)
-            bend = rewards.wrap(np.arctan2(off[row, 1], off[row, 0]) - found.heading[row])
+            off[env_id] = map_.aim(cost, goal[env_id] - place)
+            bend = rewards.wrap(np.arctan2(off[env_id, 1], off[env_id, 0]) - found.heading[env_id])
             careful = abs(bend) > BEND or free[map_.middle] < CLOSE
-            length[row] = CAUTIOUS if careful else 1.0
+            length[env_id] = CAUTIOUS if careful else 1.0
         way = rewards.wrap(np.arctan2(off[:, 1], off[:, 0]) - found.heading)
         plan = scripted.steps(way, task.step_length * length, task.stance, task.step_length)
         return np.clip(task.action_map.action(plan), -1, 1)
