@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from trl_suite.cli import bench
-from trl_suite.controllers import footstep_controller as llc
+from trl_suite.controllers import footstep_controller
 from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
@@ -38,8 +38,8 @@ def measured(environments, act, frames, seconds):
 
 def footsteps(num_envs, seconds):
     """The footstep environment, driven by the shipped controller."""
-    controller = llc.load()
-    environments = VectorEnvironment(llc.DEFAULT, num_envs, 1, 0)
+    controller = footstep_controller.load()
+    environments = VectorEnvironment(footstep_controller.DEFAULT, num_envs, 1, 0)
     return measured(
         environments, lambda o: np.clip(controller(o), -1, 1), lambda e: num_envs, seconds
     )

@@ -168,7 +168,7 @@ def plot(figures, path):
                 color=f'C{k}',
                 label=f'{id_}, {threads} thread{"s" * (threads > 1)}',
             )
-    axes.set(xscale='log', xlabel='rows', ylabel='rate / raw mj_step on one thread')
+    axes.set(xscale='log', xlabel='simulations', ylabel='rate / raw mj_step on one thread')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc='center left', bbox_to_anchor=(1.01, 0.5))
     figure.tight_layout()

@@ -24,6 +24,7 @@ from trl_suite.actuation.muscles import MUSCLES
 from trl_suite.describe import common
 from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
+from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files
 from trl_suite.viewing import gallery
@@ -58,13 +59,6 @@ WITHOUT = {  # a shipped policy
     'clip': 'the clip itself, whose poses are the targets, without feedback (`--policy clip`)',
     'zero': 'action 0 throughout, which for a gait is the default one (`--policy zero`)',
 }
-_LANDING = ('footsteps', 'footsteps2d', 'hike', 'soccer')
-DRAWN = {  # beside the physics, and by which rules
-    ' Orange and blue: where the foot that swings and the other one are to land.': _LANDING,
-    ' Beads: the way of the centre of mass; red: the goal.': (
-        'hike', 'soccer', 'journey', 'ball_journey',
-    ),
-}  # fmt: skip
 README = '../README.md'
 # What encloses the tables in the README that are written here.
 SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
@@ -93,14 +87,14 @@ def pages() -> dict[str, str]:
     for spec in catalogue.SPECS:
         # What differs by its ground only is compiled once.
         key = (
-            spec.rules,
+            spec.task_type,
             spec.character,
             spec.actuation,
             spec.clip,
             repr(sorted(spec.options.items())),
         )
         if key not in environments:
-            environments[key] = suite.build_row(spec, {}, {})
+            environments[key] = suite.build_environment(spec, {}, {})
         found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
     found['environments/README.md'] = environment_index()
     for name in characters.CHARACTERS:
@@ -209,7 +203,7 @@ def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
 
 def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
     _, begin, end, _ = gallery.scene(spec.id)
-    drawn = ''.join(text for text, rules in DRAWN.items() if spec.rules in rules)
+    drawn = task_type(spec).description.legend
     name, _ = acting.best(environment, spec.id)
     who = WITHOUT.get(name)
     said = f'No policy is shipped for it yet; this is {who}' if who else 'The shipped policy'
@@ -224,10 +218,10 @@ def begun(settings: Mapping[str, Any]) -> str:
     start = settings['start']
     if start in catalogue.BY_ID:
         return f'[{start}]({start}.md)'
-    shown = f'shown for {settings["cloned"] / 1e6:.2g} million plans'
+    copied = f'imitated for {settings["cloned"] / 1e6:.2g} million plans'
     if start == 'expert':
-        return f'what an expert with a map would do (`examples/expert.py`), {shown}'
-    return f'what `--policy {start}` does, {shown}'
+        return f'what an expert with a map would do (`examples/expert.py`), {copied}'
+    return f'what `--policy {start}` does, {copied}'
 
 
 def learnt(spec: catalogue.EnvSpec) -> str:
@@ -236,13 +230,14 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
-    unit = 'plans' if 'hierarchical' in spec.tags else 'steps'
+    unit, searched = task_type(spec).samples, task_type(spec).score == 'distance'
     trained = f'{samples / 1e6:.2g} million {unit}'
-    if spec.rules == 'gait':
+    after = f'{taken / 1e6:.2g} million'
+    if searched:
         trained = f'{samples:g} decisions, each of which tries all base actions'
-    after = f'{taken:g} decisions' if spec.rules == 'gait' else f'{taken / 1e6:.2g} million'
+        after = f'{taken:g} decisions'
     if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
-        after += ', when it had only been shown'
+        after += ', at the end of imitation'
     seeds = len(found['runs'])
     facts = (
         ('return', f'{result["normalized_return"]:.1%} of the maximum {result["step_limit"]}'),
@@ -315,7 +310,7 @@ def character_page(name: str) -> str:
             (
                 ('end effectors', ', '.join(spec.end_effectors)),
                 ('a fall is the ground under', ', '.join(spec.fall_links)),
-                ('clip of its own', suite.DEFAULT_CLIPS.get(name, 'none')),
+                ('clip of its own', spec.clip or 'none'),
             ),
         ),
         f'## Environments\n\n{links("environments", used) or "None; it is for `suite.build`."}',
@@ -456,7 +451,7 @@ def solved() -> str:
             for name in ('normalized_return', 'completion_rate', 'distance')
         }
         # A gait has no reward that ends with a limit: what counts is how far it comes.
-        gaits = all(spec.rules == 'gait' for spec in specs)
+        gaits = all(task_type(spec).score == 'distance' for spec in specs)
         cells.append((
             f'`{domain}`', f'{len(found)} of {len(specs)}',
             *(('–', '–') if gaits else (f'{middle["normalized_return"]:.2f}', f'{middle["completion_rate"]:.0%}')),
@@ -476,7 +471,7 @@ def speed() -> str:
     found, cells = speeds(), []
     for id, alone in found['single'].items():
         own, raw = found['ours'][id], found['engine alone'][id]
-        one, two = (f'256 rows, {threads} threads' for threads in (1, 2))
+        one, two = (f'256 simulations, {threads} threads' for threads in (1, 2))
         cells.append((
             f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / alone["raw mj_step"]:.2f})',
             *(f'{own[n]["control steps per second"]} ({own[n]["control steps per second"] / raw[n]:.2f})'
@@ -500,7 +495,7 @@ def speed_page() -> str:
         (
             f'`{id}`', setting, own['control steps per second'],
             f'{own["control steps per second"] / found["engine alone"][id][setting]:.2f}',
-            f'{own["serial, us per simulation"]:.2f}', f'{own["reset, ms per row"]:.2f}',
+            f'{own["serial, us per simulation"]:.2f}', f'{own["reset, ms per simulation"]:.2f}',
             f'{own["share of resets"]:.2f}',
         )
         for id, settings in found['ours'].items()
@@ -520,17 +515,17 @@ def speed_page() -> str:
     return page(
         'Speed',
         f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random; a '
-        'control step is 10 physics steps; rows are simulations that step together. `trl-suite bench '
+        'control step is 10 physics steps; simulations step together. `trl-suite bench '
         'ID` measures your machine.',
         '## One environment',
         table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per simulation of many'), single),
         '## Many at once',
-        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, rows '
+        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, simulations '
         'and threads; it may be above 1, as without resets bodies lie on the ground, where steps cost '
         'more. *Serial* is what one thread does of a control step while the others wait, in us per simulation; '
         '*resets* is their share of the time.',
         table(('environment', '', 'control steps per s', 'ratio', 'serial', 'a reset, ms', 'resets'), cells),
-        '![Rates by rows and threads](../benchmarks/vector_environment.png)',
+        '![Rates by simulations and threads](../benchmarks/vector_environment.png)',
         '## More cores',
         "A projection, not a measurement: how many times one core's rate 1024 simulations would reach, by "
         "Amdahl's law from what one thread does alone (*serial* above). Memory and caches that cores share "

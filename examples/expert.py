@@ -17,7 +17,7 @@ from scipy.sparse import csgraph
 
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.navigation import scripted
-from trl_suite.tasks.navigation.hierarchical import HighLevel
+from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.scripted import CAUTIOUS
 from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
@@ -114,7 +114,7 @@ def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray
       ValueError: a task whose steps are no plans, or whose way is that of a ball.
     """
     task = environments.task
-    if not isinstance(task, HighLevel) or task.ball or task.interface != 'plan':
+    if not isinstance(task, HierarchicalNavigation) or task.ball or task.interface != 'plan':
         raise ValueError(
             f'the expert knows no way for the task {type(task).__name__}; it does for high-level '
             "tasks with the interface 'plan' and without a ball"

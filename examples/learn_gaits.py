@@ -34,7 +34,7 @@ import tqdm
 from torch import nn
 
 from trl_suite import characters, evaluation, policies
-from trl_suite.tasks import gait
+from trl_suite.tasks.gait import task as gait
 from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 

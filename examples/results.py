@@ -134,7 +134,7 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     stored = json.loads(path.read_text()) if path.exists() else {}
     rows = []
     for id_, entry in entries.items():
-        if catalogue.BY_ID[id_].rules != 'gait' or id_ not in stored:
+        if catalogue.BY_ID[id_].actuation != 'gait' or id_ not in stored:
             continue
         run = train_all.shipped(entry)
         own, default = (
@@ -234,7 +234,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             (
                 environment_row(id_, entry)
                 for id_, entry in entries.items()
-                if catalogue.BY_ID[id_].rules != 'gait'
+                if catalogue.BY_ID[id_].actuation != 'gait'
             ),
         ),
         '![Learning curves](learning_curves.png)',
@@ -314,7 +314,7 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
     panels: dict[tuple[str, str], list[str]] = {}
     for id_ in entries:
         spec = catalogue.BY_ID[id_]
-        if spec.rules != 'gait':  # whose return says little
+        if spec.actuation != 'gait':  # whose return says little
             name = next((name for tag, name in PANELS.items() if tag in spec.tags), spec.character)
             panels.setdefault((spec.domain, name), []).append(id_)
     columns = 3

@@ -67,7 +67,7 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
         id_
         for id_, spec in catalogue.BY_ID.items()
         if id_ == pattern
-        or (fnmatch.fnmatchcase(id_, pattern) and (spec.rules != 'gait' or id_ in GAITS))
+        or (fnmatch.fnmatchcase(id_, pattern) and (spec.actuation != 'gait' or id_ in GAITS))
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
@@ -83,7 +83,7 @@ def shipped(entry: dict[str, Any]) -> dict[str, Any]:
 
 def program(id_: str) -> ModuleType:
     """The program that trains an environment."""
-    if catalogue.BY_ID[id_].rules != 'gait':
+    if catalogue.BY_ID[id_].actuation != 'gait':
         return ppo
     return learn_gaits if id_ in LEARNT else search_gaits
 
@@ -152,7 +152,7 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
-    if catalogue.BY_ID[id_].rules == 'gait':
+    if catalogue.BY_ID[id_].actuation == 'gait':
         limit = {'step_limit': FALL_STEPS}
         run['to_first_fall'] = evaluation.evaluate(id_, policy, FALL_EPISODES, SEED, 1, limit)
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]

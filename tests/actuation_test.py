@@ -324,7 +324,7 @@ class ServoTest(parameterized.TestCase):
 
 def on_the_ground(name, model):
     """A character that can move: (model, data, character, action map)."""
-    if name in suite.DEFAULT_CLIPS:
+    if characters.CHARACTERS[name].clip:
         environment = suite.build(name, model, 'slopes_mixed', task_kwargs={'random': 3})
         environment.reset()
         physics, task = environment.physics, environment.task

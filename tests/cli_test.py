@@ -20,7 +20,7 @@ from trl_suite import cli, evaluation, policies, rendering, suite
 from trl_suite.cli import list as listing
 from trl_suite.cli import rollout
 from trl_suite.registry import catalogue
-from trl_suite.tasks.gait import GaitTask
+from trl_suite.tasks.gait.task import GaitTask
 from trl_suite.tasks.navigation import scripted
 from trl_suite.util import resources
 
@@ -126,14 +126,18 @@ class InfoTest(CommandTest):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
-        rules = suite.find(id_).rules
-        gait, steps, high = rules == 'gait', rules == 'footsteps', rules in ('hike', 'soccer')
+        rules = suite.find(id_).task_type
+        gait, steps, high = (
+            rules == 'gait',
+            rules == 'spatial_footsteps',
+            rules in ('goal_navigation', 'soccer'),
+        )
         for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
                       'Termination', 'Time', 'Differs'):  # fmt: skip
             self.assertIn(f'\n{title}', out)
         for title, shown in (
             ('Clip', not gait and not steps and not high), ('Gait', gait), ('Parameters', gait),
-            ('Steps', steps), ('Plans', steps or rules == 'footsteps2d'),
+            ('Steps', steps), ('Plans', steps or rules == 'planar_footsteps'),
         ):  # fmt: skip
             self.assertEqual(f'\n{title}:' in out, shown, title)
         self.assertEqual('\nFootstep controller\n' in out, high)
@@ -335,7 +339,7 @@ class InfoTest(CommandTest):
             'cut after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
             'heights of its pillars': 'forest',
-            'a goal is reached or its time': 'hike',
+            'a goal is reached or its time': 'goal_navigation',
             'times of ball and goal': 'soccer',
         }
         tracking = {'clip', 'imitation', 'short'}
@@ -371,15 +375,18 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_LLC_Symetric_Step-v0', stepping | {'mirrored'}),
             ('PD_Biped3D_LLC_Run_FootStep-v0', stepping - {'steps'} | {'run'}),
             ('PD_Biped3D_LLC_Trail_Step-v0', stepping | {'goal', 'completion'}),
-            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'hike', 'blocks'}),
-            ('PD_Biped3D_HLC_Forest-v0', planning - {'coarse'} | {'hike', 'forest', 'blocks'}),
+            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'goal_navigation', 'blocks'}),
+            (
+                'PD_Biped3D_HLC_Forest-v0',
+                planning - {'coarse'} | {'goal_navigation', 'forest', 'blocks'},
+            ),
             (
                 'PD_Biped3D_HLC_DynamicsObstacles-v0',
-                planning - {'coarse'} | {'hike', 'moving'},
+                planning - {'coarse'} | {'goal_navigation', 'moving'},
             ),
-            ('PD_Biped3D_HLC_Conveyors-v0', planning - {'coarse'} | {'hike', 'belts'}),
+            ('PD_Biped3D_HLC_Conveyors-v0', planning - {'coarse'} | {'goal_navigation', 'belts'}),
             ('PD_Biped3D_HLC_Soccer-v0', planning | {'soccer'}),
-            ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'hike', 'completion'}),
+            ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'goal_navigation', 'completion'}),
         ):
             with self.subTest(id_):
                 out = self.output('info', id_).split('\nDiffers')[1]
@@ -508,7 +515,7 @@ class RolloutTest(CommandTest):
 
     def test_no_ghost_above_a_controller(self):
         self.assert_refused(
-            'the task HighLevel has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
+            'the task HierarchicalNavigation has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
             '--video', 'a.mp4', *SIZE,
         )  # fmt: skip
         self.assert_only()
@@ -544,7 +551,7 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('the task Imitation has no scripted policy; hikes and soccer have', GAPS, '--policy',
+        ('the task PlanarImitation has no scripted policy; goal navigation and soccer have', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('no such file', GAPS, '--policy', 'none.npz'),

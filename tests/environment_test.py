@@ -11,7 +11,7 @@ from helpers import links_on_ground
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
-from trl_suite.tasks.imitation.planar import Imitation
+from trl_suite.tasks.imitation.planar import PlanarImitation
 
 # Links and joints of each figure; muscles where it has any.
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
@@ -53,12 +53,12 @@ EXAMPLES = (
 
 def is_gait(id_):
     """Whether a step lasts a whole cycle, some 300 control steps."""
-    return suite.find(id_).rules == 'gait'
+    return suite.find(id_).task_type == 'gait'
 
 
 def is_high(id_):
     """Whether a step lasts a whole footstep, up to 15 control steps."""
-    return suite.find(id_).rules in ('hike', 'soccer')
+    return suite.find(id_).task_type in ('goal_navigation', 'soccer')
 
 
 # Steps of 1/30 s.
@@ -97,7 +97,7 @@ def expected_blocks(id_):
             return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
         mirrored = 'Symetric' in id_
         return sizes | {'phase': 3 if mirrored else 5, 'contact': 2, 'plan': 7 if mirrored else 13}
-    if suite.find(id_).rules == 'footsteps2d':
+    if suite.find(id_).task_type == 'planar_footsteps':
         return {'pose': 25, 'velocity': 24, 'phase': 5, 'contact': 2, 'plan': 13}
     if is_gait(id_):
         links = GAIT_LINKS[figure]
@@ -571,7 +571,7 @@ class ObservableTest(parameterized.TestCase):
 class HookTest(parameterized.TestCase):
     """Substeps run in C: hooks between them are refused, not forgotten."""
 
-    def task(self, cls=Imitation):
+    def task(self, cls=PlanarImitation):
         return cls(
             characters.make('biped2d'), PlanarArena(terrain.load('flat')),
             motion.load('biped2d_walk'),
@@ -579,7 +579,7 @@ class HookTest(parameterized.TestCase):
 
     @parameterized.parameters('before_substep', 'after_substep')
     def test_refused(self, hook):
-        hooked = type('Hooked', (Imitation,), {hook: lambda self, *_: None})
+        hooked = type('Hooked', (PlanarImitation,), {hook: lambda self, *_: None})
         with self.assertRaisesRegex(ValueError, f'{hook} hook.*composer.Environment'):
             Environment(self.task(hooked))
         environment = Environment(self.task())

@@ -23,7 +23,7 @@ import train_all
 class JobsTest(parameterized.TestCase):
     def test_every_environment_is_trained_but_for_most_gaits(self):
         ids = {id_ for id_, _ in train_all.jobs('*')}
-        gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.rules == 'gait'}
+        gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.task_type == 'gait'}
         self.assertEqual(ids, set(catalogue.BY_ID) - gaits | set(train_all.GAITS))
 
     def test_actuation_models_are_compared_with_three_seeds(self):

@@ -28,7 +28,7 @@ from trl_suite.vector import VectorEnvironment
 GENERAL, MIRRORED = 'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
 RUN, TRAIL = 'PD_Biped3D_LLC_Run_FootStep-v0', 'PD_Biped3D_LLC_Trail_Step-v0'
 BUMPS, FULL = 'PD_Biped3D_LLC_Bumps_Step-v0', 'PD_Biped3D_FULL_Imitate-Steps-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'footsteps']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'spatial_footsteps']
 SCALES = {'pose': 2, 'velocity': 0.005, 'end_effector': 5, 'com': 10, 'root': 10}
 SIDE = {RIGHT: -1, LEFT: 1}
 
@@ -685,7 +685,7 @@ class MovingGroundTest(parameterized.TestCase):
     def test_among_moving_boxes(self):
         environment = suite.build(
             'biped3d_mocap', terrain='dynamic_obstacles3d', task='footsteps',
-            task_kwargs={'random': 2, 'goal': True, 'terrain_observation': True},
+            task_kwargs={'random': 2, 'goal': True, 'terrain_observation': 'height'},
         )  # fmt: skip
         for _ in range(3):
             step = environment.reset()
@@ -741,8 +741,8 @@ class SaveTest(parameterized.TestCase):
     """State and pickles go on bit for bit; many simulations are single ones."""
 
     OPTIONS = (
-        (GENERAL, {}), (TRAIL, {'terrain_observation': True}), (MIRRORED, {'plans': {'from_root': 0.5}}),
-        (RUN, {}), (FULL, {}), (BUMPS, {'mirrored': True, 'terrain_observation': True, 'pushes': {}}),
+        (GENERAL, {}), (TRAIL, {'terrain_observation': 'height'}), (MIRRORED, {'plans': {'from_root': 0.5}}),
+        (RUN, {}), (FULL, {}), (BUMPS, {'mirrored': True, 'terrain_observation': 'height', 'pushes': {}}),
         (GENERAL, {'goal': True, 'mirrored': True, 'max_landing_error': 0.3}),
     )  # fmt: skip
 
@@ -767,7 +767,7 @@ class SaveTest(parameterized.TestCase):
     def test_on_moving_ground(self, preset):
         environment, other = (
             suite.build('biped3d_mocap', terrain=preset, task='footsteps',
-                        task_kwargs={'random': seed, 'terrain_observation': True})
+                        task_kwargs={'random': seed, 'terrain_observation': 'height'})
             for seed in (6, 7)
         )  # fmt: skip
         environment.reset()

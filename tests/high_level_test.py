@@ -25,7 +25,7 @@ from helpers import (
 )
 
 from trl_suite import evaluation, policies, rendering, suite
-from trl_suite.controllers import footstep_controller as llc
+from trl_suite.controllers import footstep_controller
 from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 
@@ -43,7 +43,7 @@ def started(id_=FOREST, **options):
     """An environment of few surprises, after a reset."""
     options = {'random': 8, 'step_limit': None, 'start_phases': (0.0,), **options}
     spec = id_ if not isinstance(id_, str) else suite.find(id_)
-    environment = suite.build_row(spec, options, {})
+    environment = suite.build_environment(spec, options, {})
     return environment, environment.reset()
 
 
@@ -194,7 +194,7 @@ class PlanTest(parameterized.TestCase):
             found.append((observation.copy(), feet, heading, task.phase[0]))
             return default(observation)
 
-        default = llc.load()
+        default = footstep_controller.load()
         environment, _ = started(SOCCER, controller=controller)
         task = environment.task
         for step in range(2):
@@ -449,7 +449,7 @@ class MapTest(parameterized.TestCase):
         ((), 0, 0),
     )  # fmt: skip
     def test_sight(self, sight, heights, velocities):
-        _, step = started(MOVERS, sight=sight)
+        _, step = started(MOVERS, terrain_observation=sight)
         sizes = {name: value.size for name, value in step.observation.items()}
         self.assertEqual(sizes.pop('terrain', 0), heights)
         self.assertEqual(sizes.pop('surface', 0), velocities)
@@ -676,7 +676,7 @@ class FrameTest(parameterized.TestCase):
         options = {'start_phases': (0.1,), 'random': 3}
         plan, first = started(id_, **options)
         frame, begun = started(id_, interface='frame', **options)
-        controller, rng = llc.load(), np.random.default_rng(0)
+        controller, rng = footstep_controller.load(), np.random.default_rng(0)
         for name, value in first.observation.items():
             np.testing.assert_array_equal(begun.observation[name], value)
         for i in range(4):
@@ -734,20 +734,20 @@ class ControllerTest(FolderTest):
         return environment.physics.data.qpos.copy()
 
     def test_all_ways_to_name_it(self):
-        shipped = policies.reference(llc.DEFAULT)
+        shipped = policies.reference(footstep_controller.DEFAULT)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
         expected = self.positions()
         for source in (
-            llc.DEFAULT, 'deeploco/llc_general_step', path, str(path), shipped, llc.load(),
+            footstep_controller.DEFAULT, 'deeploco/llc_general_step', path, str(path), shipped, footstep_controller.load(),
             lambda observation: shipped(observation),
         ):  # fmt: skip
             with self.subTest(source=str(source)):
                 np.testing.assert_array_equal(self.positions(controller=source), expected)
-        self.assertIsNone(llc.load(idle).policy)
-        self.assertIsNotNone(llc.load(path).policy)
-        controller = llc.load()
-        self.assertIs(llc.load(controller), controller)
+        self.assertIsNone(footstep_controller.load(idle).policy)
+        self.assertIsNotNone(footstep_controller.load(path).policy)
+        controller = footstep_controller.load()
+        self.assertIs(footstep_controller.load(controller), controller)
 
     def test_one_of_ones_own(self):
         def mine(observation):
@@ -805,15 +805,17 @@ class ControllerTest(FolderTest):
     def test_unknown(self):
         with self.assertRaisesRegex(ValueError, f"did you mean '{llc.DEFAULT}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
-        with self.assertRaisesRegex(FileNotFoundError, llc.DEFAULT):
-            llc.load('PD_Biped3D_LLC_Genral_Step-v0')
+        with self.assertRaisesRegex(FileNotFoundError, footstep_controller.DEFAULT):
+            footstep_controller.load('PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
-            llc.load('FSM_Goat2D_Terrain_Cliffs-v0')  # gaits of the goat are not trained
+            footstep_controller.load(
+                'FSM_Goat2D_Terrain_Cliffs-v0'
+            )  # gaits of the goat are not trained
         with self.assertRaises(FileNotFoundError):
-            llc.load(self.folder / 'none.npz')
+            footstep_controller.load(self.folder / 'none.npz')
         (self.folder / 'broken.npz').write_bytes(b'no')
         with self.assertRaisesRegex(ValueError, 'broken.npz'):
-            llc.load(str(self.folder / 'broken.npz'))
+            footstep_controller.load(str(self.folder / 'broken.npz'))
 
     def test_one_that_observes_something_else(self):
         task = suite.build_task(suite.find('PD_Biped3D_LLC_Symetric_Step-v0'))
@@ -829,7 +831,7 @@ class ControllerTest(FolderTest):
             started(PLANE, controller=policy)
 
     def test_another_body_is_a_warning(self):
-        shipped = policies.reference(llc.DEFAULT)
+        shipped = policies.reference(footstep_controller.DEFAULT)
         with warnings.catch_warnings():
             warnings.simplefilter('error')
             started(PLANE)  # no warning
@@ -931,7 +933,9 @@ class ScriptedTest(parameterized.TestCase):
         found = evaluation.evaluate(spec, scripted.scripted, 3, 1, factory=True)
         self.assertIs(evaluation.BASELINES['scripted'], scripted.scripted)
         for seed, total in zip(found['seeds'], found['returns'], strict=True):
-            environment = suite.build_row(spec, {'random': seed}, {'flat_observation': True})
+            environment = suite.build_environment(
+                spec, {'random': seed}, {'flat_observation': True}
+            )
             policy, step, mine = scripted.scripted(environment), environment.reset(), 0.0
             while not step.last():
                 step = environment.step(policy(step.observation['observations'][None])[0])
@@ -939,7 +943,7 @@ class ScriptedTest(parameterized.TestCase):
             self.assertEqual(mine, total)
 
     @parameterized.parameters(
-        ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task Footsteps has no scripted policy'),
+        ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task SpatialFootsteps has no scripted policy'),
         (FOREST, {'interface': 'frame'}, "needs the interface 'plan', not 'frame'"),
     )
     def test_other_tasks_are_refused(self, id_, options, message):
@@ -965,7 +969,7 @@ class SaveTest(parameterized.TestCase):
 
     OPTIONS = (
         *((id_, {}) for id_ in IDS), (SOCCER, {'interface': 'frame'}),
-        (MOVERS, {'interface': 'frame', 'sight': ('height', 'velocity')}),
+        (MOVERS, {'interface': 'frame', 'terrain_observation': ('height', 'velocity')}),
     )  # fmt: skip
 
     def advance(self, environment, seed, steps=5):
@@ -1059,7 +1063,9 @@ class PictureTest(parameterized.TestCase):
 
     def test_no_ghost(self):
         environment, _ = started(FOREST)
-        with self.assertRaisesRegex(ValueError, 'the task HighLevel has no reference clip'):
+        with self.assertRaisesRegex(
+            ValueError, 'the task HierarchicalNavigation has no reference clip'
+        ):
             rendering.frame(environment, 60, 80, ghost=True)
 
 
@@ -1068,8 +1074,8 @@ class OptionTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'interface': 'plans'}, "unknown interface 'plans'; did you mean 'plan'"),
-        ({'sight': 'heigth'}, "unknown sight 'heigth'; did you mean 'height'"),
-        ({'sight': ('height', 'colour')}, "unknown sight 'colour'"),
+        ({'terrain_observation': 'heigth'}, "unknown terrain_observation 'heigth'; did you mean 'height'"),
+        ({'terrain_observation': ('height', 'colour')}, "unknown terrain_observation 'colour'"),
         ({'target_speed': 0}, 'target_speed is 0'), ({'target_speed': np.nan}, 'target_speed is nan'),
         ({'goal_reached': -1}, 'goal_reached is -1'), ({'goal_reached': np.inf}, 'goal_reached is'),
         ({'start_phases': ()}, 'start_phases is'), ({'start_phases': (0.1, 1.0)}, 'start_phases is'),
@@ -1082,7 +1088,7 @@ class OptionTest(parameterized.TestCase):
         ({'step_length': 'long'}, "step_length is 'long'; expected a number"),
         ({'start_phases': 0.5}, 'start_phases is 0.5; expected a list of numbers'),
         ({'start_phases': '12'}, "start_phases is '12'; expected a list of numbers"),
-        ({'sight': None}, 'sight is None; expected a list of strings'),
+        ({'terrain_observation': None}, 'terrain_observation is None; expected a string or a list of strings'),
         ({'goal_reached': [1]}, r'goal_reached is \[1\]; expected a number or None'),
         ({'substeps': 10.5}, 'substeps is 10.5; expected a whole number'),
         ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),

@@ -21,7 +21,7 @@ from trl_suite.vector import VectorEnvironment
 PLANE, HILLS = 'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills-v0'
 STEPS, TRACK = 'PD_Biped3D_Imitate-Steps-v0', 'PD_Biped3D_Imitate-Track-v0'
 RUN, STAIRS = 'PD_Biped3D_Imitate-Run-v0', 'PD_Biped3D_Imitate-Stairs-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'imitation3d']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'spatial_imitation']
 WEIGHTS = {'pose': 0.5, 'velocity': 0.05, 'end_effector': 0.15, 'com': 0.2, 'root': 0.1}
 SCALES = {'pose': 2, 'velocity': 0.005, 'end_effector': 40, 'com': 10, 'root': 10}
 # Raw reward weights: root, torso, then hip, knee and ankle of the right and of the left leg.
@@ -144,7 +144,7 @@ class ObservationTest(parameterized.TestCase):
         *((id_, steps) for id_ in (HILLS, STEPS, STAIRS, RUN) for steps in (0, 4, 14))
     )
     def test_terrain_pose_and_velocity(self, id_, steps):
-        environment, step = started(id_, steps, terrain_observation=True)
+        environment, step = started(id_, steps, terrain_observation='height')
         self.assertEqual(list(step.observation)[:3], ['terrain', 'pose', 'velocity'])
         for name, value in Probe(environment).blocks().items():
             # Height grids are kept in single precision.
@@ -154,7 +154,7 @@ class ObservationTest(parameterized.TestCase):
             )
 
     def test_the_map_is_that_of_the_arena(self):
-        environment, step = started(HILLS, 6, terrain_observation=True)
+        environment, step = started(HILLS, 6, terrain_observation='height')
         probe = Probe(environment)
         expected = environment.task.arena.height_map(probe.root[None, :2], probe.heading[None])
         self.assertEqual(step.observation['terrain'].shape, (1024,))
@@ -538,7 +538,7 @@ class SaveTest(parameterized.TestCase):
     """State and pickles go on bit for bit; many simulations are single ones."""
 
     OPTIONS = (
-        (HILLS, {'terrain_observation': True}), (STEPS, {'mirrored': True, 'terrain_observation': True}),
+        (HILLS, {'terrain_observation': 'height'}), (STEPS, {'mirrored': True, 'terrain_observation': 'height'}),
         (TRACK, {}),
     )  # fmt: skip
 

@@ -8,13 +8,13 @@ from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.components import rewards
-from trl_suite.tasks.imitation.planar import Imitation
+from trl_suite.tasks.imitation.planar import PlanarImitation
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
 DOG, RAPTOR = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Raptor2D_Slopes_Terrain-v0'
 BIPED, MUSCLES = 'PD_Biped2D_Gaps_Terrain-v0', 'MTU_Dog2D_LLC_Imitate_Flat-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'imitation']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'planar_imitation']
 EXAMPLES = (
     DOG, RAPTOR, BIPED, MUSCLES, 'Torque_Raptor2D_LLC_Imitate_Flat-v0', 'PD_Biped2D_Incline-v0',
     'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
@@ -113,7 +113,7 @@ class Reference:
         options = {'reference_observation': True} if task.actuation_model == 'muscle' else {}
         self.clip = task.clip
         spec = task.character.spec
-        other = Imitation(
+        other = PlanarImitation(
             characters.make(spec.name), PlanarArena(terrain.load('flat')), self.clip,
             actuation_model=task.actuation_model, **options,
         )  # fmt: skip

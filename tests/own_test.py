@@ -19,7 +19,7 @@ from absl.testing import absltest, parameterized
 from trl_suite import characters, cli, engine, gym, motion, suite, terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.tasks import parts
-from trl_suite.tasks.walk import Walk
+from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain.planar import generators
 from trl_suite.vector import VectorEnvironment
 
@@ -437,7 +437,7 @@ class TerrainTest(Folder):
         seen = np.array([first, *(many.step(action).observation for action in actions)])
         for i in (0, 2):
             options = {'random': int(many.seeds[i])}
-            single = suite.build_row(spec, options, {'flat_observation': True})
+            single = suite.build_environment(spec, options, {'flat_observation': True})
             np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
 
     @parameterized.named_parameters(
@@ -598,7 +598,7 @@ class TaskTest(parameterized.TestCase):
 
     def test_gymnasium(self):
         spec = suite.combine('biped3d', terrain='hills3d', task='walk')
-        env = gym.SuiteEnv(spec, task_kwargs=PARTS | {'terrain_observation': True})
+        env = gym.SuiteEnv(spec, task_kwargs=PARTS | {'terrain_observation': 50})
         observation, _ = env.reset(seed=1)
         self.assertEqual(observation.shape, (1024 + 57 + 48 + 2 + 3,))
         envs = gym.SuiteVectorEnv(spec, 2, task_kwargs=PARTS)

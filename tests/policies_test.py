@@ -592,7 +592,9 @@ class ShippedTest(parameterized.TestCase):
 
     def test_every_planar_row_that_tracks_a_clip_has_one(self):
         specs = [
-            spec for spec in catalogue.SPECS if spec.rules == 'imitation' and 'planar' in spec.tags
+            spec
+            for spec in catalogue.SPECS
+            if spec.task_type == 'planar_imitation' and 'planar' in spec.tags
         ]
         self.assertLen(specs, 42)
         self.assertContainsSubset([spec.id for spec in specs], policies.available())

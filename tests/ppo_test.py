@@ -59,8 +59,8 @@ class PartsTest(parameterized.TestCase):
     def test_every_environment_has_settings(self):
         for id_ in catalogue.BY_ID:
             settings = ppo_settings.settings_for(id_)
-            cycles = catalogue.BY_ID[id_].rules == 'gait'  # a step is 10 to 20 times longer
-            plans = catalogue.BY_ID[id_].rules in ('hike', 'soccer')
+            cycles = catalogue.BY_ID[id_].task_type == 'gait'  # a step is 10 to 20 times longer
+            plans = catalogue.BY_ID[id_].task_type in ('goal_navigation', 'soccer')
             least = 5e4 if cycles or plans else 2e5 if settings.start else 5e5
             self.assertGreaterEqual(settings.samples, least, id_)
             if settings.start:

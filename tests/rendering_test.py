@@ -303,7 +303,7 @@ class SpatialTest(FolderTest):
     def build(self, terrain, **options):
         environment = suite.build(
             'biped3d', terrain=terrain,
-            task_kwargs={'random': 1, 'terrain_observation': True, 'start_phase': 0.0, **options},
+            task_kwargs={'random': 1, 'terrain_observation': 'height', 'start_phase': 0.0, **options},
         )  # fmt: skip
         environment.reset()
         return environment
@@ -351,8 +351,8 @@ class SpatialTest(FolderTest):
 
     def test_height_map_refusals(self):
         for make, options, message in (
-            (lambda: suite.make(GAPS), {}, 'the task Imitation.*no map'),
-            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, 'terrain_observation=True'),
+            (lambda: suite.make(GAPS), {}, 'the task PlanarImitation.*no map'),
+            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, "terrain_observation='height'"),
             (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
             (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
         ):

@@ -14,7 +14,7 @@ from trl_suite import motion, suite
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import make
 from trl_suite.environments.environment import Environment
-from trl_suite.tasks.imitation.planar import Imitation
+from trl_suite.tasks.imitation.planar import PlanarImitation
 from trl_suite.terrain import load
 
 EXAMPLES = (
@@ -290,7 +290,9 @@ class PickleTest(parameterized.TestCase):
         np.testing.assert_array_equal(advance(twin, 30), advance(environment, 30))
 
     def test_one_that_nothing_can_build_again(self):
-        task = Imitation(make('biped2d'), PlanarArena(load('flat')), motion.load('biped2d_walk'))
+        task = PlanarImitation(
+            make('biped2d'), PlanarArena(load('flat')), motion.load('biped2d_walk')
+        )
         with self.assertRaisesRegex(TypeError, r'get_state\(\)'):
             pickle.dumps(Environment(task))
 

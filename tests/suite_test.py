@@ -127,12 +127,12 @@ HIGH_LEVEL = {
 
 def ids_of(rules):
     """Rows of one task class."""
-    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == rules]
+    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == rules]
 
 
 def imitation_ids():
     """Rows of the two planar families of tracking."""
-    return ids_of('imitation')
+    return ids_of('planar_imitation')
 
 
 class CatalogueTest(parameterized.TestCase):
@@ -178,7 +178,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
     def test_three_dimensions(self):
-        self.assertCountEqual([*ids_of('imitation3d'), *ids_of('footsteps')], SPATIAL)
+        self.assertCountEqual([*ids_of('spatial_imitation'), *ids_of('spatial_footsteps')], SPATIAL)
         self.assertCountEqual(
             [spec.id for spec in catalogue.SPECS if 'spatial' in spec.tags],
             [*SPATIAL, *HIGH_LEVEL, *HARD],
@@ -211,7 +211,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
     def test_high_level(self):
-        self.assertCountEqual([*ids_of('hike'), *ids_of('soccer')], HIGH_LEVEL)
+        self.assertCountEqual([*ids_of('goal_navigation'), *ids_of('soccer')], HIGH_LEVEL)
         self.assertEqual(ids_of('soccer'), ['PD_Biped3D_HLC_Soccer-v0'])
         for id_, (ground, _, _, original) in HIGH_LEVEL.items():
             spec = suite.find(id_)
@@ -465,9 +465,9 @@ class BuildTest(parameterized.TestCase):
     @parameterized.parameters(
         *(
             (name, model)
-            for name in suite.DEFAULT_CLIPS
+            for name, spec in characters.CHARACTERS.items()
             for model in ('position', 'torque', 'velocity', 'muscle')
-            if model != 'muscle' or not characters.CHARACTERS[name].spatial
+            if spec.clip and (model != 'muscle' or not spec.spatial)
         )
     )
     def test_every_character_with_every_model(self, name, model):
@@ -497,7 +497,7 @@ class BuildTest(parameterized.TestCase):
     def test_every_preset_in_three_dimensions(self, preset, task):
         environment = suite.build(
             'biped3d_mocap', terrain=preset, task=task,
-            task_kwargs={'random': 0, 'terrain_observation': True},
+            task_kwargs={'random': 0, 'terrain_observation': 'height'},
         )  # fmt: skip
         self.assertEqual(environment.task.arena.terrain.name, preset)
         self.assertEqual(environment.observation_spec()['terrain'].shape, (1024,))
@@ -552,12 +552,12 @@ class BuildTest(parameterized.TestCase):
         ({'character': 'biped3d_mocap', 'terrain': {'Type': 'var2d_gaps'}, 'task': 'footsteps'},
          "'biped3d_mocap' is three-dimensional and terrain 'var2d_gaps'"),
         ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
-        ({'character': 'dog', 'task': 'hike'}, "'dog' is planar; the task 'hike'"),
+        ({'character': 'dog', 'task': 'goal_navigation'}, "'dog' is planar; the task 'goal_navigation'"),
         ({'character': 'dog', 'task': 'footsteps'}, "'dog' has no right and left foot to place"),
         ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no right and left foot"),
         ({'character': 'biped2d_full', 'task': 'footsteps', 'clip': motion.load_steps('biped3d_mocap')},
          "'biped3d_mocap' is a library of steps"),
-        ({'character': 'biped3d', 'task': 'imitation3d'}, "unknown task 'imitation3d'"),
+        ({'character': 'biped3d', 'task': 'spatial_imitation'}, "unknown task 'spatial_imitation'"),
         ({'character': 'biped3d', 'task': 'footsteps'},
          'no library of steps of its own; give clip=, one of .*biped3d_mocap'),
         ({'character': 'biped3d_mocap', 'task': 'footsteps', 'clip': 'biped3d_moca'},

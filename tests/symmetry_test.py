@@ -24,14 +24,14 @@ CASES = (
     ('biped3d_mocap_run', 'position', 'plane', 'footsteps', {}),
     ('biped3d_full_mocap', 'position', 'plane', 'footsteps', {}),
     ('biped3d_full_mocap', 'position', 'plane', 'imitation', {'action_offset': 'original'}),
-    ('biped3d', 'position', 'plane', 'imitation', {'action_offset': 'original', 'terrain_observation': True}),
+    ('biped3d', 'position', 'plane', 'imitation', {'action_offset': 'original', 'terrain_observation': 'height'}),
     ('biped3d', 'position', 'plane', 'imitation', {'action_offset': 'posture'}),
     ('biped3d', 'torque', 'plane', 'imitation', {}),
-    ('biped3d_mocap', 'torque', 'plane', 'footsteps', {'terrain_observation': True}),
+    ('biped3d_mocap', 'torque', 'plane', 'footsteps', {'terrain_observation': 'height'}),
     ('biped3d', 'velocity', 'plane', 'imitation', {}),
     ('biped3d_mocap', 'velocity', 'plane', 'footsteps', {}),
-    ('biped3d', 'position', 'stairs3d', 'imitation', {'terrain_observation': True}),
-    ('biped3d_mocap', 'position', 'ramp3d', 'footsteps', {'terrain_observation': True}),
+    ('biped3d', 'position', 'stairs3d', 'imitation', {'terrain_observation': 'height'}),
+    ('biped3d_mocap', 'position', 'ramp3d', 'footsteps', {'terrain_observation': 'height'}),
 )  # fmt: skip
 
 

@@ -546,7 +546,7 @@ class GroundTest(parameterized.TestCase):
             same = np.abs(trail.heading - heading) < 1e-12
             self.assertLess(np.abs(across[same]).min(), 1e-9)
             nearest = np.linalg.norm(0.5 * (trail.start + trail.end) - (x, y), axis=1).argmin()
-            for rule, most in (('hike', 10), ('step', 1)):
+            for rule, most in (('far', 10), ('near', 1)):
                 goal = ground.goal(rng, (x, y), rule)
                 ahead = [
                     k
@@ -569,10 +569,10 @@ class GroundTest(parameterized.TestCase):
     def test_spawn_at_the_start(self, source):
         ground, rng = make(source), np.random.RandomState(1)
         self.assertEqual(ground.spawn(rng), (0.0, 0.0, 0.0))
-        hikes = np.array([ground.goal(rng, (5.0, 7.0)) for _ in range(200)])
-        self.assertBetween(np.abs(hikes[:, :2] - (5, 7)).max(), 2.9, 3)
-        np.testing.assert_allclose(hikes[:, 2], ground.height(hikes[:, 0], hikes[:, 1]), atol=1e-6)
-        steps = np.array([ground.goal(rng, (5.0, 7.0), 'step', distance=0.5) for _ in range(200)])
+        far = np.array([ground.goal(rng, (5.0, 7.0)) for _ in range(200)])
+        self.assertBetween(np.abs(far[:, :2] - (5, 7)).max(), 2.9, 3)
+        np.testing.assert_allclose(far[:, 2], ground.height(far[:, 0], far[:, 1]), atol=1e-6)
+        steps = np.array([ground.goal(rng, (5.0, 7.0), 'near', distance=0.5) for _ in range(200)])
         np.testing.assert_array_equal(steps[:, 1], 0)
         self.assertBetween(steps[:, 0].min() - 5, 0.5, 0.6)
         self.assertBetween(steps[:, 0].max() - 5, 2.9, 3)

@@ -28,9 +28,9 @@ class IdentityTest(parameterized.TestCase):
         # A step of a gait is a whole cycle, one above a controller a footstep; gait_test and
         # high_level_test look closer.
         limit, steps, scale = LIMIT, 2 * LIMIT + 6, 1.0
-        if suite.find(id_).rules == 'gait':
+        if suite.find(id_).task_type == 'gait':
             limit, steps, scale = 1, 4, 0.3
-        elif suite.find(id_).rules in ('hike', 'soccer'):
+        elif suite.find(id_).task_type in ('goal_navigation', 'soccer'):
             limit, steps = 3, 8
         _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5)
         self.assertGreaterEqual(ends, 6)
@@ -267,7 +267,7 @@ class AutoresetTest(parameterized.TestCase):
         self.assertEqual(AUTORESET, ('next_step', 'same_step', 'disabled'))
 
 
-KINDS = tuple({spec.rules: spec.id for spec in catalogue.SPECS}.values())  # one id of each task
+KINDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())  # one id of each task
 ALONE = np.array([False, True, False])
 
 

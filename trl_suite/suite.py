@@ -1,4 +1,4 @@
-"""The front door: a row of the catalogue, a paper's id, or a free combination -> an environment."""
+"""The front door: an id, a family and task, or a free combination -> an environment."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from trl_suite import actuation as actuation_models
 from trl_suite import characters, motion, policies
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
-from trl_suite.registry.build import DIMENSIONS, build_task, character_of
-from trl_suite.registry.catalogue import EnvSpec, find
-from trl_suite.tasks.footsteps.planar import check_feet
+from trl_suite.registry.build import DIMENSIONS, build_task
+from trl_suite.registry.catalogue import find
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.registry.task_types import TASK_TYPES, TITLES
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.walk import WALK
+from trl_suite.tasks.task_type import TaskType
 from trl_suite.util import errors
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
@@ -26,24 +27,7 @@ TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
     for domain in dict.fromkeys(d for d, _ in ALL_TASKS)
 }
-DEFAULT_CLIPS = {
-    'biped2d': 'biped2d_walk', 'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound',
-    'goat': 'dog_bound', 'raptor': 'raptor_run_050', 'biped3d': 'biped3d_walk',
-    'biped3d_mocap': 'biped3d_mocap_walk', 'biped3d_mocap_run': 'biped3d_mocap_run',
-    'biped3d_full_mocap': 'biped3d_full_walk',
-}  # fmt: skip
 _ENVIRONMENT_OPTIONS = ('random', 'time_limit', 'step_limit')  # also taken from task_kwargs
-
-
-# As `build` names rules.
-TASKS = ('imitation', 'footsteps', 'hike', 'soccer', 'journey', 'gait', 'walk')
-_SPATIAL = {  # what is for one kind of character only
-    'hike': True, 'soccer': True, 'journey': True, 'gait': False,
-}  # fmt: skip
-_BY_DIMENSIONS = {  # rules of a task that planar and spatial characters have
-    ('imitation', True): 'imitation3d', ('footsteps', False): 'footsteps2d',
-}  # fmt: skip
-_OF_STEPS = ('footsteps', 'hike', 'soccer')  # in space the motion is a library of steps
 
 
 def load(
@@ -72,7 +56,7 @@ def load(
             )
         )
     spec = catalogue.BY_TASK[domain_name, task_name]
-    return build_row(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def make(
@@ -84,7 +68,7 @@ def make(
 
     Arguments and errors are those of `load`.
     """
-    return build_row(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def reference_policy(id: str) -> policies.Policy:
@@ -117,7 +101,7 @@ def build(
       ValueError: unknown names, options, or parts that do not fit each other.
     """
     spec = combine(character, actuation, terrain, task, clip)
-    return build_row(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def combine(
@@ -127,19 +111,20 @@ def combine(
     task: str | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
 ) -> EnvSpec:
-    """Returns the row of a combination: what `VectorEnvironment` and Gymnasium take.
+    """Returns the data of a combination: what `VectorEnvironment` and Gymnasium take.
 
     Args:
-      character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+      character: name in `trl_suite.characters.CHARACTERS`, or a `CharacterSpec` of the user's own.
       actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
         joints by itself and takes none.
       terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
         dimensions as the character has. By default level ground.
-      task: the rules: 'imitation'; 'footsteps', for who has a right and a left foot; in three
-        dimensions 'hike' or 'soccer' (above a footstep controller) or 'journey' (from goal to goal
-        without one); 'gait' (in the plane), or 'walk', which needs neither clip nor controller. Or
-        a class or function of the user's, called as task(character, arena, actuation_model=...),
-        with clip=... if one is given, and with the task's options by keyword; it returns a `Task`.
+      task: title of a task type: 'imitation'; 'footsteps', for characters with a right and a left
+        foot; in three dimensions 'goal_navigation' or 'soccer' (above a footstep controller), or
+        'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
+        needs neither clip nor controller. Or a class or function of the user's, called as
+        task(character, arena, actuation_model=...), with clip=... if one is given, and with the
+        task's options by keyword; it returns a `Task`.
       clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
         footsteps in three dimensions the same of a library of steps, `Steps`. By default the
         character's own. A gait or a walk takes none.
@@ -147,61 +132,81 @@ def combine(
     Raises:
       ValueError: unknown names, or parts that do not fit each other.
     """
-    own = not isinstance(task, str)
-    title = task if isinstance(task, str) else str(getattr(task, '__name__', 'task'))
-    if own and not callable(task):
-        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
-    if not own and title not in TASKS:
-        raise ValueError(errors.unknown('task', title, TASKS))
-    name = character if isinstance(character, str) else character.name
-    if isinstance(character, str) and character not in characters.CHARACTERS:
+    own: dict[str, Any] = {}
+    if not isinstance(character, str):
+        own['character'], character = character, character.name
+    elif character not in characters.CHARACTERS:
         raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
-    spatial = character_of(character).spatial
-    if not own and spatial is not _SPATIAL.get(title, spatial):
-        raise ValueError(
-            f'character {name!r} is {DIMENSIONS[spatial]}; the task {title!r} is for '
-            f'{DIMENSIONS[not spatial]} characters'
-        )
-    if task == 'footsteps' and not spatial:
-        check_feet(character_of(character))
-    if task == 'gait':
-        if actuation not in (None, 'gait') or clip is not None:
-            raise ValueError(
-                'a gait drives the joints by itself: it takes no actuation and no clip'
-            )
-        actuation = 'gait'
+    figure = own.get('character') or characters.CHARACTERS[character]
+    if isinstance(task, str):
+        title, type_ = task, _type(task, figure)
+        actuation = _actuation(type_, actuation)
+        if type_.motion is None and clip is not None:
+            raise ValueError(f'the task {title!r} tracks nothing: it takes no clip')
+        if clip is None and type_.motion is not None:
+            clip = _own_motion(figure, type_.motion)
+    elif callable(task):
+        title, type_ = str(getattr(task, '__name__', 'task')), None
+        own['task_type'], actuation = task, _actuation(None, actuation)
     else:
-        actuation = 'position' if actuation is None else actuation
-        if actuation not in actuation_models.ACTUATIONS:
-            raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
-        if task == 'walk' and clip is not None:
-            raise ValueError('a walk tracks nothing: it takes no clip')
-        if clip is None and not own and task != 'walk':
-            clip = _own_motion(name, title in _OF_STEPS and spatial)
+        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
     if terrain is None:
-        terrain = 'plane' if spatial else 'flat'
-    return EnvSpec(
-        id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{title}',
+        terrain = 'plane' if figure.spatial else 'flat'
+    if clip is not None and not isinstance(clip, str):
+        own['clip'], clip = clip, clip.name
+    ground = terrain if isinstance(terrain, str) else 'terrain'
+    spec = EnvSpec(
+        id=f'{character}/{actuation}/{ground}/{title}',
         domain='custom',
         task=title,
-        character=character,  # type: ignore[arg-type]
+        character=character,
         actuation=actuation,
-        terrain=terrain,
-        rules=task if own else _BY_DIMENSIONS.get((title, spatial), title),  # type: ignore[arg-type]
-        clip=clip,  # type: ignore[arg-type]
-        options=MappingProxyType({'rewards': WALK} if task == 'walk' else {}),
+        terrain=ground,
+        task_type=title if type_ is None else type_.name,
+        clip=clip,
+        options=MappingProxyType({} if type_ is None else dict(type_.options)),
         description='A combination of the user.',
+        own=MappingProxyType(own),
     )
+    return spec.with_terrain(terrain)
 
 
-def _own_motion(name: str, steps: bool) -> str:
+def _type(title: str, character: characters.CharacterSpec) -> TaskType:
+    """Returns the task type of a title for a character."""
+    if title not in TITLES:
+        raise ValueError(errors.unknown('task', title, TITLES))
+    types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == title}
+    spatial = character.spatial
+    if spatial not in types:
+        raise ValueError(
+            f'character {character.name!r} is {DIMENSIONS[spatial]}; the task {title!r} is for '
+            f'{DIMENSIONS[not spatial]} characters'
+        )
+    return types[spatial]
+
+
+def _actuation(type_: TaskType | None, actuation: str | None) -> str:
+    """Returns the actuation model of a task type, by default position control if it may be."""
+    known = actuation_models.ACTUATIONS
+    if type_ is not None and type_.actuations is not None:
+        known = type_.actuations
+    if actuation is None:
+        return 'position' if 'position' in known else known[0]
+    if actuation not in known:
+        owner = 'actuation' if type_ is None else f'actuation of the task {type_.title!r}'
+        raise ValueError(errors.unknown(owner, actuation, known))
+    return actuation
+
+
+def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
     """Returns the name of a character's own clip, or of its library of steps."""
-    if not steps:
-        if name not in DEFAULT_CLIPS:
+    name = character.name
+    if kind is motion.Clip:
+        if character.clip is None:
             raise ValueError(
                 f"character {name!r} has no clip of its own; give clip=, or task='walk', which needs none"
             )
-        return DEFAULT_CLIPS[name]
+        return character.clip
     known = motion.steps_names()
     if name not in known:
         raise ValueError(
@@ -211,10 +216,10 @@ def _own_motion(name: str, steps: bool) -> str:
     return name
 
 
-def build_row(
+def build_environment(
     spec: EnvSpec, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
 ) -> Environment:
-    """Builds the environment of a row; see `load` for the arguments."""
+    """Builds an environment from its data; see `load` for the arguments."""
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
     for name in environment_kwargs:
         if name not in known:
@@ -227,5 +232,5 @@ def build_row(
         spec, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
     )
     environment = Environment(task, **options)
-    environment._recipe = (build_row, (spec, task_kwargs, environment_kwargs))
+    environment._recipe = (build_environment, (spec, task_kwargs, environment_kwargs))
     return environment

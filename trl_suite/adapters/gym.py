@@ -79,7 +79,9 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
             spec = suite.find(environment) if isinstance(environment, str) else environment
-            environment = suite.build_row(spec, limited(spec, task_kwargs, max_episode_steps), {})
+            environment = suite.build_environment(
+                spec, limited(spec, task_kwargs, max_episode_steps), {}
+            )
         elif task_kwargs or max_episode_steps is not None:
             raise ValueError(
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'

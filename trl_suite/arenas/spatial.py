@@ -222,7 +222,7 @@ class SpatialArena(composer.Arena):
         env_id: int,
         random: Random,
         root: npt.ArrayLike,
-        rule: str = 'hike',
+        rule: str = 'far',
         distance: float = 1.0,
     ) -> np.ndarray:
         """Draws a goal for one simulation, clear of boxes as they now stand; see `SpatialGround.goal`."""

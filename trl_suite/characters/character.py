@@ -74,6 +74,8 @@ class CharacterSpec:
       collision_geoms: names of the geoms that can touch the ground; by default one for each link, of its
         name, unless its default class is group0.
       notes: what was assumed about the character, for people.
+      clip: the clip that it tracks where none is given, of those in mocap/.
+      differences: sentences on what differs from the original, by actuation model or 'gait'.
     """
 
     name: str
@@ -90,6 +92,8 @@ class CharacterSpec:
     bodies: tuple[str, ...] | None = None
     collision_geoms: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
+    clip: str | None = None
+    differences: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict, repr=False)
 
     @property
     def links(self) -> tuple[str, ...]:

@@ -139,6 +139,9 @@ _BIPED3D_SIMBICON_JOINTS = {
     'left_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
 }
 
+_TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
+_BORROWED = ('the original has no muscles for this character; they are borrowed',)
+
 DOG = CharacterSpec(
     name='dog',
     joints=_DOG_JOINTS,
@@ -148,6 +151,8 @@ DOG = CharacterSpec(
     end_effectors=('finger', 'toe'),
     stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
     description='Dog, 21 links: a segmented spine, a tail, one simulated front and hind leg.',
+    clip='dog_bound',
+    differences={'position': _TO_PARENT},
 )  # fmt: skip
 
 _GOAT_JOINTS = {name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()}
@@ -160,6 +165,15 @@ GOAT = CharacterSpec(
     end_effectors=('finger', 'toe'),
     stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
     description='Goat, 21 links: the skeleton of the dog with horns; only its rump is a fall.',
+    clip='dog_bound',
+    differences={
+        'position': _TO_PARENT,
+        'muscle': _BORROWED,
+        'gait': (
+            "action 0 is a gait tuned anew: the original's fall here on flat ground; the original has the "
+            'gait and no environment for it',
+        ),
+    },
 )
 
 RAPTOR = CharacterSpec(
@@ -169,6 +183,13 @@ RAPTOR = CharacterSpec(
     end_effectors=('right_toe', 'left_toe'),
     stumble_exempt=('right_toe', 'left_toe', 'right_ankle', 'left_ankle'),
     description='Raptor, 19 links: a heavy pelvis between a neck, a tail and two bird legs.',
+    clip='raptor_run_050',
+    differences={
+        'position': _TO_PARENT,
+        'gait': (
+            "action 0 is the original's base action 1, which is steadier than its base action 0",
+        ),
+    },
 )
 
 BIPED2D = CharacterSpec(
@@ -178,6 +199,7 @@ BIPED2D = CharacterSpec(
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
     description='Biped, 7 links: a trunk of 25 kg and two legs; the feet are the ankle links.',
+    clip='biped2d_walk',
 )
 
 BIPED2D_SIMBICON = CharacterSpec(
@@ -187,6 +209,11 @@ BIPED2D_SIMBICON = CharacterSpec(
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
+    differences={
+        'gait': (
+            "action 0 is a gait tuned anew: the original's falls here; torque is not rewarded",
+        ),
+    },
 )
 
 BIPED2D_FULL = CharacterSpec(
@@ -199,6 +226,8 @@ BIPED2D_FULL = CharacterSpec(
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
     description='Biped with arms and head, 12 links, with human torque limits.',
+    clip='biped2d_full_walk',
+    differences={'muscle': _BORROWED},
 )  # fmt: skip
 
 HOPPER = CharacterSpec(
@@ -208,6 +237,11 @@ HOPPER = CharacterSpec(
     end_effectors=('leg',),  # none in the original's file; the foot is the lower end of the leg
     stumble_exempt=('leg',),
     description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
+    differences={
+        'gait': (
+            '9 parameters, taken at touch-down; the original announces 8 and takes them in mid-air',
+        ),
+    },
 )
 
 BIPED3D = CharacterSpec(
@@ -218,12 +252,14 @@ BIPED3D = CharacterSpec(
     stumble_exempt=('right_ankle', 'left_ankle'),
     description='Biped in 3D, 8 links: a pelvis, a torso and two legs; waist, hips and ankles are balls.',
     spatial=True,
+    clip='biped3d_walk',
 )
 
 BIPED3D_MOCAP = dataclasses.replace(
     BIPED3D,
     name='biped3d_mocap',
     description='Biped in 3D with longer legs and a narrower pelvis, 8 links: the walker of DeepLoco.',
+    clip='biped3d_mocap_walk',
 )
 
 BIPED3D_MOCAP_RUN = dataclasses.replace(
@@ -231,6 +267,8 @@ BIPED3D_MOCAP_RUN = dataclasses.replace(
     name='biped3d_mocap_run',
     joints=_BIPED3D_MOCAP_RUN_JOINTS,
     description='Biped in 3D that runs, 8 links: light legs, strong and stiff joints.',
+    clip='biped3d_mocap_run',
+    differences={'position': ('its ankles have an armature of 0.03 kg m^2',)},
 )
 
 BIPED3D_FULL_MOCAP = dataclasses.replace(
@@ -241,6 +279,7 @@ BIPED3D_FULL_MOCAP = dataclasses.replace(
         link for link in ('root', *_BIPED3D_FULL_MOCAP_JOINTS) if not link.endswith('ankle')
     ),
     description='Biped in 3D with arms and head, 16 links; these are all but rigid.',
+    clip='biped3d_full_walk',
 )
 
 BIPED3D_SIMBICON = CharacterSpec(

@@ -23,7 +23,7 @@ from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.util import files
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
-ROWS = 64
+NUM_ENVS = 64
 CONTROL_TIMESTEP = 1 / 30  # s; longer steps have controllers inside
 SECONDS = 2.0  # per measurement
 WARM = 4 / 3  # s of simulated time; most simulations have fallen once by then
@@ -70,12 +70,12 @@ def actions(low: Any, high: Any, shape: tuple[int, ...]) -> Iterator[np.ndarray]
         yield from drawn
 
 
-def warmed(id: str, env_ids: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
+def warmed(id: str, num_envs: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
     """Makes a vector environment whose simulations are over their first episodes, and random actions."""
-    environments = VectorEnvironment(id, env_ids, threads, seed=0)
+    environments = VectorEnvironment(id, num_envs, threads, seed=0)
     environments.reset()
-    drawn = actions(-1, 1, (env_ids, len(environments.action_map)))
-    while physics_steps(environments) * environments.task.physics_timestep < WARM * env_ids:
+    drawn = actions(-1, 1, (num_envs, len(environments.action_map)))
+    while physics_steps(environments) * environments.task.physics_timestep < WARM * num_envs:
         environments.step(next(drawn))
     return environments, drawn
 
@@ -85,12 +85,12 @@ def physics_steps(environments: VectorEnvironment) -> int:
     return int(environments.task.world.engine.steps.sum())
 
 
-def vector(id: str, env_ids: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
+def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
     """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
     Args:
       id: of the environment.
-      env_ids: number of simulations.
+      num_envs: number of simulations.
       threads: that step them; 0 takes all cores.
       seconds: for the environment, and as many for the raw batch.
 
@@ -101,12 +101,12 @@ def vector(id: str, env_ids: int, threads: int, seconds: float = SECONDS) -> dic
       per simulation.
     """
     threads = threads or machine.cores()
-    environments, drawn = warmed(id, env_ids, threads)
-    others, _ = warmed(id, env_ids, threads)
+    environments, drawn = warmed(id, num_envs, threads)
+    others, _ = warmed(id, num_envs, threads)
     world: Any = others._world
     begin = Stopwatch(environments._begin, len)
     environments._begin = begin  # type: ignore[method-assign]
-    parallel = Stopwatch(environments._share, lambda *_: env_ids)
+    parallel = Stopwatch(environments._share, lambda *_: num_envs)
     environments._share = parallel  # type: ignore[method-assign]
     before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
@@ -116,8 +116,8 @@ def vector(id: str, env_ids: int, threads: int, seconds: float = SECONDS) -> dic
         controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
         world.share(lambda part: world.step(substeps, part), world.all_ids)
 
-    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: env_ids)
-    alone = Stopwatch(step, lambda: env_ids * substeps)
+    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: num_envs)
+    alone = Stopwatch(step, lambda: num_envs * substeps)
     for _ in range(ROUNDS):
         for turn in (control, alone):
             rate(turn, seconds / ROUNDS)
@@ -225,13 +225,13 @@ def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
 
 
 def bench(
-    id: str = ID, env_ids: int = ROWS, threads: int = 0, seconds: float = SECONDS
+    id: str = ID, num_envs: int = NUM_ENVS, threads: int = 0, seconds: float = SECONDS
 ) -> dict[str, Any]:
     """Measures an environment on this machine.
 
     Args:
       id: of the environment, or an alias.
-      env_ids: of the vector environment.
+      num_envs: of the vector environment.
       threads: that step them; 0 takes all cores that may be used.
       seconds: per measurement, of which there are four.
 
@@ -248,9 +248,9 @@ def bench(
     if not 0 < seconds < float('inf'):
         raise ValueError(f'seconds is {seconds}; expected a positive number')
     id, threads = suite.find(id).id, threads or machine.cores()
-    many, one = vector(id, env_ids, threads, seconds), single(id, seconds)
+    many, one = vector(id, num_envs, threads, seconds), single(id, seconds)
     return {
-        'machine': machine.sentence(), 'id': id, 'simulations': env_ids, 'threads': threads,
+        'machine': machine.sentence(), 'id': id, 'num_envs': num_envs, 'threads': threads,
         'control steps per second': round(many['control']),
         'ratio to the engine': round(many['physics'] / many['engine'], 3),
         'ratio to mj_step': round(many['physics'] / one['mj_step'], 3),
@@ -268,7 +268,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         files.write_json(result, arguments.json)
     print(
-        f'{result["id"]}, {result["simulations"]} simulations, {result["threads"]} threads, random actions'
+        f'{result["id"]}, {result["num_envs"]} simulations, {result["threads"]} threads, random actions'
     )
     print(f'  on {result["machine"]}')
     for name, text in (

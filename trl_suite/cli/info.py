@@ -12,7 +12,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Prints everything about one environment."""
     suite = engine.load()
     spec = suite.find(arguments.id)
-    environment = suite.build_row(spec, {}, {})
+    environment = suite.build_environment(spec, {}, {})
     print(f'{spec.id}\n  {spec.description}')
     print(f'  also {", ".join((f"{spec.domain}/{spec.task}", *spec.aliases))}; tags:', end=' ')
     print(', '.join(sorted(spec.tags)))

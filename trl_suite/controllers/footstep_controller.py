@@ -1,12 +1,13 @@
 """Low-level controllers that place the feet: loaded, checked, and called for many bodies at once.
 
-from trl_suite.controllers import footstep_controller as llc
+from trl_suite import policies
+from trl_suite.controllers import footstep_controller
 
-controller = llc.load()  # the one that the suite ships
-controller = llc.load('mine.npz')  # or what `trl_suite.policies.save` wrote
-controller = llc.load(lambda observation: my_network(observation))  # or any function
+controller = footstep_controller.load(policies.reference('PD_Biped3D_LLC_General_Step-v0'))
+controller = footstep_controller.load('mine.npz')  # or what `trl_suite.policies.save` wrote
+controller = footstep_controller.load(lambda observation: my_network(observation))  # or any function
 
-A controller takes the observations of `trl_suite.tasks.footsteps.spatial.spatial.Footsteps`, (n, 125) without a
+A controller takes the observations of `trl_suite.tasks.footsteps.spatial.SpatialFootsteps`, (n, 125) without a
 terrain map, and gives actions in [-1, 1], (n, 17): every 1/30 s, without memory of its own, as the
 phase is in the observation.
 """
@@ -87,22 +88,21 @@ class Controller:
         return action
 
 
-def load(source: str | os.PathLike[str] | Function = DEFAULT) -> Controller:
+def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
     """Returns a low-level controller.
 
     Args:
-      source: id of an environment whose reference policy is meant, path of a policy (a PathLike,
-        or a string that ends in .npz), a `Policy`, or any function from observations (n, size) to
-        actions (n, k).
+      source: a `Policy`, the path of one (a PathLike, or a string that ends in .npz), or any function
+        from observations (n, size) to actions (n, k).
 
     Raises:
       ValueError: a broken file; see `policies.load`.
-      FileNotFoundError: there is no such file, or no policy is shipped for the id.
+      FileNotFoundError: there is no such file.
     """
     if isinstance(source, Controller):
         return source
+    if isinstance(source, policies.Policy):
+        return Controller(source, repr(source.id))
     if callable(source):
         return Controller(source, getattr(source, '__name__', type(source).__name__))
-    if isinstance(source, os.PathLike) or str(source).endswith('.npz'):
-        return Controller(policies.load(source), repr(os.fspath(source)))
-    return Controller(policies.reference(source), repr(source))
+    return Controller(policies.load(source), repr(os.fspath(source)))

@@ -148,8 +148,8 @@ def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
     for column in _balls(clip.sizes):
         here = slice(column, column + 4)
         frames[:, here] = _upright(frames[:, here])
-    env_ids = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
-    text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{env_ids}\n]\n}}\n'
+    rows = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
+    text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{rows}\n]\n}}\n'
     path = pathlib.Path(path)
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')
     try:

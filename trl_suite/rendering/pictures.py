@@ -288,7 +288,7 @@ def height_map(
     mirrored.
 
     Args:
-      environment: one whose task observes such a map (`terrain_observation=True`), after `reset`.
+      environment: one whose task observes such a map (`terrain_observation='height'`), after `reset`.
       path: where to write it as .png; not written if None.
       reach: height, up or down, of the full colour, m.
 
@@ -305,7 +305,7 @@ def height_map(
     if part.stop - part.start != SAMPLES**2:
         raise ValueError(
             f'the task {type(task).__name__}, which observes no map of {SAMPLES} x {SAMPLES} heights, has '
-            'none to draw; 3D imitation and footsteps observe one with the option terrain_observation=True'
+            "none to draw; 3D imitation and footsteps observe one with the option terrain_observation='height'"
         )
     if not 0 < reach < np.inf:
         raise ValueError(f'reach is {reach}; expected a positive number of metres')

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +29,11 @@ from trl_suite.policies.mirror import Mirror
 from trl_suite.tasks.components import reflection as reflection3d
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    START_PHASE,
+    TERRAIN_LEVEL,
     Outcome,
     Task,
+    check_position_options,
     consecutive,
     drawn_seed,
     outcome,
@@ -39,10 +43,11 @@ from trl_suite.tasks.task import (
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SpatialWindows
-from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop
+from trl_suite.util.options import Config, option
 
 CONTROL_TIMESTEP = 1 / 30  # s
+TERRAIN_MAPS = "maps of the ground around that are observed, of 'height' and 'velocity'"
 SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
 ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
 PHASE_BINS = 4
@@ -245,6 +250,45 @@ def act_all(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int
     return leaving
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialConfig(Config):
+    """Options of tasks of a walker in three dimensions that drive its joints."""
+
+    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6)
+    action_offset: str = option(
+        'clip',
+        "pose at action 0: the mean of the motion ('clip'), left and right made alike, the working "
+        "'posture', or the 'original' map: an angle and an axis for every ball joint",
+        choices=ACTION_OFFSETS, actuation='position',
+    )  # fmt: skip
+    action_scale: float | None = option(
+        None, 'joint angle per unit action; by default 1 about the clip, 1.5 about the posture',
+        unit='rad', above=0, actuation='position',
+    )  # fmt: skip
+    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+        start_phases(self.start_phase)
+        if self.action_offset == 'original' and self.action_scale is not None:
+            raise ValueError("action_offset 'original' has ranges of its own: give no action_scale")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MirroredConfig(SpatialConfig):
+    """Options of tasks whose walkers may see and act as in a mirror while the left foot stands."""
+
+    mirrored: bool = option(False, 'observe and act as if the right foot always stood first')
+
+
+def maps(names: str | Collection[str]) -> tuple[str, ...]:
+    """Returns names of maps as a tuple, of one name or several."""
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
 class SpatialTask(Task):
     """A walker in three dimensions with a clock of the period of its motion.
 
@@ -261,6 +305,7 @@ class SpatialTask(Task):
     TERMS: Mapping[str, tuple[float, float]]  # reward terms: weight, and scale of the error
     ABOUT = 'com'  # from where end effectors are measured, or 'root'
     fields: tuple[str, ...] = SpatialFigure.fields
+    config: Any  # of the subclass
     period: float
 
     def __init__(
@@ -268,26 +313,30 @@ class SpatialTask(Task):
         character: Character,
         arena: SpatialArena,
         motion: Clip | Steps,
+        config: SpatialConfig,
         *,
         actuation_model: str = 'position',
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_observation: bool = False,
-        mirrored: bool = False,
-        terrain_level: float = 0.0,
         phase: bool = True,
         extras: Mapping[str, int],
     ) -> None:
         """Composes the task; see the subclasses.
 
+        Args:
+          character: a spatial character without actuators; it is attached to the arena.
+          arena: where it moves.
+          motion: what poses and clock are taken from.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+          phase: whether the phase is observed.
+          extras: sizes of the blocks of a subclass, by name.
+
         Raises:
-          ValueError: options out of range, or a motion that does not fit the character.
+          ValueError: options that do not fit each other, or a motion that does not fit the character.
         """
+        mirrored = getattr(config, 'mirrored', False)
         spec = character.spec
         check_motion(character, motion)
-        check_drive(actuation_model, action_offset, action_scale, substeps)
+        check_position_options(actuation_model, config.action_offset, config.action_scale)
         if mirrored and not spec.mirror:
             raise ValueError(
                 f'character {spec.name!r} has no pairs of right and left links; mirrored observations '
@@ -296,14 +345,16 @@ class SpatialTask(Task):
         if mirrored and not phase:
             raise ValueError('mirrored observations need the phase, which tells left from right')
         self.character, self.arena, self.motion = character, arena, motion
-        self.actuation_model, self.terrain_observation = actuation_model, terrain_observation
+        self.actuation_model, self.config = actuation_model, config
         self.mirrored = mirrored
-        self._start_phase, self._terrain_level = start_phases(start_phase), terrain_level
-        self.figure = SpatialFigure(character, arena, terrain_observation)
-        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
+        self._start_phase = start_phases(config.start_phase)
+        self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         options: dict[str, Any] = {}
         if actuation_model == 'position':
-            options = position_range(self._typical_poses(), motion, action_offset, action_scale)
+            options = position_range(
+                self._typical_poses(), motion, config.action_offset, config.action_scale
+            )
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
@@ -440,7 +491,9 @@ class SpatialTask(Task):
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
             ground = SpatialGround(
-                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
             )
             self._random[i] = np.random.default_rng(drawn_seed(random_state))
             spawns[k] = ground.spawn(self._random[i])
@@ -513,32 +566,6 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
             f'motion {motion.name!r} (joints {", ".join(motion.joints)}) does not fit character '
             f'{spec.name!r}: expected a spatial character with these joints, not '
             f'{"one" if spec.spatial else "a planar one"} with {", ".join(spec.joints)}'
-        )
-
-
-def check_drive(
-    actuation_model: str, action_offset: str, action_scale: float | None, substeps: int
-) -> None:
-    """Checks the options of actuation and time.
-
-    Raises:
-      ValueError: they are out of range, or do not fit each other.
-    """
-    if action_offset not in ACTION_OFFSETS:
-        raise ValueError(
-            errors.unknown('action_offset of position control', action_offset, ACTION_OFFSETS)
-        )
-    if actuation_model != 'position' and (action_offset != 'clip' or action_scale is not None):
-        raise ValueError(
-            f'action_offset and action_scale shape position control, not {actuation_model} control'
-        )
-    if action_offset == 'original' and action_scale is not None:
-        raise ValueError("action_offset 'original' has ranges of its own: give no action_scale")
-    if action_scale is not None and not 0 < action_scale < np.inf:
-        raise ValueError(f'action_scale is {action_scale}; expected a positive number of radians')
-    if int(substeps) != substeps or substeps < 6:
-        raise ValueError(
-            f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
         )
 
 

@@ -18,6 +18,12 @@ from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.util.compiled import compiled
 
+# Meanings of options that several tasks have.
+START_PHASE = 'phase of every start, in [0, 1), or pairs to draw it between; by default any'
+TERRAIN_LEVEL = (
+    "which of the terrain's parameter sets to draw from: 0 is the first, 0.5 half-way to the second"
+)
+SPAWNS = ('intended', 'upstream')
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
 
@@ -349,6 +355,18 @@ def start_phases(
         return float(pairs[i, 1] - (ends[i] - way))
 
     return phase_of
+
+
+def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
+    """Checks that options of position control are not given to another actuation model.
+
+    Raises:
+      ValueError: they are.
+    """
+    if model != 'position' and (action_offset != 'clip' or action_scale is not None):
+        raise ValueError(
+            f'action_offset and action_scale shape position control, not {model} control'
+        )
 
 
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:

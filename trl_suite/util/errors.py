@@ -2,11 +2,10 @@
 
 import collections.abc
 import difflib
-import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -45,23 +44,21 @@ def _listed(names: list[str]) -> str:
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
 
 
-def check_kinds(function: Callable[..., object], options: Mapping[str, object]) -> None:
-    """Checks options by the annotations of what takes them, before it stumbles over one.
+def check_kind(name: str, value: object, hint: object) -> None:
+    """Checks an option by the annotation of what takes it, before that stumbles over it.
 
     Args:
-      function: a function, or a class.
-      options: keyword arguments; those whose annotation says nothing here pass.
+      name: of the option.
+      value: what is given; it passes where the annotation says nothing here.
+      hint: the annotation.
 
     Raises:
-      ValueError: one is of another kind; the message has its name, and what was expected.
+      ValueError: the value is of another kind; the message has the name, and what was expected.
     """
-    takes = function.__init__ if inspect.isclass(function) else function
-    hints = typing.get_type_hints(takes)
-    for name, value in options.items():
-        choices = _choices(hints.get(name, typing.Any))
-        if not any(_fits(value, choice) for choice in choices):
-            expected = ' or '.join(dict.fromkeys(map(_words, choices)))
-            raise ValueError(f'{name} is {value!r}; expected {expected}')
+    choices = _choices(hint)
+    if not any(_fits(value, choice) for choice in choices):
+        expected = ' or '.join(dict.fromkeys(map(_words, choices)))
+        raise ValueError(f'{name} is {value!r}; expected {expected}')
 
 
 def _choices(hint: object) -> tuple[object, ...]:

@@ -33,6 +33,7 @@ from trl_suite import terrain as terrains
 from trl_suite.environments import named_policies as acting
 from trl_suite.environments.environment import Environment
 from trl_suite.registry import catalogue
+from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
 
@@ -186,8 +187,9 @@ def make(
 def character(name: str) -> np.ndarray:
     """Draws a character: in the first pose of its clip if it has one, else standing straight."""
     figure = KinematicViewer(name)
-    if name in suite.DEFAULT_CLIPS:
-        figure.put(motion.load(suite.DEFAULT_CLIPS[name]).pose(0.0))
+    clip = characters.CHARACTERS[name].clip
+    if clip is not None:
+        figure.put(motion.load(clip).pose(0.0))
     height, width = CHARACTER_SIZE
     return figure.picture(height=height, width=width, camera='front')
 
@@ -300,7 +302,8 @@ def curve(id: str) -> np.ndarray:
     found, spec = record(id), suite.find(id)
     if found is None:
         raise ValueError(f'no policy is shipped for {id!r}')
-    gait = spec.rules == 'gait'  # whose return says little
+    type_ = task_type(spec)
+    gait = type_ is not None and type_.score == 'distance'
     value = 'distance' if gait else 'normalized_return'
     unit, name = (1e6, 'million control steps')
     if gait or 'hierarchical' in spec.tags:

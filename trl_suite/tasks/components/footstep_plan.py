@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trl_suite.characters import CharacterSpec
 from trl_suite.kinematics.spatial import SpatialMeasurement, ahead_and_left
 from trl_suite.tasks.components.rewards import wrapped
 from trl_suite.tasks.task import Marker
@@ -74,7 +75,7 @@ def observe_plan(
     i: int, contact: int, column: int, found: SpatialMeasurement, plan: FootstepPlan,
     observation: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes the blocks contact and plan at these columns; see `Footsteps`."""
+    """Writes the blocks contact and plan at these columns; see `SpatialFootsteps`."""
     for foot in range(2):
         observation[i, contact + foot] = found.contact[i, foot]
     for k in range(PLAN_SIZE - 1):
@@ -111,3 +112,13 @@ def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Mark
         for place, colour in zip(plan.landing[env_id], colours, strict=True)
     ]
     return [*soles, Marker('arrow', root, (0.012, 0.012, 0.5), SWING_COLOUR, yaw)]
+
+
+def check_two_feet(spec: CharacterSpec) -> None:
+    """Checks that a character has two feet to place.
+
+    Raises:
+      ValueError: it has not.
+    """
+    if len(spec.end_effectors) != 2:
+        raise ValueError(f'character {spec.name!r} has no two feet to place')

@@ -10,6 +10,11 @@ import numpy as np
 
 from trl_suite.util import errors
 
+# Meanings of options of all tasks that follow footstep plans.
+MAX_LANDING_ERROR = (
+    'a foot that lands farther from its place ends the episode; by default it does not'
+)
+FOOTSTEP_SCALE = 'factor of the squared landing error in the reward; more teaches accuracy'
 ROOT_TURN_LIMIT = 1.2  # rad; the most that a plan made from the root turns
 
 

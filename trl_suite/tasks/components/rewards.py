@@ -32,7 +32,7 @@ STEP_TERMS: dict[str, tuple[float, float]] = {
 # Imitation on the way to a goal, as the original's scenario with a goal means it: velocity and heading
 # count towards the goal, and `proximity` is of the squared distance over that within which they no
 # longer do.
-JOURNEY_TERMS: dict[str, tuple[float, float]] = {
+DIRECT_TERMS: dict[str, tuple[float, float]] = {
     'pose': (0.5 / 1.15, 2.0),
     'velocity': (0.05 / 1.15, 0.005),
     'end_effector': (0.15 / 1.15, 40.0),

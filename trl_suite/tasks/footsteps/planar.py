@@ -6,8 +6,9 @@ Source: the step scenario of the original, as a configuration of it has it for t
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -21,13 +22,14 @@ from trl_suite.kinematics.planar_reference import feature
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.footstep_plan import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
-from trl_suite.tasks.components.plans import StraightPlans
+from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.components.plans import options as plans_from
 from trl_suite.tasks.imitation import planar as imitation
-from trl_suite.tasks.imitation.planar import SUBSTEPS, Imitation
+from trl_suite.tasks.imitation.planar import PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
 from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
 from trl_suite.util.random import Streams, random, uniform
 
 _DIGITS = 1e9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
@@ -240,11 +242,24 @@ def observe_all(
     return waiting
 
 
-class PlanarFootsteps(Imitation):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarFootstepsConfig(PlanarConfig):
+    """Options of `PlanarFootsteps`."""
+
+    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of StraightPlans')
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    footstep_scale: float = option(1.0, FOOTSTEP_SCALE, at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('plans', plans_from(StraightPlans, 'plans', self.plans or {}))
+
+
+class PlanarFootsteps(PlanarImitation):
     """A planar biped tracks a plan of footsteps; its single steps are the halves of a clip.
 
-    Observation blocks, in this order (N links; heading frame as for `Imitation`), N = 12: 69 numbers:
-      terrain, pose, velocity, phase: as for `Imitation`; the right foot stands while the phase is
+    Observation blocks, in this order (N links; heading frame as for `PlanarImitation`), N = 12: 69 numbers:
+      terrain, pose, velocity, phase: as for `PlanarImitation`; the right foot stands while the phase is
         below 0.5.
       contact: whether right and left foot touch the ground; 2.
       plan: as in three dimensions, where (x, y, z) stand for each place and y is 0: where the first
@@ -266,18 +281,9 @@ class PlanarFootsteps(Imitation):
         character: Character,
         arena: PlanarArena,
         clip: Clip,
+        config: PlanarFootstepsConfig = PlanarFootstepsConfig(),
         *,
         actuation_model: str = 'position',
-        plans: StraightPlans | Mapping[str, Any] | None = None,
-        max_landing_error: float | None = None,
-        footstep_scale: float = 1.0,
-        terrain_observation: int = 0,
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        spawn: str = 'intended',
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -286,32 +292,18 @@ class PlanarFootsteps(Imitation):
             attached to the arena.
           arena: where it moves.
           clip: a looping planar clip for this character, of two steps; the right foot stands first.
+          config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          plans: how plans are drawn; or keyword arguments of `StraightPlans`.
-          max_landing_error: an episode fails where a foot lands farther than this from its place, m.
-          footstep_scale: times the squared distance between swing foot and landing place in the
-            reward; more than 1 teaches accuracy sooner.
-          terrain_observation, substeps, action_offset, action_scale, start_phase, spawn, terrain_level: as for
-            `Imitation`.
 
         Raises:
-          ValueError: options out of range, a character without two feet, or a clip that does not fit
-            it; when the world is bound, a clip whose left foot stands first.
+          ValueError: options that do not fit each other, a character without two feet, or a clip that
+            does not fit it; when the world is bound, a clip whose left foot stands first.
         """
         check_feet(character.spec)
-        if max_landing_error is not None and not 0 < max_landing_error < np.inf:
-            raise ValueError(
-                f'max_landing_error is {max_landing_error}; expected a positive number of metres, or None'
-            )
-        if not 0 <= footstep_scale < np.inf:
-            raise ValueError(f'footstep_scale is {footstep_scale}; expected 0 or more')
-        self.plans = plans_from(StraightPlans, 'plans', {} if plans is None else plans)
-        self.max_landing_error, self._footstep_scale = max_landing_error, footstep_scale
-        super().__init__(
-            character, arena, clip, actuation_model=actuation_model,
-            terrain_observation=terrain_observation, substeps=substeps, action_offset=action_offset,
-            action_scale=action_scale, start_phase=start_phase, spawn=spawn, terrain_level=terrain_level,
-        )  # fmt: skip
+        super().__init__(character, arena, clip, config, actuation_model=actuation_model)
+        self.plans: StraightPlans = config.plans
+        self.max_landing_error = config.max_landing_error
+        self._footstep_scale = config.footstep_scale
 
     def bind(self, world: World) -> None:
         super().bind(world)

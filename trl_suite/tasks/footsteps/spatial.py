@@ -36,6 +36,7 @@ from trl_suite.tasks.components.footstep_plan import (
     RIGHT,
     SIDE,
     FootstepPlan,
+    check_two_feet,
     footstep_plan,
     observe_plan,
     plan_markers,
@@ -43,11 +44,18 @@ from trl_suite.tasks.components.footstep_plan import (
     update_stance,
 )
 from trl_suite.tasks.components.goals import GOAL_COLOUR, flag
-from trl_suite.tasks.components.plans import ROOT_TURN_LIMIT, Plans, Pushes, options
+from trl_suite.tasks.components.plans import (
+    FOOTSTEP_SCALE,
+    MAX_LANDING_ERROR,
+    ROOT_TURN_LIMIT,
+    Plans,
+    Pushes,
+    options,
+)
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.spatial_task import (
     CONTROL_TIMESTEP,
-    SUBSTEPS,
+    MirroredConfig,
     SpatialRules,
     SpatialTask,
     act_all,
@@ -59,6 +67,7 @@ from trl_suite.tasks.spatial_task import (
 )
 from trl_suite.tasks.task import Marker, conclude, consecutive
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
 
 NEAR_GOAL = 0.1  # m; nearer a goal gives no direction
 GOAL_REACHED = 1.0  # m; a goal is drawn anew there
@@ -234,7 +243,42 @@ def observe_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
         observe(i, rules)
 
 
-class Footsteps(SpatialTask):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialFootstepsConfig(MirroredConfig):
+    """Options of `SpatialFootsteps`."""
+
+    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
+    goal: bool = option(False, 'plans head for a goal on the terrain, one after the other')
+    pushes: Any = option(
+        None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
+    )
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    grace_period: float = option(
+        0.0, 'time after a push or a sharp turn in which no landing error ends the episode', unit='s',
+        at_least=0,
+    )  # fmt: skip
+    footstep_scale: float | Sequence[float] = option(
+        1.0, f'{FOOTSTEP_SCALE}; of several the mean of their rewards counts', at_least=0
+    )
+    heading_scale: float = option(
+        1.0, 'factor of the squared error of the heading in the reward', at_least=0
+    )
+    hidden_plan: bool = option(
+        False,
+        'observe bearing and distance of a goal that stays where it is instead of contact and plan, '
+        "which the reward is still about, as the original's 'Hard' environments do",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('plans', options(Plans, 'plans', self.plans or {}))
+        if self.pushes is not None:
+            self._set('pushes', options(Pushes, 'pushes', self.pushes))
+        if self.hidden_plan and self.mirrored:
+            raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+
+
+class SpatialFootsteps(SpatialTask):
     """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
@@ -260,23 +304,9 @@ class Footsteps(SpatialTask):
         character: Character,
         arena: SpatialArena,
         steps: Steps,
+        config: SpatialFootstepsConfig = SpatialFootstepsConfig(),
         *,
         actuation_model: str = 'position',
-        plans: Plans | Mapping[str, Any] | None = None,
-        goal: bool = False,
-        pushes: Pushes | Mapping[str, Any] | None = None,
-        max_landing_error: float | None = None,
-        grace_period: float = 0.0,
-        footstep_scale: float | Sequence[float] = 1.0,
-        heading_scale: float = 1.0,
-        terrain_observation: bool = False,
-        mirrored: bool = False,
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_level: float = 0.0,
-        hidden_plan: bool = False,
     ) -> None:
         """Composes the task.
 
@@ -284,58 +314,29 @@ class Footsteps(SpatialTask):
           character: a spatial biped without actuators; it is attached to the arena.
           arena: where it moves.
           steps: library of single steps of this character; the clock has the period of two.
+          config: the options; the middle of position control is the mean pose of a straight step.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          plans: how plans are drawn; or keyword arguments of `Plans`.
-          pushes: forces on the torso; or keyword arguments of `Pushes`. None without.
-          goal: plans head for a goal on the terrain instead, one after the other.
-          max_landing_error: an episode fails where a foot lands farther than this from its place, m. The original
-            meant to fail at 1 m and does not.
-          grace_period: s after a push or a sharp turn in which no foot misses its place.
-          footstep_scale: times the squared distance between swing foot and landing place in the
-            reward; more than 1 teaches accuracy sooner. Of several, the mean of their rewards counts:
-            a small one reaches far, a large one is accurate.
-          heading_scale: the same of the error of the heading.
-          terrain_observation, mirrored, substeps, action_offset, action_scale, start_phase, terrain_level: as for
-            `SpatialImitation`; the middle of position control is the mean pose of a straight step.
-          hidden_plan: observe bearing (rad) and distance (m) of a goal that stays where it is, in a
-            block goal, instead of contact and plan, which the reward is still about: what the
-            original's 'Hard' environments do.
 
         Raises:
-          ValueError: options out of range, or steps that do not fit the character.
+          ValueError: options that do not fit each other, or steps that do not fit the character.
         """
-        if len(character.spec.end_effectors) != 2:
-            raise ValueError(f'character {character.spec.name!r} has no two feet to place')
-        if max_landing_error is not None and not 0 < max_landing_error < np.inf:
-            raise ValueError(
-                f'max_landing_error is {max_landing_error}; expected a positive number of metres, or None'
-            )
-        if not 0 <= grace_period < np.inf:
-            raise ValueError(f'grace_period is {grace_period}; expected seconds, 0 or more')
-        for name, given in (('footstep_scale', footstep_scale), ('heading_scale', heading_scale)):
-            scales = np.atleast_1d(given)
-            if not len(scales) or not ((scales >= 0) & (scales < np.inf)).all():
-                raise ValueError(f'{name} is {given}; expected 0 or more')
-        self._footstep_scales = np.atleast_1d(footstep_scale).astype(float)
-        self._heading_scale = float(heading_scale)
-        self.plans = options(Plans, 'plans', {} if plans is None else plans)
-        self.pushes = None if pushes is None else options(Pushes, 'pushes', pushes)
+        check_two_feet(character.spec)
+        self._footstep_scales = np.atleast_1d(config.footstep_scale).astype(float)
+        self._heading_scale = float(config.heading_scale)
+        self.plans: Plans = config.plans
+        self.pushes: Pushes | None = config.pushes
         self.steps, self.period = steps, 2 * steps.duration
-        self.goal_given, self.hidden_plan = goal, hidden_plan
-        self.max_landing_error = max_landing_error
-        self._max_landing_error = np.inf if max_landing_error is None else float(max_landing_error)
-        self._grace_steps = round(grace_period / CONTROL_TIMESTEP)
+        self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
+        # The original meant to fail at 1 m and does not.
+        self.max_landing_error = config.max_landing_error
+        self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
         # The straight step of about the planned length, from which episodes start.
         self._first = straight_step(steps, float(np.mean(self.plans.length)))
-        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * hidden_plan}
+        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * config.hidden_plan}
         super().__init__(
-            character, arena, steps, actuation_model=actuation_model, substeps=substeps,
-            action_offset=action_offset, action_scale=action_scale, start_phase=start_phase, terrain_observation=terrain_observation,
-            mirrored=mirrored, terrain_level=terrain_level, extras=extras,
-        )  # fmt: skip
-        if hidden_plan:
-            if mirrored:
-                raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+            character, arena, steps, config, actuation_model=actuation_model, extras=extras
+        )
+        if config.hidden_plan:
             self._hide_plan()
 
     def _hide_plan(self) -> None:
@@ -375,7 +376,8 @@ class Footsteps(SpatialTask):
         rules = FootstepRules(
             common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
             starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
-            self._heading_scale, self._max_landing_error,
+            self._heading_scale,
+            np.inf if self.max_landing_error is None else float(self.max_landing_error),
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
@@ -430,7 +432,7 @@ class Footsteps(SpatialTask):
             aside[k] = state.width[i]
             if self.goal_given:
                 place = self.travel.origin[i, :2]
-                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
             sizes[k] = self._next_size(i), self._next_size(i)
         places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
         plan.heading[env_ids] = angles
@@ -449,7 +451,7 @@ class Footsteps(SpatialTask):
         if self.hidden_plan:
             for i in env_ids.tolist():
                 place = self.travel.origin[i, :2]
-                state.goal[i] = self.arena.goal(i, self._random[i], place, 'step')
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
 
     def _redraw_step(self, i: int, always: bool = False) -> None:
         """Draws length and width of the steps to come, perhaps."""
@@ -549,7 +551,7 @@ class Footsteps(SpatialTask):
             if self.goal_given:
                 root = found.root[i, :2]
                 if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
-                    self.goal[i] = self.arena.goal(i, random, root, 'step')
+                    self.goal[i] = self.arena.goal(i, random, root, 'near')
             elif plans.sharp and random.uniform() < plans.sharp:
                 turns[k] = random.uniform(-np.pi, np.pi)
                 self.state.excused[i] = self.clock.steps[i] + self._grace_steps

@@ -7,6 +7,7 @@ motion control' (Berseth et al. 2018).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -35,9 +36,13 @@ from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    SPAWNS,
+    START_PHASE,
+    TERRAIN_LEVEL,
     Outcome,
     Task,
     begin,
+    check_position_options,
     conclude,
     consecutive,
     drawn_seed,
@@ -47,8 +52,8 @@ from trl_suite.tasks.task import (
 )
 from trl_suite.terrain import PlanarGround
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import Config, option
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
@@ -251,7 +256,58 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
     return waiting
 
 
-class Imitation(Task):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarConfig(Config):
+    """Options of tasks that follow a clip in the plane."""
+
+    terrain_observation: int = option(
+        0,
+        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        at_least=0,
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    action_offset: str = option(
+        'clip',
+        "pose at action 0: the mean of the 'clip', the working 'posture', or the 'original' map, whose "
+        '[-1, 1] spans four times the joint range about its middle',
+        choices=ACTION_OFFSETS, actuation='position',
+    )  # fmt: skip
+    action_scale: float | None = option(
+        None,
+        'joint angle per unit action; by default 1.5',
+        unit='rad',
+        above=0,
+        actuation='position',
+    )
+    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
+    spawn: str = option(
+        'intended',
+        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
+        'original builds it',
+        choices=SPAWNS,
+    )  # fmt: skip
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.terrain_observation == 1:
+            raise ValueError('terrain_observation is 1; expected 0, or at least 2 heights')
+        start_phases(self.start_phase)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarImitationConfig(PlanarConfig):
+    """Options of `PlanarImitation`."""
+
+    reference_observation: bool = option(
+        False, "observe the reference's state instead of the phase"
+    )
+    muscle_set: str = option(
+        PLAIN, "'plain', or the motion that the muscles were optimised for", actuation='muscle'
+    )
+
+
+class PlanarImitation(Task):
     """A planar character tracks a looping clip over random terrain.
 
     Observation blocks, in this order (N links, J joints; heading frame: x is mirrored while the
@@ -274,17 +330,9 @@ class Imitation(Task):
         character: Character,
         arena: PlanarArena,
         clip: Clip,
+        config: PlanarConfig = PlanarImitationConfig(),
         *,
         actuation_model: str = 'position',
-        terrain_observation: int = 0,
-        reference_observation: bool = False,
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        muscle_set: str = PLAIN,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        spawn: str = 'intended',
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -292,49 +340,27 @@ class Imitation(Task):
           character: a planar character without actuators; it is attached to the arena.
           arena: where it moves.
           clip: a looping planar clip for this character.
+          config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_observation: heights observed on the line from 0.5 m behind to 3 m ahead; 0 is blind.
-          reference_observation: observe the reference's state instead of the phase.
-          substeps: physics steps per control step of 1/30 s.
-          action_offset: for position control, the pose at action 0: the mean pose of the 'clip', the
-            character's working 'posture', or the 'original' map, whose [-1, 1] spans four times the
-            joint range about its middle.
-          action_scale: for position control, rad per unit action (default 1.5).
-          muscle_set: for muscle control, 'plain' or the motion that the muscles were optimised for.
-          start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
-            drawn uniformly if None.
-          spawn: where the flat start lies: 'intended' (1 m to both sides of the start) or
-            'upstream' (where the original's construction puts it, depending on the start phase).
-          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
-          ValueError: options out of range, or a clip that does not fit the character.
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
         """
-        self._check(
-            character,
-            clip,
-            actuation_model,
-            action_offset,
-            action_scale,
-            substeps,
-            terrain_observation,
-        )
-        self.character, self.arena, self.clip = character, arena, clip
+        _check(character, clip, actuation_model, config)
+        self.character, self.arena, self.clip, self.config = character, arena, clip, config
         self.actuation_model = actuation_model
-        self._start_phase, self._spawn, self._terrain_level = (
-            start_phases(start_phase),
-            spawn,
-            terrain_level,
-        )
+        self._start_phase = start_phases(config.start_phase)
         self.figure = PlanarFigure(
-            character, arena, VIEW_BEHIND, VIEW_AHEAD, terrain_observation, 'contact' in self.EXTRAS
-        )
-        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
+            character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation,
+            'contact' in self.EXTRAS,
+        )  # fmt: skip
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
 
         options: dict[str, Any] = {}
         muscles: tuple[Muscle, ...] = ()
+        muscle_set = getattr(config, 'muscle_set', PLAIN)
         if actuation_model == 'position':
-            options = position_range(character, clip, action_offset, action_scale)
+            options = position_range(character, clip, config.action_offset, config.action_scale)
         elif actuation_model == 'muscle':
             options = {'muscle_set': muscle_set}
             muscles = actuation.character_muscles(character, muscle_set)
@@ -343,53 +369,17 @@ class Imitation(Task):
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
+        reference = 4 * len(character.spec.links) + 1
+        seen = getattr(config, 'reference_observation', False)
         self.blocks = consecutive({
             **self.figure.blocks,
             'strain': len(muscles),
-            'phase': 0 if reference_observation else 1 + PHASE_BINS,
-            'reference': 4 * len(character.spec.links) + 1 if reference_observation else 0,
+            'phase': 0 if seen else 1 + PHASE_BINS,
+            'reference': reference if seen else 0,
             **self.EXTRAS,
         })  # fmt: skip
         self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
         self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])
-
-    @staticmethod
-    def _check(
-        character: Character, clip: Clip, model: str, action_offset: str, action_scale: float | None,
-        substeps: int, terrain_observation: int,
-    ) -> None:  # fmt: skip
-        if tuple(clip.joints) != tuple(character.spec.joints) or clip.root != 'planar':
-            raise ValueError(
-                f'clip {clip.name!r} (root {clip.root}, joints {", ".join(clip.joints)}) does not '
-                f'fit character {character.spec.name!r}, whose root is planar and whose joints are '
-                f'{", ".join(character.spec.joints)}'
-            )
-        if not clip.loop:
-            raise ValueError(f'clip {clip.name!r} does not loop; an imitation task needs a cycle')
-        if action_offset not in ACTION_OFFSETS:
-            raise ValueError(
-                errors.unknown('action_offset of position control', action_offset, ACTION_OFFSETS)
-            )
-        if model != 'position' and (action_offset != 'clip' or action_scale is not None):
-            raise ValueError(
-                f'action_offset and action_scale shape position control, not {model} control'
-            )
-        if action_scale is not None and not 0 < action_scale < np.inf:
-            raise ValueError(
-                f'action_scale is {action_scale}; expected a positive number of radians'
-            )
-        if (
-            int(terrain_observation) != terrain_observation
-            or terrain_observation < 0
-            or terrain_observation == 1
-        ):
-            raise ValueError(
-                f'terrain_observation is {terrain_observation}; expected 0, or at least 2'
-            )
-        if int(substeps) != substeps or substeps < 4:
-            raise ValueError(
-                f'substeps is {substeps}; expected an integer of at least 4 (physics at 120 Hz)'
-            )
 
     @property
     def root_entity(self) -> PlanarArena:
@@ -454,12 +444,16 @@ class Imitation(Task):
             # Drawn even where it is not asked for, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
             phases[k] = self._start_phase(drawn)
-            if self._spawn == 'upstream':
+            if self.config.spawn == 'upstream':
                 # Where the original's segments meet: it builds them before it moves the root to 0.
                 centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
             seed = drawn_seed(random_state)
             strip = PlanarGround(
-                terrain, seed, terrain_level=self._terrain_level, spawn=self._spawn, centre=centre
+                terrain,
+                seed,
+                terrain_level=self.config.terrain_level,
+                spawn=self.config.spawn,
+                centre=centre,
             )
             self.arena.begin_episode(i, strip)
         for array in self.state:
@@ -518,10 +512,22 @@ class Imitation(Task):
         return pose
 
 
+def _check(character: Character, clip: Clip, model: str, config: PlanarConfig) -> None:
+    if tuple(clip.joints) != tuple(character.spec.joints) or clip.root != 'planar':
+        raise ValueError(
+            f'clip {clip.name!r} (root {clip.root}, joints {", ".join(clip.joints)}) does not '
+            f'fit character {character.spec.name!r}, whose root is planar and whose joints are '
+            f'{", ".join(character.spec.joints)}'
+        )
+    if not clip.loop:
+        raise ValueError(f'clip {clip.name!r} does not loop; an imitation task needs a cycle')
+    check_position_options(model, config.action_offset, config.action_scale)
+
+
 def position_range(
     character: Character, clip: Clip, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
-    """Centre and half range of position control, rad (see `Imitation`)."""
+    """Centre and half range of position control, rad (see `PlanarImitation`)."""
     if action_offset == 'original':
         ranges = np.array([
             joint.original_range or limits

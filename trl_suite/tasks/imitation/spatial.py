@@ -5,6 +5,7 @@ Source: the imitation scenario of the original, as for `trl_suite.tasks.imitatio
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from trl_suite.tasks.components.comparison import (
 )
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.spatial_task import (
-    SUBSTEPS,
+    MirroredConfig,
     SpatialRules,
     SpatialTask,
     act_all,
@@ -42,6 +43,7 @@ from trl_suite.tasks.spatial_task import (
 from trl_suite.tasks.task import conclude, drawn_seed
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
 
 GOAL_AHEAD = 3.0  # m along x; where the goal on the line through the start lies
 TYPICAL_POSES = 256  # of a cycle, whose mean is the middle of position control
@@ -139,6 +141,15 @@ def observe_all(env_ids: np.ndarray, rules: ImitationRules) -> None:
         observe(i, rules)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialImitationConfig(MirroredConfig):
+    """Options of `SpatialImitation`."""
+
+    reference_observation: bool = option(
+        False, "observe the reference's state instead of the phase"
+    )
+
+
 class SpatialImitation(SpatialTask):
     """A spatial character tracks a looping clip along +x, over random terrain.
 
@@ -167,16 +178,9 @@ class SpatialImitation(SpatialTask):
         character: Character,
         arena: SpatialArena,
         clip: Clip,
+        config: SpatialImitationConfig = SpatialImitationConfig(),
         *,
         actuation_model: str = 'position',
-        terrain_observation: bool = False,
-        reference_observation: bool = False,
-        mirrored: bool = False,
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -184,33 +188,19 @@ class SpatialImitation(SpatialTask):
           character: a spatial character without actuators; it is attached to the arena.
           arena: where it moves.
           clip: a looping clip for this character, with a free root.
+          config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_observation: observe the heights around.
-          reference_observation: observe the reference's state instead of the phase.
-          mirrored: observe and act as if the right foot always stood first.
-          substeps: physics steps per control step of 1/30 s.
-          action_offset: for position control, the pose at action 0: the mean pose of the 'clip', left and
-            right made alike, the character's working 'posture', or the 'original' map: an angle and
-            an axis for every ball joint, in the original's range.
-          action_scale: for position control, rad per unit action (1 about the clip, 1.5 about the
-            posture).
-          start_phase: phase of every start, in [0, 1), or pairs between whose numbers it is drawn;
-            drawn uniformly if None.
-          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
-          ValueError: options out of range, or a clip that does not fit the character.
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
         """
         check_cycle(clip)
         self.clip, self.period = clip, clip.duration
-        extras = {
-            'reference': 1 + 6 * len(character.spec.links) if reference_observation else 0,
-            'goal': 2,
-        }
+        seen = config.reference_observation
+        extras = {'reference': 1 + 6 * len(character.spec.links) if seen else 0, 'goal': 2}
         super().__init__(
-            character, arena, clip, actuation_model=actuation_model, substeps=substeps,
-            action_offset=action_offset, action_scale=action_scale, start_phase=start_phase, terrain_observation=terrain_observation,
-            mirrored=mirrored, terrain_level=terrain_level, phase=not reference_observation, extras=extras,
+            character, arena, clip, config, actuation_model=actuation_model, phase=not seen,
+            extras=extras,
         )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
@@ -238,7 +228,9 @@ class SpatialImitation(SpatialTask):
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
             ground = SpatialGround(
-                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
             )
             self.arena.begin_episode(i, ground)
         self._begin_clocks(env_ids)

@@ -6,9 +6,10 @@ were meant to have.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,11 +35,12 @@ from trl_suite.tasks.components.comparison import (
 from trl_suite.tasks.components.goals import Goals, flag, goals, set_goal
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.trace import Trace, follow, trace, trace_markers
-from trl_suite.tasks.footsteps.spatial import Footsteps
+from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
 from trl_suite.tasks.spatial_task import (
     CONTROL_TIMESTEP,
-    SUBSTEPS,
+    TERRAIN_MAPS,
+    SpatialConfig,
     SpatialRules,
     SpatialTask,
     act_all,
@@ -49,8 +51,8 @@ from trl_suite.tasks.spatial_task import (
     tick,
 )
 from trl_suite.tasks.task import Marker, conclude
-from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
 
 REWARDS = ('goal', 'original')
 GOAL_REACHED = 0.5  # m; of the root, on the ground
@@ -59,10 +61,10 @@ HIDDEN_LENGTH = 0.4  # m; of the steps of the plan that the original's reward is
 BALL_SHARE = 0.5  # of the reward, where there is a ball
 BALL_TERMS = {
     name: (BALL_SHARE * weight, scale)
-    for name, (weight, scale) in {**rewards.JOURNEY_TERMS, **ball.SOCCER_TERMS}.items()
+    for name, (weight, scale) in {**rewards.DIRECT_TERMS, **ball.SOCCER_TERMS}.items()
 }
 
-TERMS = len(rewards.JOURNEY_TERMS)
+TERMS = len(rewards.DIRECT_TERMS)
 POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING, PROXIMITY = range(TERMS)
 
 
@@ -72,7 +74,7 @@ class Progress(NamedTuple):
     speed: np.ndarray
 
 
-class JourneyRules(NamedTuple):
+class DirectRules(NamedTuple):
     """All that the rules of a journey work on.
 
     Attributes:
@@ -96,7 +98,7 @@ class JourneyRules(NamedTuple):
 
 
 @compiled
-def travel(i: int, rules: JourneyRules) -> bool:
+def travel(i: int, rules: DirectRules) -> bool:
     """Measures the body and looks at what was reached; returns whether anything is to be drawn."""
     common, goals, state = rules.common, rules.goals, rules.ball.state
     tick(i, common)
@@ -123,7 +125,7 @@ def travel(i: int, rules: JourneyRules) -> bool:
 
 
 @compiled
-def finish(i: int, rules: JourneyRules) -> None:
+def finish(i: int, rules: DirectRules) -> None:
     """Reward, failure and observation."""
     common = rules.common
     if common.outcome.diverged[i]:  # the last finite observation stands
@@ -137,7 +139,7 @@ def finish(i: int, rules: JourneyRules) -> None:
 
 
 @compiled
-def compare(i: int, rules: JourneyRules) -> None:
+def compare(i: int, rules: DirectRules) -> None:
     """Writes the reward terms: imitation on the way to the goal, or to the ball."""
     common, by, found = rules.common, rules.comparison, rules.common.found
     row, rest = moment(common.clock.phase[i], 0, by.tracks)
@@ -168,7 +170,7 @@ def compare(i: int, rules: JourneyRules) -> None:
 
 
 @compiled
-def observe(i: int, rules: JourneyRules) -> None:
+def observe(i: int, rules: DirectRules) -> None:
     """Writes the observation."""
     common, found = rules.common, rules.common.found
     observe_body(i, common)
@@ -189,7 +191,7 @@ def observe(i: int, rules: JourneyRules) -> None:
 
 
 @compiled_loop
-def travel_all(env_ids: np.ndarray, rules: JourneyRules) -> int:
+def travel_all(env_ids: np.ndarray, rules: DirectRules) -> int:
     """Looks at what was reached; returns for how many anything is to be drawn."""
     wanted = 0
     for i in env_ids:
@@ -198,14 +200,14 @@ def travel_all(env_ids: np.ndarray, rules: JourneyRules) -> int:
 
 
 @compiled_loop
-def finish_all(env_ids: np.ndarray, rules: JourneyRules) -> None:
+def finish_all(env_ids: np.ndarray, rules: DirectRules) -> None:
     """Finishes steps."""
     for i in env_ids:
         finish(i, rules)
 
 
 @compiled_loop
-def observe_all(env_ids: np.ndarray, fresh: bool, rules: JourneyRules) -> None:
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: DirectRules) -> None:
     """Observes, and compares as if a step had been taken; at their starts if they are fresh."""
     for i in env_ids:
         measure(i, rules.common)
@@ -215,11 +217,40 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: JourneyRules) -> None:
         observe(i, rules)
 
 
-class Journey(SpatialTask):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DirectConfig(SpatialConfig):
+    """Options of `DirectNavigation`."""
+
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=('height',))
+    goal_reached: float | None = option(
+        None,
+        f'distance at which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',
+        unit='m', above=0,
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DirectNavigationConfig(DirectConfig):
+    """Options of direct navigation without a ball, for either of its rewards."""
+
+    reward: str = option(
+        'goal',
+        f"'goal', or 'original': that of following a hidden plan of footsteps {HIDDEN_LENGTH:g} m long "
+        'towards a goal that stays where it is',
+        choices=REWARDS,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reward == 'original' and self.goal_reached is not None:
+            raise ValueError("goal_reached is an option of the reward 'goal', not of 'original'")
+
+
+class DirectNavigation(SpatialTask):
     """A spatial character imitates a clip on its way from goal to goal, or dribbles a ball to them.
 
     The reward is that of imitation, but that the clip's velocity is turned towards the goal, and
-    heading for the goal and nearness are rewarded too (`rewards.JOURNEY_TERMS`). With a ball, half of
+    heading for the goal and nearness are rewarded too (`rewards.DIRECT_TERMS`). With a ball, half of
     it is that of a journey to the ball, half that of dribbling (`ball.SOCCER_TERMS`).
 
     Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
@@ -233,16 +264,10 @@ class Journey(SpatialTask):
         character: Character,
         arena: SpatialArena,
         clip: Clip,
+        config: DirectConfig = DirectConfig(),
         ball: Ball | None = None,
         *,
         actuation_model: str = 'position',
-        terrain_observation: bool = True,
-        goal_reached: float = GOAL_REACHED,
-        substeps: int = SUBSTEPS,
-        action_offset: str = 'clip',
-        action_scale: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -250,27 +275,21 @@ class Journey(SpatialTask):
           character: a spatial character without actuators; it is attached to the arena.
           arena: where it moves.
           clip: a looping clip for this character, with a free root.
+          config: the options.
           ball: a ball of the arena that is to be dribbled.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_observation: observe the heights around.
-          goal_reached: m; nearer, a goal is drawn anew. With a ball: nearer, the ball is at the goal.
-          substeps, action_offset, action_scale, start_phase, terrain_level: as for `SpatialImitation`.
 
         Raises:
-          ValueError: options out of range, or a clip that does not fit the character.
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
         """
-        if not 0 < goal_reached < np.inf:
-            raise ValueError(
-                f'goal_reached is {goal_reached}; expected a positive number of metres'
-            )
         check_cycle(clip)
         self.clip, self.period, self.ball = clip, clip.duration, ball
-        self.TERMS = BALL_TERMS if ball else rewards.JOURNEY_TERMS
-        self._goal_reached = goal_reached
+        self.TERMS = BALL_TERMS if ball else rewards.DIRECT_TERMS
+        reached = config.goal_reached
+        self.goal_reached = GOAL_REACHED if reached is None else float(reached)
         super().__init__(
-            character, arena, clip, actuation_model=actuation_model, terrain_observation=terrain_observation,
-            substeps=substeps, action_offset=action_offset, action_scale=action_scale, start_phase=start_phase,
-            terrain_level=terrain_level, extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
+            character, arena, clip, config, actuation_model=actuation_model,
+            extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
         )  # fmt: skip
 
     def _typical_poses(self) -> np.ndarray:
@@ -290,12 +309,12 @@ class Journey(SpatialTask):
         balls = ball.no_ball(n)
         if self.ball:
             self.ball.bind(world)
-            balls = self.ball.rules(starts['ball'], ball.SPEED, float(self._goal_reached))
+            balls = self.ball.rules(starts['ball'], ball.SPEED, self.goal_reached)
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
-        rules = JourneyRules(
-            common, comparison(self.character, self.reference, rewards.JOURNEY_TERMS), self.goals,
-            self.progress, self.trace, starts['goal'], float(self._goal_reached),
+        rules = DirectRules(
+            common, comparison(self.character, self.reference, rewards.DIRECT_TERMS), self.goals,
+            self.progress, self.trace, starts['goal'], self.goal_reached,
             self.ball is not None, balls,
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
@@ -331,7 +350,7 @@ class Journey(SpatialTask):
         if self.ball:
             drawn = self.ball.goal(i, random)
         else:
-            drawn = self.arena.goal(i, random, place, 'step')
+            drawn = self.arena.goal(i, random, place, 'near')
         set_goal(i, drawn, self.clock.steps[i], random, self.goals)
 
     # A step.
@@ -366,51 +385,26 @@ class Journey(SpatialTask):
     def markers(self, env_id: int) -> list[Marker]:
         """Where the centre of mass has been, and the goal: of a ball as a disc on the ground."""
         goal = self.goal[env_id]
-        there = ball.goal_disc(goal, self._goal_reached) if self.ball else flag(goal)
+        there = ball.goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [*trace_markers(env_id, self.trace), there]
 
 
-def journey(
+def hidden_plan(
     character: Character,
     arena: SpatialArena,
-    clip: Clip,
-    steps: Steps | None,
-    *,
-    reward: str = 'goal',
-    actuation_model: str = 'position',
-    goal_reached: float | None = None,
-    terrain_observation: bool = True,
-    substeps: int = SUBSTEPS,
-    action_offset: str = 'clip',
-    action_scale: float | None = None,
-    start_phase: float | Sequence[Sequence[float]] | None = None,
-    terrain_level: float = 0.0,
-) -> Journey | Footsteps:
-    """Composes what one of the rewards is for.
+    steps: Steps,
+    config: DirectConfig,
+    actuation_model: str,
+) -> SpatialFootsteps:
+    """Composes what the reward 'original' is for.
 
-    Args:
-      reward: 'goal', see `Journey`; or 'original': that of following a hidden plan of footsteps 0.4 m
-        long, see `Footsteps`; its goal stays. In the original that plan begins at the world's origin,
-        mostly far away; here at the start.
-      goal_reached: m, 0.5 by default; only for 'goal'.
-      steps: only for 'original'.
-      character, arena, clip, and the other options: as for the classes.
-
-    Raises:
-      ValueError: options out of range, or that do not fit each other.
+    In the original the hidden plan begins at the world's origin, mostly far away; here at the start.
     """
-    options: dict[str, Any] = {
-        'actuation_model': actuation_model, 'terrain_observation': terrain_observation, 'substeps': substeps,
-        'action_offset': action_offset, 'action_scale': action_scale, 'start_phase': start_phase, 'terrain_level': terrain_level,
-    }  # fmt: skip
-    if reward not in REWARDS:
-        raise ValueError(errors.unknown('reward', reward, REWARDS))
-    if reward == 'goal':
-        reached = GOAL_REACHED if goal_reached is None else goal_reached
-        return Journey(character, arena, clip, goal_reached=reached, **options)
-    if goal_reached is not None:
-        raise ValueError("goal_reached is an option of the reward 'goal', not of 'original'")
-    if steps is None:
-        raise ValueError("the reward 'original' needs a library of steps")
-    plans = {'length': (HIDDEN_LENGTH,) * 2}
-    return Footsteps(character, arena, steps, plans=plans, hidden_plan=True, **options)
+    common = {
+        field.name: getattr(config, field.name) for field in dataclasses.fields(SpatialConfig)
+    }
+    return SpatialFootsteps(
+        character, arena, steps,
+        SpatialFootstepsConfig(plans={'length': (HIDDEN_LENGTH,) * 2}, hidden_plan=True, **common),
+        actuation_model=actuation_model,
+    )  # fmt: skip

@@ -6,6 +6,7 @@ deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ import numpy as np
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
-from trl_suite.controllers import footstep_controller as llc
+from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import polar, write_body, write_terrain
 from trl_suite.motion import Steps
@@ -38,6 +39,7 @@ from trl_suite.tasks.components.footstep_plan import (
     CONTACT_SIZE,
     PLAN_SIZE,
     FootstepPlan,
+    check_two_feet,
     footstep_plan,
     observe_plan,
     plan_markers,
@@ -51,15 +53,19 @@ from trl_suite.tasks.footsteps.spatial import TYPICAL_POSES, pose_of_step, strai
 from trl_suite.tasks.spatial_task import (
     CONTROL_TIMESTEP,
     SUBSTEPS,
+    TERRAIN_MAPS,
+    SpatialConfig,
     SpatialRules,
     SpatialTask,
     act_all,
     breaks_down,
+    maps,
     measure,
     observe_body,
     tick,
 )
 from trl_suite.tasks.task import (
+    TERRAIN_LEVEL,
     Marker,
     check_simulated,
     conclude,
@@ -70,11 +76,11 @@ from trl_suite.tasks.task import (
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
-from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import Config, option
 
 INTERFACES = ('plan', 'frame')
-SIGHTS = ('height', 'velocity')
+MAPS = ('height', 'velocity')
 # The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
 # m, and turn of the heading, rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
@@ -86,7 +92,7 @@ GOAL_REACHED = 1.0  # m; by default
 GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
 SPEED_SHARPNESS = 1.5
 UPRIGHT = 0.2  # reward for being on one's feet
-HIKE_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
+NAVIGATION_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
 CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
     0.9,
     1 / 11,
@@ -96,7 +102,7 @@ SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
 FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
 LONGEST = 60  # control steps of a step; the clock switches stance long before
 
-SPEED, ON_FEET = range(len(HIKE_TERMS))
+SPEED, ON_FEET = range(len(NAVIGATION_TERMS))
 
 
 class PlanningState(NamedTuple):
@@ -370,7 +376,62 @@ def observe_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
         observe(i, rules)
 
 
-class HighLevel(SpatialTask):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HierarchicalConfig(Config):
+    """Options of `HierarchicalNavigation`."""
+
+    controller: Any = option(
+        footstep_controller.DEFAULT,
+        'footstep controller: an id whose policy is shipped, a policy, its file, or a function',
+        policy=True,
+    )
+    interface: str = option(
+        'plan',
+        "'plan': a step is a footstep; 'frame': 1/30 s, and an action has the plan, then the joints' "
+        'targets; a plan takes effect only in a step that begins a footstep',
+        choices=INTERFACES,
+    )
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
+    step_length: float = option(
+        STEP_LENGTH, 'length of the steps that action 0 means', unit='m', above=0
+    )
+    target_speed: float = option(
+        1.0,
+        'speed of walker and ball towards the goal from which on the reward is full',
+        unit='m/s',
+        above=0,
+    )
+    goal_reached: float | None = option(
+        None,
+        f'distance at which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
+        f'{AT_GOAL:g}',
+        unit='m', above=0,
+    )  # fmt: skip
+    goal_distance: tuple[float, float] | None = option(
+        None,
+        'least and most distance from the walker, or the ball, at which goals are drawn, in any direction; '
+        'by default goals are where the terrain has them',
+        unit='m',
+    )
+    start_phases: Sequence[float] = option(
+        (0.1, 0.6), 'phases of the clock, one of which an episode starts with', at_least=0, below=1
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6)
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+        self._set('start_phases', tuple(self.start_phases))
+        if self.goal_distance is not None:
+            self._set('goal_distance', span('goal_distance', self.goal_distance, 'm'))
+            if self.goal_distance[1] > FARTHEST_GOAL:
+                raise ValueError(
+                    f'goal_distance is {self.goal_distance}; expected at most {FARTHEST_GOAL:g} m'
+                )
+
+
+class HierarchicalNavigation(SpatialTask):
     """A spatial biped goes from goal to goal, or dribbles a ball to them, by planning footsteps.
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
@@ -386,7 +447,7 @@ class HighLevel(SpatialTask):
       goal: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
         the ball.
       ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
-      low_level: what the footstep controller observes, with interface 'frame' only; see `Footsteps`.
+      low_level: what the footstep controller observes, with interface 'frame' only; see `SpatialFootsteps`.
 
     Attributes:
       watch: called at every 1/30 s of the first simulation, within steps too; for pictures.
@@ -400,18 +461,8 @@ class HighLevel(SpatialTask):
         character: Character,
         arena: SpatialArena,
         steps: Steps,
+        config: HierarchicalConfig = HierarchicalConfig(),
         ball: Ball | None = None,
-        *,
-        controller: Any = llc.DEFAULT,
-        interface: str = 'plan',
-        sight: Collection[str] = ('height',),
-        step_length: float = STEP_LENGTH,
-        target_speed: float = 1.0,
-        goal_reached: float | None = None,
-        goal_distance: tuple[float, float] | None = None,
-        start_phases: Sequence[float] = (0.1, 0.6),
-        substeps: int = SUBSTEPS,
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
@@ -419,66 +470,32 @@ class HighLevel(SpatialTask):
           character: a spatial biped without actuators; it is attached to the arena.
           arena: where it walks.
           steps: library of single steps of this character, for the first pose and the clock.
+          config: the options.
           ball: a ball of the arena that is to be dribbled; its ground must be level.
-          controller: the footstep controller: what `trl_suite.controllers.footstep_controller.load` takes.
-          interface: 'plan', or 'frame': a step is one control step of 1/30 s, and an action is the plan
-            followed by the joint action. A plan takes effect only in a step that begins a footstep.
-          sight: which maps are observed, of 'height' and 'velocity'.
-          step_length: of the steps that action 0 means, m.
-          target_speed: m/s towards the goal, of walker and ball, from which on the reward is full.
-          goal_reached: m; nearer, a goal is drawn anew, or the ball is at the goal. By default 1 m,
-            and 0.5 m of a ball.
-          goal_distance: m; the least and the most, up to 100, from the walker (with a ball: from the
-            ball), in any direction, at which goals are drawn: for open ground. By default they are
-            where the terrain has them.
-          start_phases: of the clock, one of which every episode starts with.
-          substeps: physics steps per 1/30 s.
-          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
-          ValueError: options out of range, or parts that do not fit each other.
+          ValueError: parts that do not fit each other.
         """
-        if interface not in INTERFACES:
-            raise ValueError(errors.unknown('interface', interface, INTERFACES))
-        sight = (sight,) if isinstance(sight, str) else tuple(sight)
-        for each in sight:
-            if each not in SIGHTS:
-                raise ValueError(errors.unknown('sight', each, SIGHTS))
-        if goal_reached is None:
-            goal_reached = AT_GOAL if ball else GOAL_REACHED
-        for name, value in (
-            ('step_length', step_length), ('target_speed', target_speed),
-            ('goal_reached', goal_reached),
-        ):  # fmt: skip
-            if not 0 < value < np.inf:
-                raise ValueError(f'{name} is {value}; expected a positive number')
-        if goal_distance is not None:
-            goal_distance = span('goal_distance', goal_distance, 'm')
-            if goal_distance[1] > FARTHEST_GOAL:
-                raise ValueError(
-                    f'goal_distance is {goal_distance}; expected at most {FARTHEST_GOAL:g} m'
-                )
-        if not len(start_phases) or not all(0 <= phase < 1 for phase in start_phases):
-            raise ValueError(f'start_phases is {start_phases}; expected numbers in [0, 1)')
-        if len(character.spec.end_effectors) != 2:
-            raise ValueError(f'character {character.spec.name!r} has no two feet to place')
+        check_two_feet(character.spec)
+        interface, step_length = config.interface, config.step_length
         self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
-        self.TERMS = SOCCER_TERMS if ball else HIKE_TERMS
+        self.TERMS = SOCCER_TERMS if ball else NAVIGATION_TERMS
         self._goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
         super().__init__(
-            character, arena, steps, substeps=substeps, terrain_level=terrain_level,
+            character, arena, steps, SpatialConfig(substeps=config.substeps),
             extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
         )  # fmt: skip
-        self.controller = llc.load(controller)
+        self.controller = footstep_controller.load(config.controller)
         self.controller.check(self)
         # A function of the user's is called by one thread, for all simulations that go on.
         self.in_parts = self.controller.policy is not None
-        self.interface, self.sight, self.step_length = interface, sight, step_length
-        self._target_speed, self._goal_reached = float(target_speed), float(goal_reached)
-        self._goal_distance = goal_distance
-        self._start_phases = tuple(start_phases)
-        self._frame = substeps
+        self.config, self.interface, self.step_length = config, interface, step_length
+        reached = config.goal_reached
+        self.goal_reached = (
+            (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
+        )
+        self._frame = config.substeps
         low = max(part.stop for part in self._full.values())
         action_offset, action_scale, names = step_length * PLAN_OFFSET, PLAN_SCALE, PLAN_NAMES
         if interface == 'frame':
@@ -487,14 +504,14 @@ class HighLevel(SpatialTask):
             action_offset = np.concatenate([action_offset, np.zeros(len(joints))])
             action_scale = np.concatenate([action_scale, np.ones(len(joints))])
         else:
-            self.set_timesteps(steps.duration, CONTROL_TIMESTEP / substeps)
+            self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
         self.action_map = ActionMap(
             names, 'footstep plan', 'm (turn: rad)', action_offset, action_scale
         )
         pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
         self.blocks = consecutive({
-            'terrain': SAMPLES**2 if 'height' in sight else 0,
-            'surface': 2 * SAMPLES**2 if 'velocity' in sight else 0,
+            'terrain': SAMPLES**2 if 'height' in config.terrain_observation else 0,
+            'surface': 2 * SAMPLES**2 if 'velocity' in config.terrain_observation else 0,
             **pose,
             **{name: len(signs) for name, signs in self._goal_signs.items()},
             'low_level': low if interface == 'frame' else 0,
@@ -544,7 +561,9 @@ class HighLevel(SpatialTask):
         balls = no_ball(n)
         if self.ball:
             self.ball.bind(world)
-            balls = self.ball.rules(starts['ball'], self._target_speed, self._goal_reached)
+            balls = self.ball.rules(
+                starts['ball'], float(self.config.target_speed), self.goal_reached
+            )
             self.saved = (*self.saved, self.ball.state)
             self.info_arrays['at_goal'] = self.ball.state.at_goal
         low = self._full
@@ -553,8 +572,8 @@ class HighLevel(SpatialTask):
             common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
             contact=low['contact'].start, plan_block=low['plan'].start,
             by_plan=self.interface == 'plan', plan_offset=self.action_map.action_offset,
-            plan_scale=self.action_map.action_scale, target_speed=self._target_speed,
-            goal_reached=self._goal_reached, with_ball=self.ball is not None, ball=balls,
+            plan_scale=self.action_map.action_scale, target_speed=float(self.config.target_speed),
+            goal_reached=self.goal_reached, with_ball=self.ball is not None, ball=balls,
             **{name: starts.get(name, -1) for name in names},
         )  # fmt: skip
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
@@ -590,10 +609,12 @@ class HighLevel(SpatialTask):
         spawns = np.zeros((len(env_ids), 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             ground = SpatialGround(
-                self.arena.terrain, drawn_seed(random_state), terrain_level=self._terrain_level
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
             )
             random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
-            self.clock.start[i] = random.choice(self._start_phases)
+            self.clock.start[i] = random.choice(self.config.start_phases)
             spawns[k] = ground.spawn(random)
             self.arena.begin_episode(i, ground, spawns[k, :2])
         self._begin_clocks(env_ids)
@@ -627,7 +648,7 @@ class HighLevel(SpatialTask):
         self._draw_goal(i, place)
 
     def _draw_goal(self, i: int, place: np.ndarray) -> None:
-        random, away = self._random[i], self._goal_distance
+        random, away = self._random[i], self.config.goal_distance
         if self.ball:
             goal = self.ball.goal(i, random, away or GOAL_AWAY)
         elif away is None:
@@ -708,7 +729,7 @@ class HighLevel(SpatialTask):
     def markers(self, env_id: int) -> list[Marker]:
         """The plan, where the centre of mass has been, and the goal: of a ball as a disc."""
         root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
-        there = goal_disc(goal, self._goal_reached) if self.ball else flag(goal)
+        there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [
             *plan_markers(env_id, root, self.plan), *trace_markers(env_id, self.trace), there,
         ]  # fmt: skip

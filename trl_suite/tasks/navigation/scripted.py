@@ -13,7 +13,7 @@ import numpy as np
 
 from trl_suite.tasks.components.footstep_plan import SIDE
 from trl_suite.tasks.composed import Composed
-from trl_suite.tasks.navigation.hierarchical import PLAN_NAMES, HighLevel
+from trl_suite.tasks.navigation.hierarchical import PLAN_NAMES, HierarchicalNavigation
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
@@ -48,9 +48,9 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     task = environments.task
     if isinstance(task, Composed):
         task = task.task
-    if not isinstance(task, HighLevel):
+    if not isinstance(task, HierarchicalNavigation):
         raise ValueError(
-            f'the task {type(task).__name__} has no scripted policy; hikes and soccer have'
+            f'the task {type(task).__name__} has no scripted policy; goal navigation and soccer have'
         )
     if task.interface != 'plan':
         raise ValueError(

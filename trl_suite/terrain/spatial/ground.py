@@ -22,7 +22,7 @@ START_ROOM = 1.0  # m; half side of the square that must be clear about a start
 GOAL_SPREAD = 3.0  # m
 TRIES = 1000  # places drawn before the origin is taken
 FAR_APART, AREA = 1e3, 1e5  # m, m^2; points spread more widely are looked at one by one
-RULES = ('hike', 'step')
+RULES = ('far', 'near')
 
 Random = np.random.Generator | np.random.RandomState
 
@@ -219,14 +219,14 @@ class SpatialGround:
         self,
         random: Random,
         root: npt.ArrayLike,
-        rule: str = 'hike',
+        rule: str = 'far',
         *,
         distance: float = 1.0,
         movers: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draws a goal on the ground.
 
-        By the layout's place: about the character (`hike`: within 3 m along x and along y; `step`:
+        By the layout's place: about the character (`far`: within 3 m along x and along y; `near`:
         from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a start; or on the
         trail, 1 to 10 segments of 2 m beyond the one nearest to the character (`step`: 1).
 
@@ -250,7 +250,7 @@ class SpatialGround:
         if layout.place == 'trail':
             trail = layout.trail
             assert trail is not None
-            ahead = 1 + int(random.uniform() * (10 if rule == 'hike' else 1))
+            ahead = 1 + int(random.uniform() * (10 if rule == 'far' else 1))
             middle = 0.5 * (trail.start + trail.end)
             nearest = int(np.linalg.norm(middle - root, axis=1).argmin())
             k = nearest + ahead
@@ -265,7 +265,7 @@ class SpatialGround:
             x, y, found = self._clear(random, layout.goal_room, movers)
             if found and layout.grid is None and layout.level is not None:
                 return np.array([x, y, layout.level])
-        elif rule == 'hike':
+        elif rule == 'far':
             x, y = root + [random.uniform(-GOAL_SPREAD, GOAL_SPREAD) for _ in range(2)]
         else:
             x, y = root[0] + random.uniform(distance, GOAL_SPREAD), 0.0

@@ -79,16 +79,16 @@ def markdown_table(table: Table, plain: bool = False) -> str:
       table: what to write.
       plain: whether cells are Markdown already, as links are.
     """
-    header, env_ids = list(table.header), [[_cell(c) for c in row] for row in table.cells]
+    header, rows = list(table.header), [[_cell(c) for c in row] for row in table.cells]
     if table.numbered:
-        header, env_ids = (
+        header, rows = (
             ['index', *header],
-            [[str(i), *env_id] for i, env_id in enumerate(env_ids)],
+            [[str(i), *row] for i, row in enumerate(rows)],
         )
-    right = _numeric(list(zip(header, *env_ids, strict=True)))
+    right = _numeric(list(zip(header, *rows, strict=True)))
     if not plain:
-        env_ids = [list(map(escape, row)) for row in env_ids]
-    lines = [header, ['--:' if to_right else '---' for to_right in right], *env_ids]
+        rows = [list(map(escape, row)) for row in rows]
+    lines = [header, ['--:' if to_right else '---' for to_right in right], *rows]
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 

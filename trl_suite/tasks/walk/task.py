@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,10 +36,13 @@ from trl_suite.kinematics.spatial import (
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.imitation.planar import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
+from trl_suite.tasks.spatial_task import TERRAIN_MAPS, maps
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    TERRAIN_LEVEL,
     Outcome,
     Task,
+    check_position_options,
     conclude,
     consecutive,
     drawn_seed,
@@ -50,6 +54,7 @@ from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import Config, option
 
 SAMPLES = 50  # heights on the line that a planar character sees
 FROUDE = 0.25  # speed^2 / (gravity * height of the root) of a full reward
@@ -209,13 +214,47 @@ def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> i
     return 0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WalkConfig(Config):
+    """Options of `Walk`."""
+
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    action_scale: float | None = option(
+        None, 'joint angle per unit action about the working posture; by default 1.5',
+        unit='rad', above=0, actuation='position',
+    )  # fmt: skip
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarWalkConfig(WalkConfig):
+    """Options of a planar walk."""
+
+    terrain_observation: int = option(
+        0,
+        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        at_least=0,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialWalkConfig(WalkConfig):
+    """Options of a walk in three dimensions."""
+
+    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+
+
 class Walk(Task):
     """A character, planar or spatial, stands in its working posture on random terrain.
 
     It fails when a fall link touches the ground. It has no reward of its own: `suite.build` adds
     `WALK`, or the user's `rewards`. So may a subclass, after `super().finish_step`.
 
-    Observation blocks, in this order: terrain (if seen), pose and velocity as in `Imitation` and
+    Observation blocks, in this order: terrain (if seen), pose and velocity as in `PlanarImitation` and
     `SpatialImitation`; of a spatial character
       target_heading: cosine and sine of the bearing of the way it is to go, that of its start; 2.
 
@@ -227,47 +266,40 @@ class Walk(Task):
         self,
         character: Character,
         arena: PlanarArena | SpatialArena,
+        config: PlanarWalkConfig | SpatialWalkConfig,
         *,
         actuation_model: str = 'position',
-        terrain_observation: bool = False,
-        substeps: int = SUBSTEPS,
-        action_scale: float | None = None,
-        terrain_level: float = 0.0,
     ) -> None:
         """Composes the task.
 
         Args:
           character: without actuators; it is attached to the arena.
           arena: where it moves, of as many dimensions.
+          config: the options, planar or spatial as the character is.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
-          terrain_observation: observe the ground: 50 heights from 0.5 m behind to 3 m ahead, or the 32 x 32
-            map of a spatial character.
-          substeps: physics steps per control step of 1/30 s.
-          action_scale: for position control, rad per unit action about the working posture.
-          terrain_level: which mixture of the terrain's parameter sets to draw from.
 
         Raises:
-          ValueError: options out of range.
+          ValueError: options that do not fit each other.
         """
-        if int(substeps) != substeps or substeps < 4:
-            raise ValueError(f'substeps is {substeps}; expected an integer of at least 4')
-        self.character, self.arena = character, arena
-        self._terrain_level, self._spatial = terrain_level, character.spec.spatial
-        self.terrain_observation = terrain_observation and self._spatial
+        self.character, self.arena, self.config = character, arena, config
+        self._spatial = character.spec.spatial
         self.figure: Any
         if isinstance(arena, SpatialArena):
-            self.figure = SpatialFigure(character, arena, terrain_observation)
+            assert isinstance(config, SpatialWalkConfig)
+            self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
             self.fields = SpatialFigure.fields
         else:
-            samples = SAMPLES if terrain_observation else 0
-            self.figure = PlanarFigure(character, arena, VIEW_BEHIND, VIEW_AHEAD, samples)
-        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
-        options = {} if action_scale is None else {'action_scale': action_scale}
-        if options and actuation_model != 'position':
-            raise ValueError(f'action_scale shapes position control, not {actuation_model} control')
+            assert isinstance(config, PlanarWalkConfig)
+            self.figure = PlanarFigure(
+                character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation
+            )
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
+        check_position_options(actuation_model, 'clip', config.action_scale)
+        scale = config.action_scale
         self.action_map = actuation.add(
-            character, actuation_model, self.physics_timestep, **options
-        )
+            character, actuation_model, self.physics_timestep,
+            **({} if scale is None else {'action_scale': scale}),
+        )  # fmt: skip
         self.blocks = consecutive({**self.figure.blocks, 'target_heading': 2 * self._spatial})
 
     @property
@@ -357,12 +389,12 @@ class Walk(Task):
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             seed = drawn_seed(random_state)
             if isinstance(self.arena, SpatialArena):
-                ground = SpatialGround(terrain, seed, terrain_level=self._terrain_level)
+                ground = SpatialGround(terrain, seed, terrain_level=self.config.terrain_level)
                 spawns[k] = ground.spawn(random_state)
                 self.arena.begin_episode(i, ground, spawns[k, :2])
             else:
                 self.arena.begin_episode(
-                    i, PlanarGround(terrain, seed, terrain_level=self._terrain_level)
+                    i, PlanarGround(terrain, seed, terrain_level=self.config.terrain_level)
                 )
         if self._spatial:
             self.figure.place(env_ids, poses, rates, spawns)

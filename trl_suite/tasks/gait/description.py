@@ -1,17 +1,21 @@
-"""Gait state machines, whose parameters an action sets once per cycle."""
+"""Gait state machines in words and tables."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.describe.common import Meanings, floats
-from trl_suite.describe.layout import Section, Table, section
-from trl_suite.environments.environment import Environment
-from trl_suite.registry import catalogue
-from trl_suite.tasks import gait
+from trl_suite.tasks.components import description
+from trl_suite.tasks.components.description import Meanings, floats
+from trl_suite.tasks.gait import task as gait
+from trl_suite.tasks.task_type import Description
+from trl_suite.util.tables import Section, Table, section
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
 
 _BLOCKS = {
     'terrain': (
@@ -89,11 +93,6 @@ def before(task: Any) -> Iterator[Section]:
     )
 
 
-def after(task: Any) -> Iterator[Section]:
-    """Yields what comes after the observation."""
-    yield from ()
-
-
 def action(environment: Environment) -> Section:
     """Returns what the actions set."""
     task: Any = environment.task
@@ -131,7 +130,7 @@ def _effect(task: Any, parameter: str) -> str:
     return _EFFECTS.get(own, 'a target')
 
 
-def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
+def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     """Yields reward and termination."""
     figure, parameters = task.character.spec, task.gait.parameters
     weights = parameters.reward
@@ -150,9 +149,11 @@ def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
         lines.append('0 if v is negative')
     yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
     links = ', '.join(figure.fall_links)
+    share = gait.FALL_THRESHOLD, gait.CONTACT_DECAY, gait.CONTACT_GAIN
     ends = [
         f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
-        f'{looks_until_fall(gait)} looks in a row, or so often that {running_share(gait)}',
+        f'{description.samples_until_fall(*share)} samples in a row, or so often that '
+        f'{description.contact_share(*share)}',
         f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
         f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
         'the physics diverges',
@@ -160,28 +161,12 @@ def rules(spec: catalogue.EnvSpec, task: Any) -> Iterator[Section]:
     if parameters.forward_only:
         ends.insert(2, 'it moves backwards')
     yield section(
-        f'Termination (discount 0), looked at every {gait.SAMPLE:g} s',
+        f'Termination (discount 0), sampled every {gait.SAMPLE:g} s',
         '\n'.join(f'- {end}' for end in ends),
     )
 
 
-def running_share(rule: Any) -> str:
-    """Returns when links have been seen on the ground too often, from a module with the rule."""
-    return (
-        f'd > {rule.FALL_THRESHOLD:g}: with every look d becomes {rule.CONTACT_DECAY:g} d, and 1/{1 / rule.CONTACT_GAIN:.0f} '
-        'more if one touches'
-    )
-
-
-def looks_until_fall(rule: Any) -> int:
-    """Returns how often in a row a link must be seen on the ground, from a module with the rule."""
-    down, count = 0.0, 0
-    while down <= rule.FALL_THRESHOLD:
-        down, count = rule.CONTACT_DECAY * down + rule.CONTACT_GAIN, count + 1
-    return count
-
-
-def time(spec: catalogue.EnvSpec, task: Any) -> Section:
+def time(spec: EnvSpec, task: Any) -> Section:
     """Returns rates, and how long a step and an episode are."""
     control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
     step = f'one cycle, at most {gait.LONGEST_CYCLE * gait.FRAME:.3g} s'
@@ -192,3 +177,15 @@ def time(spec: catalogue.EnvSpec, task: Any) -> Section:
         f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
         f'(discount 1) after {spec.step_limit} steps',
     )
+
+
+def joints(task: Any) -> tuple[str, list[object]]:
+    """Returns what the target of each joint is relative to."""
+    hips = task.gait.hips
+    joints = task.character.spec.joints
+    return 'target is to', ['the world' if joint in hips else 'its parent' for joint in joints]
+
+
+GAIT = Description(
+    blocks=blocks, rules=rules, before=before, action=action, time=time, joints=joints
+)

@@ -7,6 +7,7 @@ the environment's discount is 0 after a fall and 1 otherwise.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -30,6 +31,8 @@ from trl_suite.kinematics.planar import (
 )
 from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.task import (
+    SPAWNS,
+    TERRAIN_LEVEL,
     Outcome,
     Task,
     begin,
@@ -42,8 +45,8 @@ from trl_suite.tasks.task import (
 )
 from trl_suite.terrain import PlanarGround
 from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util import errors
 from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import Config, option
 
 SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m
 SUBSTEPS = 2  # physics steps per control step: 1/1200 s
@@ -385,6 +388,33 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
     return waiting
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaitConfig(Config):
+    """Options of `GaitTask`."""
+
+    interface: str = option(
+        'parameters',
+        "'parameters': a step is a cycle, and an action sets the gait's parameters, 0 the default and +-1 "
+        "the largest deviation of any base action; 'base_action': a step is 1/30 s, and an action is one "
+        'preference per base action, of which the largest counts when the next cycle begins',
+        choices=INTERFACES,
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1)
+    spawn: str = option(
+        'intended',
+        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
+        'original builds it',
+        choices=SPAWNS,
+    )
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+    start_noise: float = option(
+        0.0,
+        'standard deviation of what is added to joint angles at the start; ten times that to their rates '
+        'and to the speed (m/s)',
+        unit='rad', at_least=0,
+    )  # fmt: skip
+
+
 class GaitTask(Task):
     """Travel at the target speed by setting a gait's parameters.
 
@@ -408,43 +438,24 @@ class GaitTask(Task):
         self,
         character: Character,
         arena: PlanarArena,
-        *,
-        interface: str = 'parameters',
-        substeps: int = SUBSTEPS,
-        spawn: str = 'intended',
-        terrain_level: float = 0.0,
-        start_noise: float = 0.0,
+        config: GaitConfig = GaitConfig(),
     ) -> None:
         """Attaches character and gait to an arena.
 
         Args:
           character: one with a gait, see `trl_suite.controllers.available`.
           arena: planar terrain.
-          interface: 'parameters': a step is a cycle, and an action sets the gait's parameters, 0 the
-            default and +-1 the largest deviation of any base action. 'base_action': a step is 1/30
-            s, and an action is one preference per base action, of which the largest counts when
-            the next cycle begins.
-          substeps: physics steps per control step of 1/600 s.
-          spawn: where the ground begins, see `trl_suite.terrain.PlanarGround`.
-          terrain_level: which of the terrain's parameter sets.
-          start_noise: standard deviation that is added to the joints' angles (rad) at the start,
-            and ten times that to their rates and to the speed (m/s).
+          config: the options.
 
         Raises:
-          ValueError: no gait drives the character, or an option makes no sense.
+          ValueError: no gait drives the character.
         """
-        if interface not in INTERFACES:
-            raise ValueError(errors.unknown('interface', interface, INTERFACES))
-        if int(substeps) != substeps or substeps < 1:
-            raise ValueError(f'substeps is {substeps}; expected a positive integer')
-        if not 0 <= start_noise < np.inf:
-            raise ValueError(f'start_noise is {start_noise}; expected 0 or a positive number')
-        self.character, self.arena, self.interface = character, arena, interface
+        self.character, self.arena, self.config = character, arena, config
+        self.interface = interface = config.interface
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
         self.gait = Gait(character, arena.ground_body, arena.mjcf_model)
-        self._spawn, self._terrain_level, self._noise = spawn, terrain_level, float(start_noise)
-        self._control_substeps = int(substeps)
-        timestep = CONTROL_TIMESTEP / substeps
+        self._control_substeps = int(config.substeps)
+        timestep = CONTROL_TIMESTEP / config.substeps
         self.set_timesteps(FRAME, timestep)
         actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned without
@@ -578,16 +589,16 @@ class GaitTask(Task):
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         poses, rates, extents = (np.repeat(part, len(env_ids), axis=0) for part in self._start)
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            noise = self._noise * random_state.standard_normal((2, poses.shape[1] - 3))
-            push = self._noise * random_state.standard_normal()
+            noise = self.config.start_noise * random_state.standard_normal((2, poses.shape[1] - 3))
+            push = self.config.start_noise * random_state.standard_normal()
             poses[k, 3:] += noise[0]
             rates[k, 3:] += 10 * noise[1]
             rates[k, 0] += 10 * push
             strip = PlanarGround(
                 self.arena.terrain,
                 drawn_seed(random_state),
-                terrain_level=self._terrain_level,
-                spawn=self._spawn,
+                terrain_level=self.config.terrain_level,
+                spawn=self.config.spawn,
                 centre=UPSTREAM_CENTRE,
             )
             self.arena.begin_episode(i, strip)
