@@ -26,7 +26,7 @@ from helpers import (
 
 from trl_suite import evaluation, policies, rendering, suite
 from trl_suite.controllers import footstep_controller
-from trl_suite.tasks.navigation import scripted
+from trl_suite.tasks.navigation import hierarchical, scripted
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'
@@ -37,6 +37,10 @@ IDS = [id_ for id_ in suite.ALL_IDS if id_.startswith(PREFIX)]
 PLANE = dataclasses.replace(suite.find(FOREST), terrain='plane')  # to go from goal to goal
 STILL = 0.8 * np.exp(-1.5) + 0.2  # what standing still earns
 AHEAD = np.zeros(5)  # two steps of half a metre, straight on
+
+
+def shipped_controller():
+    return footstep_controller.load(policies.reference(hierarchical.CONTROLLER))
 
 
 def started(id_=FOREST, **options):
@@ -194,7 +198,7 @@ class PlanTest(parameterized.TestCase):
             found.append((observation.copy(), feet, heading, task.phase[0]))
             return default(observation)
 
-        default = footstep_controller.load()
+        default = shipped_controller()
         environment, _ = started(SOCCER, controller=controller)
         task = environment.task
         for step in range(2):
@@ -676,7 +680,10 @@ class FrameTest(parameterized.TestCase):
         options = {'start_phases': (0.1,), 'random': 3}
         plan, first = started(id_, **options)
         frame, begun = started(id_, interface='frame', **options)
-        controller, rng = footstep_controller.load(), np.random.default_rng(0)
+        controller, rng = (
+            shipped_controller(),
+            np.random.default_rng(0),
+        )
         for name, value in first.observation.items():
             np.testing.assert_array_equal(begun.observation[name], value)
         for i in range(4):
@@ -734,19 +741,19 @@ class ControllerTest(FolderTest):
         return environment.physics.data.qpos.copy()
 
     def test_all_ways_to_name_it(self):
-        shipped = policies.reference(footstep_controller.DEFAULT)
+        shipped = policies.reference(hierarchical.CONTROLLER)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
         expected = self.positions()
         for source in (
-            footstep_controller.DEFAULT, 'deeploco/llc_general_step', path, str(path), shipped, footstep_controller.load(),
+            hierarchical.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
             lambda observation: shipped(observation),
         ):  # fmt: skip
             with self.subTest(source=str(source)):
                 np.testing.assert_array_equal(self.positions(controller=source), expected)
         self.assertIsNone(footstep_controller.load(idle).policy)
         self.assertIsNotNone(footstep_controller.load(path).policy)
-        controller = footstep_controller.load()
+        controller = shipped_controller()
         self.assertIs(footstep_controller.load(controller), controller)
 
     def test_one_of_ones_own(self):
@@ -803,14 +810,10 @@ class ControllerTest(FolderTest):
         np.testing.assert_array_equal(ones, far)
 
     def test_unknown(self):
-        with self.assertRaisesRegex(ValueError, f"did you mean '{llc.DEFAULT}'"):
+        with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical.CONTROLLER}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
-        with self.assertRaisesRegex(FileNotFoundError, footstep_controller.DEFAULT):
-            footstep_controller.load('PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
-            footstep_controller.load(
-                'FSM_Goat2D_Terrain_Cliffs-v0'
-            )  # gaits of the goat are not trained
+            started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0')  # nobody trained the goat
         with self.assertRaises(FileNotFoundError):
             footstep_controller.load(self.folder / 'none.npz')
         (self.folder / 'broken.npz').write_bytes(b'no')
@@ -831,7 +834,7 @@ class ControllerTest(FolderTest):
             started(PLANE, controller=policy)
 
     def test_another_body_is_a_warning(self):
-        shipped = policies.reference(footstep_controller.DEFAULT)
+        shipped = policies.reference(hierarchical.CONTROLLER)
         with warnings.catch_warnings():
             warnings.simplefilter('error')
             started(PLANE)  # no warning

@@ -3,8 +3,8 @@
 from trl_suite import policies
 from trl_suite.controllers import footstep_controller
 
-controller = footstep_controller.load(policies.reference('PD_Biped3D_LLC_General_Step-v0'))
-controller = footstep_controller.load('mine.npz')  # or what `trl_suite.policies.save` wrote
+controller = footstep_controller.load(policies.load('mine.npz'))
+controller = footstep_controller.load('mine.npz')  # the same
 controller = footstep_controller.load(lambda observation: my_network(observation))  # or any function
 
 A controller takes the observations of `trl_suite.tasks.footsteps.spatial.SpatialFootsteps`, (n, 125) without a
@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 
 from trl_suite import characters, policies
-
-DEFAULT = 'PD_Biped3D_LLC_General_Step-v0'  # whose reference policy is taken
 
 Function = Callable[[np.ndarray], Any]
 

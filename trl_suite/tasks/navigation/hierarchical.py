@@ -79,6 +79,7 @@ from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import Config, option
 
+CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # whose shipped policy places the feet by default
 INTERFACES = ('plan', 'frame')
 MAPS = ('height', 'velocity')
 # The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
@@ -381,7 +382,7 @@ class HierarchicalConfig(Config):
     """Options of `HierarchicalNavigation`."""
 
     controller: Any = option(
-        footstep_controller.DEFAULT,
+        CONTROLLER,
         'footstep controller: an id whose policy is shipped, a policy, its file, or a function',
         policy=True,
     )
