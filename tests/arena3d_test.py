@@ -10,6 +10,7 @@ from dm_control import composer, mjcf
 from trl_suite import terrain
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
+from trl_suite.terrain.spatial import generators
 
 TIMESTEP = 1 / 300  # s
 SUBSTEPS = 10
@@ -189,7 +190,7 @@ class GeometryTest(parameterized.TestCase):
                 ),
             )  # fmt: skip
 
-        self.addCleanup(terrain.spatial._generators.pop, 'turned3d')
+        self.addCleanup(generators._generators.pop, 'turned3d')
         for seed in range(4):
             stage = Stage({'Type': 'turned3d'}, (seed,))
             x, y = np.random.default_rng(seed).uniform(-13, 13, (2, 600))
@@ -210,7 +211,7 @@ class GeometryTest(parameterized.TestCase):
         def steep(parameters, rng):
             return terrain.Layout(level=None, grid=lambda i, j: np.add.outer(i, 0 * j) * 0.5)
 
-        self.addCleanup(terrain.spatial._generators.pop, 'steep3d')
+        self.addCleanup(generators._generators.pop, 'steep3d')
         with self.assertRaisesRegex(ValueError, 'steep3d.*rises.*40 m'):
             Stage({'Type': 'steep3d'})
 

@@ -531,7 +531,7 @@ class CycleTest(parameterized.TestCase):
     def test_a_plain_composer_environment_is_refused(self):
         environment = composer.Environment(suite.build_task(suite.find(DOG)), random_state=0)
         environment.reset()
-        with self.assertRaisesRegex(RuntimeError, r'trl_suite\.environment\.Environment'):
+        with self.assertRaisesRegex(RuntimeError, r'environments\.environment\.Environment'):
             environment.step(np.zeros(29))
 
 

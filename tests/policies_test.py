@@ -363,7 +363,7 @@ class FileTest(FolderTest):
         again = policies.load(self.folder / 'p.npz')
         for name in files._OPTIONAL:
             np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
-            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+            self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(9, None)
     def test_convolutions_come_back(self, origin):
@@ -379,7 +379,7 @@ class FileTest(FolderTest):
         policies.save(again, self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
         for name in (*files._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
-            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+            self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(
         ({'line': None}, "'line': is missing"),
@@ -408,7 +408,7 @@ class FileTest(FolderTest):
         with np.load(self.folder / 'p.npz', allow_pickle=False) as data:
             arrays = dict(data)
         for name in files._FIELDS:
-            self.assertRegex(policies.__doc__, rf'\n    (\w+, )?{name}\b')
+            self.assertRegex(files.__doc__, rf'\n    (\w+, )?{name}\b')
         self.assertCountEqual(
             arrays,
             {*files._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},

@@ -14,7 +14,7 @@ from dm_control import composer
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.rendering import frames as drawing
+from trl_suite.rendering import drawing
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -449,7 +449,7 @@ class MissingPartsTest(FolderTest):
         program = f"""
 import numpy as np
 from trl_suite import rendering, suite
-from trl_suite.rendering import frames as drawing
+from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 environment.step(np.zeros(11))
@@ -471,7 +471,7 @@ except RuntimeError as error:
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite
-from trl_suite.rendering import frames as drawing
+from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 print(rendering.frame(environment).std() > 10)

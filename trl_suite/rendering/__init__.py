@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from trl_suite.rendering.frames import frame, frames, markers, no_gl, watching
+from trl_suite.rendering.drawing import frame, frames, markers, no_gl, watching
 from trl_suite.rendering.pictures import (
     CONTROL_FPS,
     IMAGE_SUFFIXES,
@@ -17,7 +17,7 @@ from trl_suite.rendering.pictures import (
 )
 
 if TYPE_CHECKING:
-    from trl_suite.rendering.frames import Policy as Policy
+    from trl_suite.rendering.drawing import Policy as Policy
 
 __all__ = [
     'CONTROL_FPS', 'IMAGE_SUFFIXES', 'STRIP_MARGIN', 'VIDEO_SUFFIXES', 'Video', 'film_strip', 'frame',

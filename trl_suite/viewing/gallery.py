@@ -10,7 +10,6 @@ that it shows has been replaced.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import fnmatch
@@ -20,7 +19,6 @@ import io
 import itertools
 import json
 import pathlib
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -365,13 +363,3 @@ def _source(path: pathlib.Path) -> str:
         kept = image.info.get('comment', '')
         return kept.decode() if isinstance(kept, bytes) else kept
     return ''
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Makes pictures, and returns 1 if any failed."""
-    written, failed = make(arguments.output, arguments.filter, arguments.overwrite)
-    for path, error in failed.items():
-        print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
-    noun = 'picture' if len(written) == 1 else 'pictures'
-    print(f'{len(written)} {noun} written to {arguments.output}, {len(failed)} failed')
-    return int(bool(failed))
