@@ -19,7 +19,7 @@ from trl_suite import policies
 from trl_suite.cli import bench
 from trl_suite.controllers import footstep_controller
 from trl_suite.registry import catalogue
-from trl_suite.tasks.navigation import hierarchical
+from trl_suite.tasks.navigation import hierarchical_rules
 from trl_suite.vector import VectorEnvironment
 
 HALF_RANGE = 0.1  # of the random plans about action 0, straight on
@@ -40,8 +40,8 @@ def measured(environments, act, frames, seconds):
 
 def footsteps(num_envs, seconds):
     """The footstep environment, driven by the shipped controller."""
-    controller = footstep_controller.load(policies.reference(hierarchical.CONTROLLER))
-    environments = VectorEnvironment(hierarchical.CONTROLLER, num_envs, 1, 0)
+    controller = footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
+    environments = VectorEnvironment(hierarchical_rules.CONTROLLER, num_envs, 1, 0)
     return measured(
         environments, lambda o: np.clip(controller(o), -1, 1), lambda e: num_envs, seconds
     )
@@ -65,7 +65,7 @@ def main():
     parser.add_argument('--seconds', type=float, default=4.0, help='per measurement')
     arguments = parser.parse_args()
     base = footsteps(arguments.num_envs, arguments.seconds)
-    print(f'{hierarchical.CONTROLLER}: {1e6 * base:.0f} us')
+    print(f'{hierarchical_rules.CONTROLLER}: {1e6 * base:.0f} us')
     for id_ in arguments.ids:
         cost = high_level(id_, arguments.num_envs, arguments.seconds)
         print(f'{id_}: {cost / base:.2f} times as much', flush=True)

@@ -23,8 +23,8 @@ import numpy as np
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.navigation.scripted import scripted
-from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
 from trl_suite.util import errors, files, resources
 from trl_suite.vector import VectorEnvironment
 

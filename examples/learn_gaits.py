@@ -34,7 +34,7 @@ import tqdm
 from torch import nn
 
 from trl_suite import characters, evaluation, policies
-from trl_suite.tasks.gait import task as gait
+from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
@@ -176,7 +176,7 @@ class Learner:
         environments = self.environments
         parameters = environments.task.gait.parameters
         self.choices = parameters.action(parameters.base_actions)
-        ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+        ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
         self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]

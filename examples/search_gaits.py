@@ -30,7 +30,7 @@ import torch
 import tqdm
 
 from trl_suite import characters, evaluation, policies
-from trl_suite.tasks.gait import task as gait
+from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
@@ -112,7 +112,7 @@ class Search:
 
 def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
     """Which columns of an observation are no ground, or not too far ahead."""
-    ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+    ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
     seen = np.ones(max(part.stop for part in blocks.values()), bool)
     seen[blocks['terrain']] = ahead <= view
     return np.flatnonzero(seen)

@@ -32,7 +32,8 @@ import numpy as np
 
 from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
 from trl_suite.registry.catalogue import EnvSpec
-from trl_suite.tasks.gait.task import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
+from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE, SUBSTEPS
+from trl_suite.tasks.gait.task import GaitTask
 from trl_suite.util import errors
 from trl_suite.vector import VectorEnvironment
 

@@ -26,7 +26,7 @@ from helpers import (
 
 from trl_suite import evaluation, policies, rendering, suite
 from trl_suite.controllers import footstep_controller
-from trl_suite.tasks.navigation import hierarchical, scripted
+from trl_suite.tasks.navigation import hierarchical_rules, scripted
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'
@@ -40,7 +40,7 @@ AHEAD = np.zeros(5)  # two steps of half a metre, straight on
 
 
 def shipped_controller():
-    return footstep_controller.load(policies.reference(hierarchical.CONTROLLER))
+    return footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
 
 
 def started(id_=FOREST, **options):
@@ -741,12 +741,12 @@ class ControllerTest(FolderTest):
         return environment.physics.data.qpos.copy()
 
     def test_all_ways_to_name_it(self):
-        shipped = policies.reference(hierarchical.CONTROLLER)
+        shipped = policies.reference(hierarchical_rules.CONTROLLER)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
         expected = self.positions()
         for source in (
-            hierarchical.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
+            hierarchical_rules.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
             lambda observation: shipped(observation),
         ):  # fmt: skip
             with self.subTest(source=str(source)):
@@ -810,7 +810,7 @@ class ControllerTest(FolderTest):
         np.testing.assert_array_equal(ones, far)
 
     def test_unknown(self):
-        with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical.CONTROLLER}'"):
+        with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical_rules.CONTROLLER}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
             started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0')  # nobody trained the goat
@@ -834,7 +834,7 @@ class ControllerTest(FolderTest):
             started(PLANE, controller=policy)
 
     def test_another_body_is_a_warning(self):
-        shipped = policies.reference(hierarchical.CONTROLLER)
+        shipped = policies.reference(hierarchical_rules.CONTROLLER)
         with warnings.catch_warnings():
             warnings.simplefilter('error')
             started(PLANE)  # no warning

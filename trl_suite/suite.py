@@ -232,5 +232,5 @@ def build_environment(
         spec, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
     )
     environment = Environment(task, **options)
-    environment._recipe = (build_environment, (spec, task_kwargs, environment_kwargs))
+    environment.recipe = (build_environment, (spec, task_kwargs, environment_kwargs))
     return environment

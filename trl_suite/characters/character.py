@@ -118,7 +118,8 @@ class CharacterSpec:
         return raw / raw.sum()
 
     @functools.cached_property
-    def _fingerprint(self) -> str:
+    def digest(self) -> str:
+        """See `fingerprint`."""
         return _digest(self)  # it compiles the character
 
 
@@ -288,7 +289,7 @@ def fingerprint(spec: CharacterSpec) -> str:
 
     Looks do not count, nor does how the MJCF is written. Found once for every row.
     """
-    return spec._fingerprint
+    return spec.digest
 
 
 def _digest(spec: CharacterSpec) -> str:

@@ -64,7 +64,7 @@ class Environment(composer.Environment):
         self._flat_observation = flat_observation
         self._step_limit = step_limit
         self._steps = 0
-        self._recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
+        self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
             time_limit=time_limit,
@@ -245,12 +245,12 @@ class Environment(composer.Environment):
         return self._observe()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        if self._recipe is None:
+        if self.recipe is None:
             raise TypeError(
                 'this environment was not made by trl_suite.suite, so nothing tells how to build '
                 'it again; pickle env.get_state() instead'
             )
-        build, arguments = self._recipe
+        build, arguments = self.recipe
         return build, arguments, self.get_state()
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -182,7 +182,7 @@ class VectorEnvironment:
         if seed is not None:
             self.seed(seed, numbers)
         self._fresh = False
-        self._share(self._begin, numbers)
+        self.share(self.begin, numbers)
         return self._observation()
 
     def step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None = None) -> Step:
@@ -213,7 +213,7 @@ class VectorEnvironment:
 
         def work(part: np.ndarray) -> None:
             over = np.isin(part, resetting)
-            self._begin(part[over])
+            self.begin(part[over])
             task.step(action, part[~over])
             # A slice of neighbours is copied faster than a choice of simulations.
             near = len(part) and part[-1] - part[0] == len(part) - 1
@@ -221,7 +221,7 @@ class VectorEnvironment:
             observation[env_ids] = task.observation[env_ids]
 
         observation = np.empty(task.observation.shape, self.dtype)
-        self._share(work, asked)
+        self.share(work, asked)
         self._steps[env_ids] += 1
         reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
         if len(env_ids) < self.num_envs:
@@ -240,7 +240,7 @@ class VectorEnvironment:
             info['ended'] = ended.copy()
             if ended.any():
                 info['final_observation'] = self._observation()
-                self._share(self._begin, ended.nonzero()[0])
+                self.share(self.begin, ended.nonzero()[0])
                 observation = task.observation.astype(self.dtype)
         if len(asked) < self.num_envs:
             observation = task.observation.astype(self.dtype)
@@ -375,7 +375,7 @@ class VectorEnvironment:
             'get_state(), and build it again where it is needed'
         )
 
-    def _share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
+    def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
         """Has the threads do some work, each for a part of the simulations."""
         assert self._world is not None
         if self._task.in_parts:
@@ -383,7 +383,8 @@ class VectorEnvironment:
         else:
             work(env_ids)
 
-    def _begin(self, env_ids: np.ndarray) -> None:
+    def begin(self, env_ids: np.ndarray) -> None:
+        """Begins episodes in some simulations; `reset` checks its arguments and observes as well."""
         if not len(env_ids):
             return
         self._task.reset(env_ids, [self._random[env_id] for env_id in env_ids.tolist()])

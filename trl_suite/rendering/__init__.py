@@ -1,8 +1,6 @@
 """Pictures without a screen: frames, videos, film strips, plots of terrain, height maps."""
 
-from typing import TYPE_CHECKING
-
-from trl_suite.rendering.drawing import frame, frames, markers, no_gl, watching
+from trl_suite.rendering.drawing import Policy, frame, frames, markers, no_gl, watching
 from trl_suite.rendering.pictures import (
     CONTROL_FPS,
     IMAGE_SUFFIXES,
@@ -16,10 +14,21 @@ from trl_suite.rendering.pictures import (
     video,
 )
 
-if TYPE_CHECKING:
-    from trl_suite.rendering.drawing import Policy as Policy
-
 __all__ = [
-    'CONTROL_FPS', 'IMAGE_SUFFIXES', 'STRIP_MARGIN', 'VIDEO_SUFFIXES', 'Video', 'film_strip', 'frame',
-    'frames', 'height_map', 'markers', 'no_gl', 'plot_terrain', 'spread', 'video', 'watching',
+    'CONTROL_FPS',
+    'IMAGE_SUFFIXES',
+    'STRIP_MARGIN',
+    'VIDEO_SUFFIXES',
+    'Policy',
+    'Video',
+    'film_strip',
+    'frame',
+    'frames',
+    'height_map',
+    'markers',
+    'no_gl',
+    'plot_terrain',
+    'spread',
+    'video',
+    'watching',
 ]  # fmt: skip

@@ -30,11 +30,10 @@ import numpy as np
 from trl_suite.util import errors
 
 if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
-    import dm_env
     from dm_control import composer
 
-    Policy = Callable[[dm_env.TimeStep], np.ndarray]
 
+Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
 GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
 GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
 

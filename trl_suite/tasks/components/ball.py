@@ -14,7 +14,7 @@ from trl_suite.arenas import SpatialArena
 from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
 from trl_suite.tasks.components.goals import GOAL_COLOUR
-from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.task import Marker, drawn_way
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline

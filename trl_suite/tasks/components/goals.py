@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.task import Marker
 
 GOAL_LASTS = (50.0, 100.0)  # s until a goal that was not reached is drawn anew

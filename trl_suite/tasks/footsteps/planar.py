@@ -24,7 +24,7 @@ from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.footstep_plan import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
 from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
 from trl_suite.tasks.components.plans import options as plans_from
-from trl_suite.tasks.imitation import planar as imitation
+from trl_suite.tasks.imitation import planar_rules as imitation_rules
 from trl_suite.tasks.imitation.planar import PlanarConfig, PlanarImitation
 from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
 from trl_suite.terrain.planar import windows as planar_ground
@@ -84,10 +84,10 @@ class Options(NamedTuple):
 
 
 @compiled
-def finish_step(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Landing, reward, failure and observation, after the physics has advanced."""
-    imitation.advance_clock(i, rules.clip, rules.state)
-    diverged = imitation.breaks_down(i, rules)
+    imitation_rules.advance_clock(i, rules.clip, rules.state)
+    diverged = imitation_rules.breaks_down(i, rules)
     missed = land(i, diverged, rules, plan, options)
     if diverged:
         conclude(i, True, rules.outcome)
@@ -99,7 +99,7 @@ def finish_step(i: int, rules: imitation.Rules, plan: Plan, options: Options) ->
 
 
 @compiled
-def read_clock(i: int, rules: imitation.Rules) -> int:
+def read_clock(i: int, rules: imitation_rules.Rules) -> int:
     """Writes the phase; returns which foot stands by it."""
     cycles = np.rint(rules.state.cycles[i] * _DIGITS) / _DIGITS
     rules.state.phase[i] = cycles % 1.0
@@ -108,7 +108,7 @@ def read_clock(i: int, rules: imitation.Rules) -> int:
 
 @compiled
 def land(
-    i: int, diverged: bool, rules: imitation.Rules, plan: Plan, options: Options
+    i: int, diverged: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> bool:  # fmt: skip
     """At a switch of stance, looks where the foot has landed and plans on; whether it has missed."""
     stance = read_clock(i, rules)
@@ -134,7 +134,7 @@ def next_length(i: int, plan: Plan, options: Options) -> float:
 
 
 @compiled
-def put_on_ground(i: int, rules: imitation.Rules, plan: Plan) -> None:
+def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
     """Gives the landing places the heights of the ground; notes where the plan was made."""
     for which in range(2):
         x = plan.landing[i, which, 0]
@@ -144,9 +144,9 @@ def put_on_ground(i: int, rules: imitation.Rules, plan: Plan) -> None:
 
 
 @compiled
-def compare(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Writes the reward terms; in the second half of a step the plan replaces the clip."""
-    imitation.compare(i, rules)
+    imitation_rules.compare(i, rules)
     layout, found, terms = rules.layout, rules.found, rules.outcome.reward_terms
     phase, swing = rules.state.phase[i], 1 - plan.stance[i]
     twice = 2 * phase
@@ -171,9 +171,9 @@ def compare(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> Non
 
 
 @compiled
-def observe(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Writes the blocks behind velocity: muscles, phase, contacts, and the plan."""
-    imitation.observe(i, rules)
+    imitation_rules.observe(i, rules)
     observation, body, physics = rules.outcome.observation, rules.body, rules.physics
     for k in range(len(body.contact)):
         touches = physics.sensordata[i, body.contact[k]] > 0.0
@@ -189,7 +189,7 @@ def observe(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> Non
 
 
 @compiled
-def draw_plan(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+def draw_plan(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Draws the first plan of an episode."""
     plan.stance[i] = read_clock(i, rules)
     plan.landing_error[i], plan.landed[i] = 0.0, False
@@ -204,14 +204,18 @@ def draw_plan(i: int, rules: imitation.Rules, plan: Plan, options: Options) -> N
 
 
 @compiled_loop
-def draw_plans(env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options) -> None:
+def draw_plans(
+    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> None:
     """Draws the first plans of some simulations."""
     for i in env_ids:
         draw_plan(i, rules, plan, options)
 
 
 @compiled_loop
-def finish_steps(env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, options: Options) -> int:
+def finish_steps(
+    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> int:
     """Finishes the steps of all that can be measured; returns how many have to wait."""
     waiting = 0
     for i in env_ids:
@@ -225,7 +229,7 @@ def finish_steps(env_ids: np.ndarray, rules: imitation.Rules, plan: Plan, option
 
 @compiled_loop
 def observe_all(
-    env_ids: np.ndarray, fresh: bool, rules: imitation.Rules, plan: Plan, options: Options
+    env_ids: np.ndarray, fresh: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> int:
     """Observes all that can be measured, at their starts if they are; returns how many wait."""
     waiting = 0

@@ -9,6 +9,7 @@ import numpy as np
 
 from trl_suite.tasks.components import description
 from trl_suite.tasks.components.description import Meanings, floats
+from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.tasks.gait import task as gait
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
@@ -136,11 +137,11 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     weights = parameters.reward
     weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
     lines = [
-        f'{weight}exp(-{gait.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
+        f'{weight}exp(-{gait_rules.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
         'v: mean forward speed of the centre of mass, m/s',
     ]
     if weights['stumble']:
-        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait.STUMBLE_SHARPNESS:g} s)'
+        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait_rules.STUMBLE_SHARPNESS:g} s)'
         lines.append(
             's: share of the time in which a link other than '
             f'{", ".join(figure.stumble_exempt)} touches the ground'
@@ -149,19 +150,19 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
         lines.append('0 if v is negative')
     yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
     links = ', '.join(figure.fall_links)
-    share = gait.FALL_THRESHOLD, gait.CONTACT_DECAY, gait.CONTACT_GAIN
+    share = gait_rules.FALL_THRESHOLD, gait_rules.CONTACT_DECAY, gait_rules.CONTACT_GAIN
     ends = [
         f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
         f'{description.samples_until_fall(*share)} samples in a row, or so often that '
         f'{description.contact_share(*share)}',
-        f'the root is turned by more than {np.degrees(gait.TURNED):.0f} degrees',
-        f'it has moved less than {gait.PROGRESS:g} m in {gait.PATIENCE:g} s',
+        f'the root is turned by more than {np.degrees(gait_rules.TURNED):.0f} degrees',
+        f'it has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
         'the physics diverges',
     ]
     if parameters.forward_only:
         ends.insert(2, 'it moves backwards')
     yield section(
-        f'Termination (discount 0), sampled every {gait.SAMPLE:g} s',
+        f'Termination (discount 0), sampled every {gait_rules.SAMPLE:g} s',
         '\n'.join(f'- {end}' for end in ends),
     )
 
@@ -169,9 +170,9 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
 def time(spec: EnvSpec, task: Any) -> Section:
     """Returns rates, and how long a step and an episode are."""
     control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
-    step = f'one cycle, at most {gait.LONGEST_CYCLE * gait.FRAME:.3g} s'
+    step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * gait_rules.FRAME:.3g} s'
     if task.interface == 'base_action':
-        step = f'{gait.FRAME:.3g} s'
+        step = f'{gait_rules.FRAME:.3g} s'
     return section(
         'Time',
         f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'

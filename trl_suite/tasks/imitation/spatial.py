@@ -29,10 +29,8 @@ from trl_suite.tasks.components.comparison import (
     term,
 )
 from trl_suite.tasks.components.reflection import Reflection
-from trl_suite.tasks.spatial_task import (
-    MirroredConfig,
+from trl_suite.tasks.components.spatial_rules import (
     SpatialRules,
-    SpatialTask,
     act_all,
     breaks_down,
     measure,
@@ -40,6 +38,7 @@ from trl_suite.tasks.spatial_task import (
     publish,
     tick,
 )
+from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
 from trl_suite.tasks.task import conclude, drawn_seed
 from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from trl_suite.tasks.components import ball, description, spatial_description
 from trl_suite.tasks.components.description import REWARD, Meanings, floats, tracking_terms
 from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
-from trl_suite.tasks.navigation import direct, hierarchical
+from trl_suite.tasks.navigation import direct, direct_rules, hierarchical_rules
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, Table, section
 
@@ -62,7 +62,7 @@ def action(environment: Environment) -> Section:
     )
 
 
-def hierarchical_rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
+def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
     """Yields controller, goal, reward and termination."""
     yield section(
         'Footstep controller',
@@ -75,7 +75,7 @@ def hierarchical_rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     else:
         yield spatial_description.goal(spec, task, 'far')
         formulas = [
-            f'exp(-{hierarchical.SPEED_SHARPNESS:g} min(0, v - {task.config.target_speed:g})^2), v: speed of the '
+            f'exp(-{hierarchical_rules.SPEED_SHARPNESS:g} min(0, v - {task.config.target_speed:g})^2), v: speed of the '
             'centre of mass towards the goal, m/s',
             '1',
         ]
@@ -91,8 +91,12 @@ def hierarchical_rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
         ),
         full,
     )
-    every = hierarchical.SAMPLE_FRAMES / 30
-    share = hierarchical.FALL_THRESHOLD, hierarchical.CONTACT_DECAY, hierarchical.CONTACT_GAIN
+    every = hierarchical_rules.SAMPLE_FRAMES / 30
+    share = (
+        hierarchical_rules.FALL_THRESHOLD,
+        hierarchical_rules.CONTACT_DECAY,
+        hierarchical_rules.CONTACT_GAIN,
+    )
     yield section(
         f'Termination (discount 0), sampled every {every:g} s',
         f'one of {", ".join(task.character.spec.fall_links)} touches the ground in '
@@ -112,7 +116,7 @@ def time(spec: EnvSpec, task: Any) -> Section:
     )
 
 
-def direct_rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
+def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
     """Yields clip, start, goal, reward and termination."""
     if not isinstance(task, direct.DirectNavigation):  # the original's reward, of a hidden plan
         yield from spatial_rules(spec, task)
@@ -129,7 +133,7 @@ def direct_rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
 
 
 def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
-    near = f'{direct.NEAR:g} m'
+    near = f'{direct_rules.NEAR:g} m'
     yield tracking_terms(task, False, proximity=f'distance to the {where} over {near}')
     yield (
         'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and the direction of '
@@ -150,11 +154,11 @@ def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
 
 
 DIRECT = Description(
-    blocks=spatial_description.blocks, rules=direct_rules, after=spatial_description.after,
+    blocks=spatial_description.blocks, rules=about_joints, after=spatial_description.after,
     legend=_BEADS,
 )  # fmt: skip
 HIERARCHICAL = Description(
-    blocks=blocks, rules=hierarchical_rules, after=spatial_description.after, action=action,
+    blocks=blocks, rules=about_plans, after=spatial_description.after, action=action,
     time=time, joints=lambda task: ('', [''] * len(task.character.spec.joints)),
     legend=LEGEND + _BEADS,
 )  # fmt: skip

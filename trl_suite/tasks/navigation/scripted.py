@@ -13,7 +13,8 @@ import numpy as np
 
 from trl_suite.tasks.components.footstep_plan import SIDE
 from trl_suite.tasks.composed import Composed
-from trl_suite.tasks.navigation.hierarchical import PLAN_NAMES, HierarchicalNavigation
+from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
+from trl_suite.tasks.navigation.hierarchical_rules import PLAN_NAMES
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
