@@ -186,7 +186,7 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +a target\n')
         self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
         self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
-        self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+looks')
+        self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+samples')
         self.assertIn('turned by more than 144 degrees', out)
         self.assertIn('less than 0.5 m in 5 s', out)
         self.assertRegex(out, 'one cycle, at most 1.67 s; control 600 Hz, physics 1200 Hz;.*cut\n'
@@ -281,7 +281,7 @@ class InfoTest(CommandTest):
             out, r'\nGoal\n  drawn up to 12 m .* nothing stands or moves\s+within 0\.25 m;\s'
         )
         self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
-        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+looks')
+        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+samples')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
         out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')

@@ -206,7 +206,7 @@ class ShimmyTest(parameterized.TestCase):
 @needs('ray', 'rllib')
 class RLlibTest(absltest.TestCase):
     def test_configuration(self):
-        configuration = load('rllib_ppo').configuration(GAPS, runners=3, env_ids=8, seed=7)
+        configuration = load('rllib_ppo').configuration(GAPS, runners=3, num_envs=8, seed=7)
         configuration.validate()
         self.assertEqual(configuration.total_train_batch_size, 3 * 8 * 32)
 
@@ -219,7 +219,7 @@ class RLlibTest(absltest.TestCase):
         ray.cloudpickle.register_pickle_by_value(example)
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level='ERROR')
         self.addCleanup(ray.shutdown)
-        algorithm = example.configuration(FLAT, runners=2, env_ids=16, seed=7).build_algo()
+        algorithm = example.configuration(FLAT, runners=2, num_envs=16, seed=7).build_algo()
         self.addCleanup(algorithm.stop)
         for updates in range(1, 4):
             found = algorithm.train()

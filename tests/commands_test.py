@@ -113,7 +113,9 @@ class BenchTest(CommandTest):
             'bench', 'plaid/dog_gaps', '--num-envs', '3', '--threads', '1', '--seconds', '0.05',
             '--json', 'bench.json',
         )  # fmt: skip
-        self.assertStartsWith(out, 'PD_Dog2D_Gaps_Terrain-v0, 3 rows, 1 threads, random actions\n')
+        self.assertStartsWith(
+            out, 'PD_Dog2D_Gaps_Terrain-v0, 3 simulations, 1 threads, random actions\n'
+        )
         found = json.loads(pathlib.Path('bench.json').read_text())
         self.assertIn(found['machine'], out)
         self.assertIn(f'mujoco {machine.version("mujoco")}', found['machine'])

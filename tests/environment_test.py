@@ -81,7 +81,7 @@ def expected_blocks(id_):
         if ground in ('DynamicsObstacles', 'Conveyors', 'Conveyors_Wide'):
             sizes = {'surface': 2048}
         ball = {'ball': 9} if ground == 'Soccer' else {}
-        return sizes | {'pose': 57, 'velocity': 48, 'target': 2} | ball
+        return sizes | {'pose': 57, 'velocity': 48, 'goal': 2} | ball
     if figure == 'Biped3D':
         links = 16 if 'FULL' in id_ else 8
         sizes = {'terrain': 1024} if '_Terrain-' in id_ else {}
@@ -94,7 +94,7 @@ def expected_blocks(id_):
             )
         if '_Imitate' in id_ and 'FULL' not in id_:
             track = 'Track' in id_
-            return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
+            return sizes | ({'reference': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
         mirrored = 'Symetric' in id_
         return sizes | {'phase': 3 if mirrored else 5, 'contact': 2, 'plan': 7 if mirrored else 13}
     if suite.find(id_).task_type == 'planar_footsteps':
@@ -107,7 +107,7 @@ def expected_blocks(id_):
     sizes |= {'pose': 2 * links + 1, 'velocity': 2 * links}
     if id_.startswith('MTU'):
         sizes['strain'] = units
-    return sizes | ({'target': 4 * links + 1} if 'LLC' in id_ else {'phase': 5})
+    return sizes | ({'reference': 4 * links + 1} if 'LLC' in id_ else {'phase': 5})
 
 
 def random_actions(environment, steps, seed=0):

@@ -833,7 +833,7 @@ class HelperTest(parameterized.TestCase):
         ({'footstep_scale': (1, np.inf)}, r'footstep_scale is \(1, inf'),
         ({'heading_scale': -1}, 'heading_scale is -1'),
         ({'start_phase': 1}, 'start_phase is 1'), ({'substeps': 5}, 'substeps is 5'),
-        ({'action_offset': 'mean'}, "unknown action_offset of position control 'mean'"),
+        ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
         ({'action_scale': -1}, 'action_scale is -1'),
         ({'reference_observation': True}, "unknown option.*'reference_observation'"),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.components import rewards
-from trl_suite.tasks.imitation.planar import PlanarImitation
+from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
@@ -110,12 +110,12 @@ class Reference:
 
     def __init__(self, environment):
         task = environment.task
-        options = {'reference_observation': True} if task.actuation_model == 'muscle' else {}
+        config = PlanarImitationConfig(reference_observation=task.actuation_model == 'muscle')
         self.clip = task.clip
         spec = task.character.spec
         other = PlanarImitation(
             characters.make(spec.name), PlanarArena(terrain.load('flat')), self.clip,
-            actuation_model=task.actuation_model, **options,
+            config, actuation_model=task.actuation_model,
         )  # fmt: skip
         self.environment = Environment(other, random=0)
         self.environment.reset()

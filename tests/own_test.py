@@ -450,7 +450,7 @@ class TerrainTest(Folder):
         ('spacing', lambda _: terrain.from_heights([0, 0], 0), 'spacing is 0'),
         ('suffix', lambda _: terrain.from_mesh('hill.fbx'), "suffix '.fbx'; expected .obj or"),
         ('away', lambda f: terrain.from_mesh(f / 'away.stl'), 'not over the origin'),
-        ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, action_offset=True), '1 x 1 points'),
+        ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
         ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
         ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture'),
@@ -598,7 +598,7 @@ class TaskTest(parameterized.TestCase):
 
     def test_gymnasium(self):
         spec = suite.combine('biped3d', terrain='hills3d', task='walk')
-        env = gym.SuiteEnv(spec, task_kwargs=PARTS | {'terrain_observation': 50})
+        env = gym.SuiteEnv(spec, task_kwargs=PARTS | {'terrain_observation': 'height'})
         observation, _ = env.reset(seed=1)
         self.assertEqual(observation.shape, (1024 + 57 + 48 + 2 + 3,))
         envs = gym.SuiteVectorEnv(spec, 2, task_kwargs=PARTS)

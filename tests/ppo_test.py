@@ -375,7 +375,7 @@ class RunTest(parameterized.TestCase):
             trainer.value[-1].bias.fill_(7.0)  # the value of every state
         batch = trainer.collect()
         # Episodes last two steps: no target lacks the 7 that follow, discounted.
-        self.assertGreater(float(batch['goal'].min()), 7 * settings.gamma**2)
+        self.assertGreater(float(batch['target'].min()), 7 * settings.gamma**2)
 
     def test_what_ships_may_be_the_mean_over_ends_of_stages(self):
         samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a curriculum stage

@@ -392,7 +392,7 @@ class LoadTest(parameterized.TestCase):
             "unknown option.*'goal_reached'",
         ),
         (lambda: suite.build('dgo'), "unknown character 'dgo'.*'dog'"),
-        (lambda: suite.build('dog', 'torqe'), "unknown actuation 'torqe'.*'torque'"),
+        (lambda: suite.build('dog', 'torqe'), "unknown actuation .*'torqe'.*'torque'"),
         (lambda: suite.build('dog', terrain='gap'), "unknown terrain 'gap'.*'gaps'"),
         (lambda: suite.build('dog', task='imitate'), "unknown task 'imitate'.*'imitation'"),
         (lambda: suite.build('dog', clip='dog_bond'), "unknown clip 'dog_bond'.*'dog_bound'"),
@@ -554,7 +554,7 @@ class BuildTest(parameterized.TestCase):
         ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
         ({'character': 'dog', 'task': 'goal_navigation'}, "'dog' is planar; the task 'goal_navigation'"),
         ({'character': 'dog', 'task': 'footsteps'}, "'dog' has no right and left foot to place"),
-        ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no right and left foot"),
+        ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no clip of its own"),
         ({'character': 'biped2d_full', 'task': 'footsteps', 'clip': motion.load_steps('biped3d_mocap')},
          "'biped3d_mocap' is a library of steps"),
         ({'character': 'biped3d', 'task': 'spatial_imitation'}, "unknown task 'spatial_imitation'"),
@@ -609,7 +609,7 @@ class BuildTest(parameterized.TestCase):
 
     def test_a_row_of_the_users_own(self):
         spec = dataclasses.replace(
-            characters.CHARACTERS['biped2d'], name='mine', fall_links=('root', 'left_knee'),
+            characters.CHARACTERS['biped2d'], name='mine', clip=None, fall_links=('root', 'left_knee'),
             path=str(resources.directory('xml') / 'biped2d.xml'),
         )  # fmt: skip
         with self.assertRaisesRegex(ValueError, 'clip'):

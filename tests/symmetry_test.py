@@ -8,6 +8,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import policies, suite
+from trl_suite.policies import files
 from trl_suite.policies.mirror import Mirror, blocks, exchanged
 from trl_suite.tasks.imitation.spatial import joint_targets
 from trl_suite.tasks.navigation import scripted
@@ -416,7 +417,7 @@ class PolicyTest(parameterized.TestCase):
             names = [name for name in data.files if name.startswith('mirror_')]
             self.assertLen(names, 5)
             for name in names:
-                self.assertRegex(policies.__doc__, rf'\n    {name}  ')
+                self.assertRegex(files.__doc__, rf'\n    {name}  ')
                 self.assertIn(data[name].dtype.kind, 'iuf')
                 if data[name].dtype.kind == 'f':
                     self.assertIn(data[name].dtype, (np.float32, np.float16))

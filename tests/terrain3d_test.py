@@ -483,7 +483,7 @@ class GroundTest(parameterized.TestCase):
     def test_same_ground_in_another_process(self):
         code = (
             'from trl_suite import terrain as t; '
-            'print([t.Ground(t.load(n), 7).height([9.1, -9.1], [3.2, 3.2]).tolist() for n in '
+            'print([t.SpatialGround(t.load(n), 7).height([9.1, -9.1], [3.2, 3.2]).tolist() for n in '
             "('trail3d2', 'steps3d', 'stairs3d', 'pillars3d')])"
         )
         root = pathlib.Path(terrain.__file__).parents[2]

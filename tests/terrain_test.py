@@ -618,7 +618,7 @@ class StripTest(parameterized.TestCase):
     def test_same_ground_in_another_process(self):
         code = (
             'from trl_suite import terrain as t; '
-            "print(t.Strip(t.load('slopes_mixed'), 7).height([9.1, -9.1]).tolist())"
+            "print(t.PlanarGround(t.load('slopes_mixed'), 7).height([9.1, -9.1]).tolist())"
         )
         root = pathlib.Path(terrain.__file__).parents[2]
         output = subprocess.run(

@@ -195,9 +195,9 @@ class LimitTest(parameterized.TestCase):
             for _ in range(5):
                 step = each.step(idle)
             np.testing.assert_array_equal(step.truncated, [True, False, True])
-            environments.reset([0, 2])
+            each.reset([0, 2])
             for _ in range(4):
-                step = environments.step(idle)
+                step = each.step(idle)
             np.testing.assert_array_equal(step.truncated, [False, True, False])
 
     @parameterized.parameters(
@@ -248,8 +248,8 @@ class AutoresetTest(parameterized.TestCase):
         self.assertFalse(environments.step(np.zeros((4, 6))).truncated.any())
         self.assertEqual(step.reward.shape, (4,))
 
-    @parameterized.parameters({'simulations': [1, 3]}, {'simulations': [False, True, False, True]})
-    def test_a_reset_of_some_rows_leaves_the_others(self, environments):
+    @parameterized.parameters({'env_ids': [1, 3]}, {'env_ids': [False, True, False, True]})
+    def test_a_reset_of_some_rows_leaves_the_others(self, env_ids):
         environments, untouched = (
             VectorEnvironment(FLAT, 4, 1, seed=4, autoreset='disabled') for _ in range(2)
         )

@@ -85,7 +85,7 @@ def build(
     character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
-    task: str | Callable[..., Task] = 'imitation',
+    task: str | TaskType | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
@@ -108,7 +108,7 @@ def combine(
     character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
-    task: str | Callable[..., Task] = 'imitation',
+    task: str | TaskType | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
 ) -> EnvSpec:
     """Returns the data of a combination: what `VectorEnvironment` and Gymnasium take.
@@ -122,8 +122,8 @@ def combine(
       task: title of a task type: 'imitation'; 'footsteps', for characters with a right and a left
         foot; in three dimensions 'goal_navigation' or 'soccer' (above a footstep controller), or
         'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
-        needs neither clip nor controller. Or a class or function of the user's, called as
-        task(character, arena, actuation_model=...), with clip=... if one is given, and with the
+        needs neither clip nor controller. Or a `TaskType` of the user's; or a class or function, called
+        as task(character, arena, actuation_model=...), with clip=... if one is given, and with the
         task's options by keyword; it returns a `Task`.
       clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
         footsteps in three dimensions the same of a library of steps, `Steps`. By default the
@@ -143,6 +143,12 @@ def combine(
         actuation = _actuation(type_, actuation)
         if type_.motion is None and clip is not None:
             raise ValueError(f'the task {title!r} tracks nothing: it takes no clip')
+        if clip is None and type_.motion is not None:
+            clip = _own_motion(figure, type_.motion)
+    elif isinstance(task, TaskType):
+        title, type_, own['task_type'] = task.title, task, task
+        _check_dimensions(task, figure)
+        actuation = _actuation(type_, actuation)
         if clip is None and type_.motion is not None:
             clip = _own_motion(figure, type_.motion)
     elif callable(task):
@@ -176,13 +182,22 @@ def _type(title: str, character: characters.CharacterSpec) -> TaskType:
     if title not in TITLES:
         raise ValueError(errors.unknown('task', title, TITLES))
     types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == title}
-    spatial = character.spatial
-    if spatial not in types:
+    type_ = types.get(character.spatial) or next(iter(types.values()))
+    _check_dimensions(type_, character)
+    return type_
+
+
+def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> None:
+    """Checks that a task type is for characters of these dimensions.
+
+    Raises:
+      ValueError: it is not.
+    """
+    if character.spatial != type_.spatial:
         raise ValueError(
-            f'character {character.name!r} is {DIMENSIONS[spatial]}; the task {title!r} is for '
-            f'{DIMENSIONS[not spatial]} characters'
+            f'character {character.name!r} is {DIMENSIONS[character.spatial]}; the task '
+            f'{type_.title!r} is for {DIMENSIONS[type_.spatial]} characters'
         )
-    return types[spatial]
 
 
 def _actuation(type_: TaskType | None, actuation: str | None) -> str:

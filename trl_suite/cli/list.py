@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from trl_suite import describe, policies
+from trl_suite import policies
 from trl_suite.registry import catalogue
-from trl_suite.util import errors
+from trl_suite.util import errors, tables
 
 FILTERS = ('domain', 'character', 'actuation', 'terrain', 'tag')
 
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
         chosen = [spec for spec in chosen if spec.id in shipped]
     if chosen:
         cells = [(spec.id, f'{spec.domain}/{spec.task}', spec.description) for spec in chosen]
-        print(describe.table(('id', 'domain/task', 'description'), cells, indent=''))
+        print(tables.table(('id', 'domain/task', 'description'), cells, indent=''))
     print(f'{len(chosen)} environment{"" if len(chosen) == 1 else "s"}')
 
 

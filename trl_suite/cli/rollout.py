@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite import describe, rendering
+from trl_suite import rendering
 from trl_suite.cli import engine
 from trl_suite.environments import named_policies as acting
-from trl_suite.util import files
+from trl_suite.util import files, tables
 
 if TYPE_CHECKING:
     import dm_env
@@ -136,7 +136,7 @@ class _Record:
     def summary(self) -> str:
         shown = self._episodes[:SHOWN_EPISODES]
         lines = [
-            describe.table(
+            tables.table(
                 ('episode', 'steps', 'return', 'distance (m)', 'end'),
                 (
                     (i, e['steps'], f'{e["return"]:.2f}', f'{e["distance"]:.2f}', e['end'])

@@ -16,14 +16,17 @@ from trl_suite.tasks import composed
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
 from trl_suite.util import errors
-from trl_suite.util.options import Option
+from trl_suite.util.options import Config, Option
 
 DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
 def task_type(spec: EnvSpec) -> TaskType | None:
-    """Returns the task type of an environment; None where the task is the user's own."""
-    return None if 'task_type' in spec.own else TASK_TYPES[spec.task_type]
+    """Returns the task type of an environment; None where a function of the user's makes the task."""
+    own = spec.own.get('task_type')
+    if own is None:
+        return TASK_TYPES[spec.task_type]
+    return own if isinstance(own, TaskType) else None
 
 
 def character_of(spec: EnvSpec) -> characters.CharacterSpec:
@@ -32,17 +35,26 @@ def character_of(spec: EnvSpec) -> characters.CharacterSpec:
     return characters.CHARACTERS[character] if isinstance(character, str) else character
 
 
+def config_of(spec: EnvSpec) -> type[Config] | None:
+    """Returns the options of an environment's task; None of a function of the user's."""
+    type_ = task_type(spec)
+    if type_ is not None:
+        return type_.config
+    config = getattr(spec.own['task_type'], 'CONFIG', None)
+    return config[character_of(spec).spatial] if isinstance(config, Mapping) else config
+
+
 def task_options(spec: EnvSpec) -> list[Option]:
     """Returns the options of an environment's task, besides those of every task."""
-    type_ = task_type(spec)
-    if type_ is None:
+    config = config_of(spec)
+    if config is None:
         known = [
             Option(name, parameter.default, '')
             for name, parameter in inspect.signature(spec.own['task_type']).parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
         ]
     else:
-        known = type_.config.options()
+        known = config.options()
     return [
         option._replace(default=spec.options.get(option.name, option.default)) for option in known
     ]
@@ -63,30 +75,33 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     type_, others = task_type(spec), (*composed.OPTIONS, 'random')
-    if type_ is None:
+    config_type, config = config_of(spec), None
+    if config_type is None:
         known = {option.name for option in task_options(spec)}
         for name in merged:
             if name not in known:
                 choices = [*known, *others]
                 raise ValueError(errors.unknown(f'option of {spec.id}', name, choices))
     else:
-        for option in type_.config.options():
-            if option.policy and option.name in merged:
-                merged[option.name] = _policy(merged[option.name])
-            elif option.policy:
-                merged[option.name] = _policy(option.default)
-        config = type_.config.of(spec.id, merged, others)
-        if type_.actuations is not None and spec.actuation not in type_.actuations:
-            raise ValueError(
-                f'{spec.task}: joints are driven by {" or ".join(type_.actuations)} control, not by '
-                f'{spec.actuation}'
-            )
+        policies_ = {
+            option.name: option.default for option in config_type.options() if option.policy
+        }
+        for name, default in policies_.items():
+            merged[name] = _policy(merged.get(name, default))
+        config = config_type.of(spec.id, merged, others)
+    if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
+        raise ValueError(
+            f'{spec.task}: joints are driven by {" or ".join(type_.actuations or ())} control, not by '
+            f'{spec.actuation}'
+        )
     parts = _parts(spec, type_)
     if type_ is not None:
         return composed.compose(type_.make(parts, config), extras)
-    tracked = {} if spec.clip is None else {'clip': parts.motion}
+    given: dict[str, Any] = merged if config is None else {'config': config}
+    if spec.clip is not None:
+        given['clip'] = parts.motion
     task = spec.own['task_type'](
-        parts.character, parts.arena, actuation_model=parts.actuation, **tracked, **merged
+        parts.character, parts.arena, actuation_model=parts.actuation, **given
     )
     return composed.compose(task, extras)
 

@@ -16,9 +16,10 @@ import functools
 
 import numpy as np
 
-from trl_suite import characters, describe
+from trl_suite import characters
 from trl_suite.motion import Clip, quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.util import tables
 
 # What is a fault. Our own clips have none of these, see mocap/README.md.
 EXCESS = 1e-3  # rad beyond a joint's limits (m of a slide)
@@ -101,7 +102,7 @@ class Report:
                  f'{worst.amount:.3g}', worst.unit, worst.frame)
             )  # fmt: skip
         header = ('fault', 'where', 'frames', 'first', 'last', 'worst', '', 'in frame')
-        return f'{title}\n{describe.table(header, rows)}'
+        return f'{title}\n{tables.table(header, rows)}'
 
 
 def check(clip: Clip, character: str | characters.CharacterSpec, near: float = NEAR) -> Report:

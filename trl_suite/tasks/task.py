@@ -137,6 +137,7 @@ class Task(composer.Task):
     outcome: Outcome
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
+    CONFIG: Any = None  # its options: a subclass of `Config`, or {spatial: one} where they differ
     fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
     in_parts = True  # whether threads may each be given a part of the simulations
     _begun = False  # whether no step was taken since composer's reset

@@ -280,6 +280,8 @@ class PlanarFootsteps(PlanarImitation):
     ABOUT = 'root'
     EXTRAS = MappingProxyType({'contact': 2, 'plan': 13})
 
+    CONFIG: Any = PlanarFootstepsConfig
+
     def __init__(
         self,
         character: Character,

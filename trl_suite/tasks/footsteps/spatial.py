@@ -117,6 +117,8 @@ class SpatialFootsteps(SpatialTask):
     TERMS = rewards.STEP_TERMS
     ABOUT = 'root'
 
+    CONFIG: Any = SpatialFootstepsConfig
+
     def __init__(
         self,
         character: Character,

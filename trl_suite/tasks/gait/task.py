@@ -102,6 +102,8 @@ class GaitTask(Task):
     fields = dynamics.FIELDS
     watch: Callable[[], None] | None = None
 
+    CONFIG: Any = GaitConfig
+
     def __init__(
         self,
         character: Character,

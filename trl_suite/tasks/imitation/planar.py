@@ -126,6 +126,8 @@ class PlanarImitation(Task):
     ABOUT = 'com'  # from where end effectors are measured, or 'root'
     EXTRAS: Mapping[str, int] = MappingProxyType({})  # blocks of a subclass, with their sizes
 
+    CONFIG: Any = PlanarImitationConfig
+
     def __init__(
         self,
         character: Character,

@@ -172,6 +172,8 @@ class SpatialImitation(SpatialTask):
 
     TERMS = rewards.IMITATION_TERMS
 
+    CONFIG: Any = SpatialImitationConfig
+
     def __init__(
         self,
         character: Character,

@@ -87,6 +87,8 @@ class DirectNavigation(SpatialTask):
       ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
     """
 
+    CONFIG: Any = DirectConfig
+
     def __init__(
         self,
         character: Character,

@@ -166,6 +166,8 @@ class HierarchicalNavigation(SpatialTask):
     ABOUT = 'root'
     watch: Callable[[], None] | None = None
 
+    CONFIG: Any = HierarchicalConfig
+
     def __init__(
         self,
         character: Character,

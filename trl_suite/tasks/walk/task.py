@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -101,11 +102,13 @@ class Walk(Task):
       speed_ratio: speed of a full reward, m/s.
     """
 
+    CONFIG: Any = MappingProxyType({False: PlanarWalkConfig, True: SpatialWalkConfig})
+
     def __init__(
         self,
         character: Character,
         arena: PlanarArena | SpatialArena,
-        config: PlanarWalkConfig | SpatialWalkConfig,
+        config: PlanarWalkConfig | SpatialWalkConfig | None = None,
         *,
         actuation_model: str = 'position',
     ) -> None:
@@ -114,14 +117,16 @@ class Walk(Task):
         Args:
           character: without actuators; it is attached to the arena.
           arena: where it moves, of as many dimensions.
-          config: the options, planar or spatial as the character is.
+          config: the options, planar or spatial as the character is; by default the defaults.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
           ValueError: options that do not fit each other.
         """
-        self.character, self.arena, self.config = character, arena, config
         self._spatial = character.spec.spatial
+        if config is None:
+            config = SpatialWalkConfig() if self._spatial else PlanarWalkConfig()
+        self.character, self.arena, self.config = character, arena, config
         self.figure: Any
         if isinstance(arena, SpatialArena):
             assert isinstance(config, SpatialWalkConfig)
