@@ -20,6 +20,13 @@ if TYPE_CHECKING:
     from trl_suite.registry.spec import EnvSpec
 
 
+def tracking(task: Callable[..., Task]) -> Callable[[Parts, Any], Task]:
+    """Returns what makes a task that tracks a motion, and takes parts as those of the suite do."""
+    return lambda parts, config: task(
+        parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
+    )
+
+
 class Parts(NamedTuple):
     """What a task is composed of.
 

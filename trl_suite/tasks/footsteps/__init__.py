@@ -6,7 +6,7 @@ from trl_suite.tasks.components.differences import Difference
 from trl_suite.tasks.footsteps import description
 from trl_suite.tasks.footsteps.planar import PlanarFootsteps, PlanarFootstepsConfig
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
-from trl_suite.tasks.task_type import TaskType
+from trl_suite.tasks.task_type import TaskType, tracking
 
 TYPES = (
     TaskType(
@@ -14,9 +14,7 @@ TYPES = (
         title='footsteps',
         spatial=False,
         config=PlanarFootstepsConfig,
-        make=lambda parts, config: PlanarFootsteps(
-            parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-        ),
+        make=tracking(PlanarFootsteps),
         description=description.PLANAR,
         motion=Clip,
         differences=(
@@ -30,9 +28,7 @@ TYPES = (
         title='footsteps',
         spatial=True,
         config=SpatialFootstepsConfig,
-        make=lambda parts, config: SpatialFootsteps(
-            parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-        ),
+        make=tracking(SpatialFootsteps),
         description=description.SPATIAL,
         motion=Steps,
         differences=(

@@ -6,7 +6,7 @@ from trl_suite.tasks.components.differences import Difference
 from trl_suite.tasks.imitation import description
 from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.tasks.imitation.spatial import SpatialImitation, SpatialImitationConfig
-from trl_suite.tasks.task_type import TaskType
+from trl_suite.tasks.task_type import TaskType, tracking
 
 TYPES = (
     TaskType(
@@ -14,9 +14,7 @@ TYPES = (
         title='imitation',
         spatial=False,
         config=PlanarImitationConfig,
-        make=lambda parts, config: PlanarImitation(
-            parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-        ),
+        make=tracking(PlanarImitation),
         description=description.PLANAR,
         motion=Clip,
         differences=(
@@ -36,9 +34,7 @@ TYPES = (
         title='imitation',
         spatial=True,
         config=SpatialImitationConfig,
-        make=lambda parts, config: SpatialImitation(
-            parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-        ),
+        make=tracking(SpatialImitation),
         description=description.SPATIAL,
         motion=Clip,
         differences=(

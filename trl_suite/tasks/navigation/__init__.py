@@ -16,16 +16,14 @@ from trl_suite.tasks.navigation.direct import (
 )
 from trl_suite.tasks.navigation.hierarchical import HierarchicalConfig, HierarchicalNavigation
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.task_type import Parts, TaskType
+from trl_suite.tasks.task_type import Parts, TaskType, tracking
 
 
 def _direct(parts: Parts, config: Any) -> Task:
     if config.reward == 'original':
         steps = motion.load_steps(parts.character.spec.name)
         return hidden_plan(parts.character, parts.arena, steps, config, parts.actuation)
-    return DirectNavigation(
-        parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
-    )
+    return tracking(DirectNavigation)(parts, config)
 
 
 _HIERARCHICAL = (
