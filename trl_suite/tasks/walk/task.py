@@ -127,6 +127,7 @@ class Walk(Task):
         if config is None:
             config = SpatialWalkConfig() if self._spatial else PlanarWalkConfig()
         self.character, self.arena, self.config = character, arena, config
+        self.actuation_model = actuation_model
         self.figure: Any
         if isinstance(arena, SpatialArena):
             assert isinstance(config, SpatialWalkConfig)
