@@ -620,8 +620,8 @@ class TaskTest(parameterized.TestCase):
         np.testing.assert_allclose(
             many.step(np.zeros((2, len(many.action_map)))).reward, height, atol=0.05
         )
-        with self.assertRaisesRegex(ValueError, "unknown option .*'half_rang'.*'action_scale'"):
-            suite.build(character, task=Rise, task_kwargs={'half_rang': 1})
+        with self.assertRaisesRegex(ValueError, "unknown option .*'action_scal'.*'action_scale'"):
+            suite.build(character, task=Rise, task_kwargs={'action_scal': 1})
 
     def test_walking_is_rewarded(self):
         environment = suite.build('biped3d', task='walk', task_kwargs={'random': 1})

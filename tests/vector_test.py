@@ -255,7 +255,7 @@ class AutoresetTest(parameterized.TestCase):
         )
         before = environments.reset()
         np.testing.assert_array_equal(untouched.reset(), before)
-        after = environments.reset(environments)
+        after = environments.reset(env_ids)
         np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
         self.assertTrue((after[[1, 3]] != before[[1, 3]]).any(1).all())
         action = np.random.default_rng(0).uniform(-0.1, 0.1, (4, 6))
