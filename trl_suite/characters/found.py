@@ -139,6 +139,13 @@ class Found:
                 file, 'no geom of the character can touch the ground: expected some whose contype '
                 'and conaffinity are not both 0 (in URDF, <collision> elements)',
             )  # fmt: skip
+        for i in self.geoms:
+            masks = int(model.geom_contype[i]), int(model.geom_conaffinity[i])
+            if not all(-(2**30) <= mask < 2**30 for mask in masks):
+                raise problem(
+                    file, f'geom {model.geom(i).name!r} has contype {masks[0]} and conaffinity '
+                    f'{masks[1]}; expected masks below 2^30, as one bit is for the ground',
+                )  # fmt: skip
         self.solids = tuple(model.geom(i).name for i in self.geoms)
         heavy = model.body_mass[self.ids] > 0
         heavy[0] = True

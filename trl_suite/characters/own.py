@@ -167,7 +167,10 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: Found) -> mjcf.RootEle
         joint.actuatorfrcrange = (-found.limits[name], found.limits[name])
     for i in found.geoms:
         geom = tree.find('geom', model.geom(i).name)
-        geom.conaffinity = int(model.geom_conaffinity[i]) | 1  # the ground's contype is 1
+        # The first bit is the ground's. The file's masks move up by one, so that two geoms of the
+        # character collide exactly if they do in the file.
+        geom.contype = int(model.geom_contype[i]) << 1
+        geom.conaffinity = int(model.geom_conaffinity[i]) << 1 | 1
         if file.suffix.lower() == '.urdf':
             geom.rgba = COLOUR  # what is only looked at, and has colours, was left out
     _stage(tree, root, found.reach(found.data.xpos[found.root], found.root))
