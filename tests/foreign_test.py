@@ -15,6 +15,7 @@ GYMNASIUM = 'gymnasium/envs/mujoco/assets/'
 HANDS = {'end_effectors': ('foot_L', 'foot_R', 'hand_L', 'hand_R'), 'fall_links': ('skull',)}
 FEET = {'end_effectors': ('right_foot', 'left_foot'), 'fall_links': ('torso',)}
 ENDS = {'end_effectors': ('ffoot', 'bfoot'), 'fall_links': ('torso',)}
+CMU = {'end_effectors': ('lfoot', 'rfoot'), 'fall_links': ('head', 'thorax')}
 TOES = {
     'end_effectors': tuple(f'toe_{x}_{y}' for x in ('front', 'back') for y in ('left', 'right')),
     'fall_links': ('torso',),
@@ -28,11 +29,20 @@ FILES = {
     'dm_control/suite/humanoid.xml': (FEET, 0.0),
     'dm_control/suite/quadruped.xml': (TOES, 0.8),
     'dm_control/suite/dog.xml': ({**HANDS, 'name': 'dog1', 'root': 'torso'}, 0.9),
+    # Up is y in the first, which stands as the package has it turned; the other is turned in the file.
+    f'{LOCOMOTION}humanoid_CMU_V2020.xml': (
+        {**CMU, 'spatial': True, 'turn': (0.859, 1, 1, 0.859)},
+        0.0,
+    ),
+    'dm_control/suite/humanoid_CMU.xml': ({**CMU, 'turn': (0.7071, 0, 0, 0.7071)}, 0.0),
     f'{LOCOMOTION}rodent.xml': ({**HANDS, 'root': 'torso', 'spatial': True}, 0.8),
     f'{GYMNASIUM}walker2d_v5.xml': ({**FEET, 'end_effectors': ('foot', 'foot_left')}, 0.9),
     f'{GYMNASIUM}half_cheetah.xml': (ENDS, 0.9),
     f'{GYMNASIUM}hopper.xml': ({**FEET, 'end_effectors': ('foot',), 'name': 'hopper1'}, 0.9),
-    f'{GYMNASIUM}ant.xml': ({**FEET, 'end_effectors': ('aux_1', 'aux_2')}, 0.4),
+    f'{GYMNASIUM}ant.xml': (
+        {**FEET, 'end_effectors': tuple(f'ankle_{i}' for i in range(1, 5))},
+        0.4,
+    ),
     f'{GYMNASIUM}humanoid.xml': (FEET, 0.0),
 }
 

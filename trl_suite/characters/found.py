@@ -26,6 +26,8 @@ LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
 MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
 SIZES = (0.05, 10.0)  # m, from the root to the farthest end
 MASSES = (0.1, 2000.0)  # kg
+LYING = 0.2  # share of the way to the end effectors that goes down; what has less may lie
+FACING = 0.7  # cosine of an angle; what looks farther aside than that may look elsewhere
 LATERAL = 1e-3  # how far an axis of a planar character may be from its plane or normal, rad
 
 _FREE, _BALL, _SLIDE, _HINGE = (
@@ -35,9 +37,17 @@ _FREE, _BALL, _SLIDE, _HINGE = (
         mujoco.mjtJoint.mjJNT_HINGE,
     )
 )  # fmt: skip
+_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
 # Of a file, besides bodies: what must have a name to be found again.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
+
+
+def _right(left: str) -> list[str]:
+    """Returns what the right counterpart of a left body may be called."""
+    ways = (('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'))
+    ways += (('l$', 'r'), ('L$', 'R'))
+    return [name for a, b in ways if (name := re.sub(a, b, left, count=1)) != left]
 
 
 def problem(file: pathlib.Path, what: str) -> ValueError:
@@ -71,10 +81,18 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
     return spec
 
 
-def check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset()) -> None:
-    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity."""
+def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
+    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity.
+
+    Refuses models that load themselves, too: they would crash the process.
+
+    Args:
+      file: which is read with all that it includes and loads.
+      above: files that load it, the first one first.
+    """
     try:
-        elements = [*etree.parse(file).getroot().iter(etree.Element)]
+        parser = etree.XMLParser(resolve_entities=False)
+        elements = [*etree.parse(file, parser).getroot().iter(etree.Element)]
     except etree.XMLSyntaxError as error:
         raise problem(file, f'not a model: {error}') from None
     names = {element.get(key) for element in elements for key in ('name', 'class')}
@@ -86,12 +104,21 @@ def check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset(
                     file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
                     'finite numbers',
                 )  # fmt: skip
-    seen |= {file.resolve()}
+    above = (*above, file.resolve())
     for element in elements:
-        if element.tag == 'include':
-            included = file.parent / element.get('file', '')
-            if included.is_file() and included.resolve() not in seen:  # else MuJoCo complains
-                check_numbers(included, seen)
+        if element.tag not in ('include', 'model') or not element.get('file'):
+            continue
+        # MuJoCo takes paths from the file that it was given, too.
+        for folder in dict.fromkeys((file.parent, above[0].parent)):
+            inside = folder / element.get('file', '')
+            if inside.resolve() in above:
+                raise problem(
+                    file, f'line {element.sourceline}: <{element.tag} file="{element.get("file")}"> '
+                    'loads a file that loads this one; expected another model',
+                )  # fmt: skip
+            if inside.is_file():  # else MuJoCo complains
+                check_numbers(inside, above)
+                break
 
 
 def _finite(text: str) -> bool:
@@ -116,16 +143,127 @@ def _in_package(file: pathlib.Path, name: str) -> str:
     return str(next((place for place in places if place.is_file()), name))
 
 
+def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> int:
+    """Returns the number of the body that carries all others; by default the only one there is."""
+    top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
+    if root is None and len(top) == 1:
+        (root,) = top
+    if root in top:
+        return top[root]
+    if not top:
+        raise problem(file, 'there is no body; expected one that carries all others')
+    if root is None:
+        raise problem(file, f'several bodies may be the root; give root=, one of {[*top]}')
+    names = [model.body(i).name for i in range(1, model.nbody)]
+    if root in names:
+        above = model.body(model.body_rootid[model.body(root).id]).name
+        raise problem(file, f'root {root!r} hangs on another body; did you mean {above!r}?')
+    raise problem(file, errors.unknown('root', root, names))
+
+
+def turned(
+    file: pathlib.Path, spec: mujoco.MjSpec, root: str, rotation: np.ndarray
+) -> mujoco.MjModel:
+    """Turns all that a body holds, and the body back: its axes become those of the world.
+
+    Args:
+      file: for messages.
+      spec: is changed.
+      root: name of the body, a child of the world.
+      rotation: of what it holds, unit quaternion wxyz.
+
+    Returns:
+      The compiled file.
+    """
+    body = spec.body(root)
+    for equality in spec.equalities:
+        if equality.objtype == mujoco.mjtObj.mjOBJ_BODY and root in (
+            equality.name1, equality.name2,
+        ):  # fmt: skip
+            raise problem(
+                file, f'the root {root!r} is turned, and equality {equality.name!r} holds it; expected '
+                'none at the root, or that the file is turned as it should be',
+            )  # fmt: skip
+    frame = body.add_frame(quat=rotation)
+    for item in (*body.geoms, *body.sites, *body.cameras, *body.lights, *body.bodies):
+        if item.frame is None:
+            item.set_frame(frame)
+    for each in body.frames:
+        if each is not frame and each.frame is None:
+            each.set_frame(frame)
+    if body.explicitinertial:
+        model = spec.compile()  # resolves what is written in other ways than by a quaternion
+        number = model.body(root).id
+        turn = Rotation(rotation)
+        body.ipos = turn.vector(model.body_ipos[number])
+        body.iquat = turn.quaternion(model.body_iquat[number])
+        body.inertia, body.fullinertia = model.body_inertia[number], np.full(6, np.nan)
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.quat = 1, 0, 0, 0
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    return compiled(file, spec)
+
+
+def compiled(file: pathlib.Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise problem(file, ' '.join(str(error).split())) from None
+
+
+def flat(text: str) -> str:
+    """Returns MJCF, as `MjSpec.to_xml` writes it, without frames, which dm_control does not read."""
+    tree = etree.fromstring(text.encode())
+    for frame in reversed([*tree.iter('frame')]):  # the innermost first
+        turn = Rotation(_numbers(frame, 'quat', (1, 0, 0, 0)))
+        origin = _numbers(frame, 'pos', (0, 0, 0))
+        above, place = frame.getparent(), frame.getparent().index(frame)
+        for child in reversed(frame):
+            if child.tag in ('body', 'geom', 'site', 'camera', 'frame'):
+                position = origin + turn.vector(_numbers(child, 'pos', (0, 0, 0)))
+                rotation = turn.quaternion(_numbers(child, 'quat', (1, 0, 0, 0)))
+                child.set('pos', ' '.join(map(repr, position.tolist())))
+                child.set('quat', ' '.join(map(repr, rotation.tolist())))
+            key = 'childclass' if child.tag in ('body', 'frame') else 'class'
+            if frame.get('childclass') and child.get(key) is None:
+                child.set(key, frame.get('childclass'))
+            above.insert(place, child)
+        above.remove(frame)
+    return etree.tostring(tree, encoding='unicode')
+
+
+def _numbers(element: etree._Element, key: str, default: Sequence[float]) -> np.ndarray:
+    text = element.get(key)
+    return np.array(default if text is None else text.split(), float)
+
+
+class Rotation:
+    """A rotation, of vectors and of other rotations."""
+
+    def __init__(self, quaternion: Sequence[float] | np.ndarray) -> None:
+        self._turn = np.array(quaternion, float)
+
+    def vector(self, vector: np.ndarray) -> np.ndarray:
+        result = np.empty(3)
+        mujoco.mju_rotVecQuat(result, vector, self._turn)
+        return result
+
+    def quaternion(self, quaternion: np.ndarray) -> np.ndarray:
+        result = np.empty(4)
+        mujoco.mju_mulQuat(result, self._turn, quaternion)
+        return result
+
+
 class Found:
     """What a compiled file holds of a character."""
 
     def __init__(
-        self, file: pathlib.Path, model: mujoco.MjModel, root: str | None, spatial: bool | None
+        self, file: pathlib.Path, model: mujoco.MjModel, root: int, spatial: bool | None
     ) -> None:
         self.file, self.model, self.notes = file, model, list[str]()
         self.data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.data)
-        self.root = self._root(root)
+        self.root = root
         self.ids = np.flatnonzero(model.body_rootid == self.root)
         self.bodies = [model.body(i).name for i in self.ids]
         own = np.isin(model.jnt_bodyid, self.ids)
@@ -154,31 +292,6 @@ class Found:
         if not self.weight > 0:
             raise problem(file, f'the mass of {self.bodies[0]!r} and all that hangs on it is 0')
         self._doubt()
-
-    def _root(self, root: str | None) -> int:
-        model = self.model
-        top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
-        if root is None and len(top) == 1:
-            (root,) = top
-        if root in top:
-            number = top[root]
-            if abs(model.body_quat[number, 0]) < 1 - 1e-6:
-                raise problem(
-                    self.file, f'the root {root!r} is turned against the world; expected none, x '
-                    'ahead and z up: turn what it holds instead',
-                )  # fmt: skip
-            return number
-        if not top:
-            raise problem(self.file, 'there is no body; expected one that carries all others')
-        if root is None:
-            raise problem(self.file, f'several bodies may be the root; give root=, one of {[*top]}')
-        names = [model.body(i).name for i in range(1, model.nbody)]
-        if root in names:
-            above = model.body(model.body_rootid[model.body(root).id]).name
-            raise problem(
-                self.file, f'root {root!r} hangs on another body; did you mean {above!r}?'
-            )
-        raise problem(self.file, errors.unknown('root', root, names))
 
     def _dimensions(self, root_joints: np.ndarray, spatial: bool | None) -> bool:
         kinds = sorted(KINDS[int(kind)] for kind in self.model.jnt_type[root_joints])
@@ -233,6 +346,55 @@ class Found:
             self.notes.append(f'it reaches {reach:.3g} m from its root; are lengths in m?')
         if not MASSES[0] <= self.weight / GRAVITY <= MASSES[1]:
             self.notes.append(f'it weighs {self.weight / GRAVITY:.4g} kg; are masses in kg?')
+
+    def check_posture(self, end_effectors: Sequence[str]) -> None:
+        """Notes that a character may lie, or may not look along +x, in its working posture."""
+        model, data = self.model, mujoco.MjData(self.model)
+        for i in self.joints:
+            if model.jnt_type[i] in (_HINGE, _SLIDE):
+                data.qpos[model.jnt_qposadr[i]] = self._posture(i, [])
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        ends = np.mean([data.xipos[model.body(name).id] for name in end_effectors], axis=0)
+        away = ends - data.subtree_com[self.root]
+        distance = np.linalg.norm(away)
+        if distance > 0 and -away[2] < LYING * distance:
+            self.notes.append(
+                f'it may lie: the end effectors are {away.round(3).tolist()} m from the centre of mass; '
+                'expected below it, z up. turn= turns it'
+            )
+            return
+        forward = self._facing(data)
+        if forward is not None and forward[0] < FACING:
+            self.notes.append(
+                f'it may look along {forward.round(2).tolist()}, as left and right bodies lie; expected '
+                'along +x, (1, 0). turn= turns it'
+            )
+
+    def _facing(self, data: mujoco.MjData) -> np.ndarray | None:
+        """Returns the direction (2,) that left and right bodies are beside, or None without such."""
+        numbers = {self.model.body(i).name: i for i in self.ids}
+        aside = np.zeros(3)
+        for left in numbers:
+            right = next((name for name in _right(left) if name in numbers), None)
+            if right is not None:
+                aside += data.xipos[numbers[left]] - data.xipos[numbers[right]]
+        length = np.linalg.norm(aside[:2])
+        # Of what lies on its side, x and y say nothing.
+        if length < FACING * np.linalg.norm(aside) or not length:
+            return None
+        return np.array([aside[1], -aside[0]]) / length
+
+    def left_out(self) -> list[str]:
+        """Names of actuators that have no part in the character: what each acts on, in brackets."""
+        model, names = self.model, []
+        for a in range(model.nu):
+            kind = mujoco.mjtTrn(model.actuator_trntype[a])
+            if kind in _OF_JOINTS and model.actuator_trnid[a, 0] in self.joints:
+                continue
+            on = kind.name.removeprefix('mjTRN_').lower()
+            names.append(f'{model.actuator(a).name or a} ({on})')
+        return names
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
         if isinstance(names, str) or not names:
@@ -302,7 +464,7 @@ class Found:
         """Returns kp, kv and torque limit of a joint as the file's actuators have them."""
         model = self.model
         kp, kv, limits = 0.0, 0.0, []
-        at = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+        at = np.isin(model.actuator_trntype, [*map(int, _OF_JOINTS)]) & (
             model.actuator_trnid[:, 0] == joint
         )
         for a in np.flatnonzero(at):
