@@ -32,9 +32,17 @@ from dm_control import mjcf
 
 from trl_suite import errors
 from trl_suite.characters.character import CharacterRow, Joint
-from trl_suite.characters.found import (
-    KINDS, Found, Rotation, check_numbers, compiled, find_root, flat, named, problem, turned,
-)  # fmt: skip
+from trl_suite.characters.found import KINDS, Found
+from trl_suite.characters.model_file import (
+    Rotation,
+    check_numbers,
+    compiled,
+    find_root,
+    flat,
+    named,
+    problem,
+    turned,
+)
 from trl_suite.characters.rows import CHARACTERS
 from trl_suite.files import existing
 
