@@ -7,12 +7,14 @@
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
+    trl-suite try robot.urdf --spatial
     trl-suite doctor
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
     trl-suite gallery --only Dog2D_Gaps
 
 Bad input ends with one line on stderr and exit status 2. A command NAME is the function `run` of the
-module `trl_suite.commands.NAME`; the engine is imported only by those that need it.
+module `trl_suite.commands.NAME` (of try, a word of Python: `try_file`); the engine is imported only by
+those that need it.
 """
 
 from __future__ import annotations
@@ -163,6 +165,29 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--frames', action='store_true', help='print every fault in every frame')
     command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
     command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+
+    command = add('try', 'read a character from a file, tell what becomes of it, and draw it')
+    command.set_defaults(command='try_file')
+    command.add_argument('file', metavar='FILE', type=pathlib.Path, help='an .xml, .mjcf or .urdf')
+    command.add_argument('--root', metavar='BODY', help='that carries all others')
+    command.add_argument(
+        '--end-effectors', nargs='+', metavar='BODY', help='by default the last ones of each limb'
+    )
+    command.add_argument(
+        '--fall-links', nargs='+', metavar='BODY',
+        help='that must not touch the ground; by default the first one that can',
+    )  # fmt: skip
+    command.add_argument(
+        '--spatial', action=argparse.BooleanOptionalAction,
+        help="moves in three dimensions, or not; by default as the root's joints say",
+    )  # fmt: skip
+    command.add_argument(
+        '--turn', nargs=4, type=float, metavar=('W', 'X', 'Y', 'Z'),
+        help='a quaternion that makes it look along +x with z up',
+    )  # fmt: skip
+    command.add_argument(
+        '--output', type=pathlib.Path, metavar='FILE', help='a .png of it on three terrains'
+    )
 
     add('doctor', 'look at the installation; say what is wrong and what to do')
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -42,6 +42,24 @@ _SIDES = (
     ('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'), ('l$', 'r'), ('L$', 'R'),
 )  # fmt: skip
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
+
+
+def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Returns the direction (2,) that something looks along, or None if nothing tells it.
+
+    Args:
+      places: of its bodies by name, (3,) m; those named left or right are taken to lie there.
+    """
+    aside = np.zeros(3)
+    for left, place in places.items():
+        right = next((name for name in _right(left) if name in places), None)
+        if right is not None:
+            aside += place - places[right]
+    length = np.linalg.norm(aside[:2])
+    # Of what lies on its side, x and y say nothing.
+    if length < FACING * np.linalg.norm(aside) or not length:
+        return None
+    return np.array([aside[1], -aside[0]]) / length
 
 
 def _right(left: str) -> list[str]:
@@ -159,26 +177,14 @@ class Found:
                 'expected below it, z up. turn= turns it'
             )
             return
-        forward = self._facing(data)
+        forward = facing(
+            {name: data.xipos[i] for name, i in zip(self.bodies, self.ids, strict=True)}
+        )
         if forward is not None and forward[0] < FACING:
             self.notes.append(
                 f'it may look along {forward.round(2).tolist()}, as left and right bodies lie; expected '
                 'along +x, (1, 0). turn= turns it'
             )
-
-    def _facing(self, data: mujoco.MjData) -> np.ndarray | None:
-        """Returns the direction (2,) that left and right bodies are beside, or None without such."""
-        numbers = {self.model.body(i).name: i for i in self.ids}
-        aside = np.zeros(3)
-        for left in numbers:
-            right = next((name for name in _right(left) if name in numbers), None)
-            if right is not None:
-                aside += data.xipos[numbers[left]] - data.xipos[numbers[right]]
-        length = np.linalg.norm(aside[:2])
-        # Of what lies on its side, x and y say nothing.
-        if length < FACING * np.linalg.norm(aside) or not length:
-            return None
-        return np.array([aside[1], -aside[0]]) / length
 
     def left_out(self) -> list[str]:
         """Names of actuators that have no part in the character: what each acts on, in brackets."""
