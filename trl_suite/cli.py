@@ -24,7 +24,9 @@ import contextlib
 import os
 import pathlib
 import re
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -43,8 +45,10 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
 
     Returns:
       The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
-      error, with one line on stderr; 130 after an interrupt.
+      error, with one line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
         arguments = _parser(prog).parse_args(argv)
         command = engine.load(f'trl_suite.commands.{arguments.command}')
@@ -55,13 +59,28 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except _Terminated:
+        print('trl-suite: terminated', file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
     except (ValueError, ImportError, RuntimeError, OSError) as error:
         print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGTERM, before)
     return status
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: unfinished files are removed, as after an interrupt."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+    raise _Terminated
 
 
 class _Parser(argparse.ArgumentParser):

@@ -18,7 +18,7 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
 
     Raises:
       ValueError: the suffix is none of the given ones.
-      OSError: the folder does not exist, or the path is a folder.
+      OSError: the folder does not exist or cannot be written, or the path is a folder.
     """
     path = pathlib.Path(path)
     _check_suffix(path, suffixes)
@@ -26,6 +26,8 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
         raise FileNotFoundError(f'{path}: the folder {str(path.parent)!r} does not exist')
     if path.is_dir():
         raise IsADirectoryError(f'{path}: is a folder')
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f'{path}: the folder {str(path.parent)!r} cannot be written')
     return path
 
 
@@ -55,11 +57,19 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary path beside `path` that takes its place once all went well."""
+    """Yields a temporary path beside `path` that takes its place once all went well.
+
+    Raises:
+      OSError: what was raised within, with the path if it had none, as errors of writing have not.
+    """
     part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
     try:
         yield part
         os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(part), part):
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
 

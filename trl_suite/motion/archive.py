@@ -10,18 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.files import replacing
+
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
     """Writes an archive; an old file stays until the new one is whole."""
-    path = pathlib.Path(path)
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
-        with part.open('wb') as file:
-            arrays = {name: np.asarray(value) for name, value in fields.items()}
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    arrays = {name: np.asarray(value) for name, value in fields.items()}
+    with replacing(pathlib.Path(path)) as part, part.open('wb') as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def read(

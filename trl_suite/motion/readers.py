@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.files import replacing
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES
 
@@ -150,13 +151,8 @@ def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
         frames[:, here] = _upright(frames[:, here])
     rows = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
     text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{rows}\n]\n}}\n'
-    path = pathlib.Path(path)
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
+    with replacing(pathlib.Path(path)) as part:
         part.write_text(text)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _parse(path: pathlib.Path) -> dict[str, Any]:
