@@ -168,7 +168,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command = add('clip', 'carry a motion file over to a character, and check it')
     command.add_argument(
         'file', metavar='FILE', type=pathlib.Path,
-        help='a .bvh, .amc, .json (TerrainRL, DeepMimic) or .npz',
+        help='BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; its content tells',
     )  # fmt: skip
     command.add_argument('--character', required=True, help='name of a character')
     command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')

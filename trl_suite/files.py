@@ -31,15 +31,16 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
     return path
 
 
-def existing(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
+def existing(path: Path, suffixes: tuple[str, ...] | None = None) -> pathlib.Path:
     """Returns a path that can be read.
 
     Raises:
-      ValueError: the suffix is none of the given ones.
+      ValueError: suffixes are given, and that of the path is none of them.
       FileNotFoundError: there is no such file; the message has those with similar names beside it.
     """
     path = pathlib.Path(path)
-    _check_suffix(path, suffixes)
+    if suffixes is not None:
+        _check_suffix(path, suffixes)
     if not path.is_file():
         beside = [p.name for p in path.parent.glob('*')] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, beside, n=3, cutoff=0.5)
@@ -53,6 +54,37 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
         raise ValueError(
             f'{path}: unknown suffix {path.suffix!r}; expected {" or ".join(suffixes)}'
         )
+
+
+def read_text(path: Path) -> str:
+    """Returns the text of a file.
+
+    Raises:
+      ValueError: it is not UTF-8; the message names the file and the byte.
+      OSError: it cannot be read.
+    """
+    try:
+        return pathlib.Path(path).read_text(encoding='utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f'{path}: not text in UTF-8: {error.reason} at byte {error.start}'
+        ) from None
+
+
+def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+      ValueError: it is not JSON, or nested too deeply; the message names the file.
+      OSError: it cannot be read.
+    """
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError(f'{path}: not JSON: nested too deeply') from None
+    except ValueError as error:  # also of numbers with too many digits
+        raise ValueError(f'{path}: not JSON: {error}') from None
 
 
 @contextlib.contextmanager

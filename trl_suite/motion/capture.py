@@ -13,12 +13,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
+import tempfile
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from trl_suite.files import existing
+from trl_suite import errors
+from trl_suite.files import existing, read_text
 from trl_suite.motion import quaternion
 
 BVH_UNIT = 0.01  # m; most files are in cm
@@ -70,18 +72,25 @@ def read_bvh(
       FileNotFoundError: there is no such file.
       ImportError: the extra 'clips' is not installed.
     """
-    path = existing(path, ('.bvh',))
+    path = existing(path)
     axes = frame(forward, up)
+    text = read_text(path)
+    _check_bvh(path, text)
     try:
         import pybvh
     except ImportError as error:
         raise ImportError(
             "pybvh is needed to read BVH and missing; pip install 'trl_suite[clips]'"
         ) from error
-    try:
-        found = pybvh.read_bvh_file(path, world_up='+y', warn_on_world_up_disagreement=False)
-    except (ValueError, IndexError) as error:
-        raise ValueError(f'{path}: {error}') from None
+    with tempfile.TemporaryDirectory() as folder:
+        copy = pathlib.Path(folder, 'copy.bvh')  # pybvh reads no other suffix
+        copy.write_text(text)
+        try:
+            found = pybvh.read_bvh_file(copy, world_up='+y', warn_on_world_up_disagreement=False)
+        except (ValueError, IndexError) as error:
+            raise ValueError(f'{path}: {error}'.replace(str(copy), path.name)) from None
+    if not 0 < found.frame_time < np.inf:
+        raise ValueError(f'{path}: Frame Time is {found.frame_time}; expected a positive number')
     nodes = [node for node in found.nodes if not node.is_end_site()]
     numbers = {node: i for i, node in enumerate(nodes)}
     parents = [-1 if node.parent is None else numbers[node.parent] for node in nodes]
@@ -108,7 +117,7 @@ def read_amc(
     A joint has the name of the bone that hangs on it.
 
     Args:
-      path: the .amc file.
+      path: the motion, an .amc file.
       skeleton: the .asf file that belongs to it.
       rate: frames per second.
       unit: of lengths, m, before the file's own factor.
@@ -118,7 +127,7 @@ def read_amc(
       ValueError: a malformed file; the message names file and line.
       FileNotFoundError: there is no such file.
     """
-    path, skeleton = existing(path, ('.amc',)), existing(skeleton, ('.asf',))
+    path, skeleton = existing(path), existing(skeleton)
     axes = frame(forward, up)
     if not 0 < rate < np.inf:
         raise ValueError(f'rate is {rate}; expected a positive number of frames per second')
@@ -211,16 +220,42 @@ def _capture(
     )
 
 
+def _check_bvh(path: pathlib.Path, text: str) -> None:
+    """Refuses, by line, what pybvh does not read or does not refuse."""
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        key = words[0].upper() if words else ''
+        if key == 'MOTION':
+            return
+        if key == 'OFFSET' and not _three_numbers(words[1:]):
+            raise ValueError(
+                f'{path}, line {number}: {line.strip()!r}; expected OFFSET and three finite numbers'
+            )
+        if key == 'CHANNELS' and words[1:2] == ['0']:
+            raise ValueError(
+                f'{path}, line {number}: {line.strip()!r}: a joint without channels is not read; '
+                "expected 'CHANNELS 3 Zrotation Xrotation Yrotation', and three zeros in every frame"
+            )
+    raise ValueError(f'{path}: there is no line MOTION; expected one after the HIERARCHY')
+
+
+def _three_numbers(words: Sequence[str]) -> bool:
+    try:
+        return len(words) == 3 and bool(np.isfinite(np.array(words, float)).all())
+    except ValueError:
+        return False
+
+
 def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, bool]:
     """Reads a .asf file: bones, parents before children, the factor of lengths, and if in degrees."""
     bones: dict[str, dict[str, Any]] = {
         'root': {'parent': '', 'dof': [], 'axis': np.zeros(3), 'order': 'xyz', 'tip': np.zeros(3)}
     }
     root = bones['root']
-    bone: dict[str, Any] = {}
+    bone: dict[str, Any] | None = None
     children: list[str] = []
     section, length, degrees = '', 1.0, True
-    for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split('#')[0].split()
         if not words:
             continue
@@ -229,46 +264,92 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
             if key.startswith(':'):
                 section = key[1:]
             elif section == 'units' and key == 'length':
-                length = float(values[0])
+                length = _number(values, positive=True)
             elif section == 'units' and key == 'angle':
-                degrees = values[0].lower().startswith('deg')
+                degrees = ''.join(values).lower().startswith('deg')
             elif section == 'root' and key == 'order':
-                root['dof'] = [value.lower() for value in values]
+                root['dof'] = _dofs(values)
+                if not {'tx', 'ty', 'tz'} <= {*root['dof']}:
+                    raise ValueError('expected TX, TY and TZ among them')
             elif section == 'root' and key == 'axis':
-                root['order'] = values[0].lower()
+                root['order'] = _order(values)
             elif section == 'root' and key == 'orientation':
-                root['axis'] = np.array(values, float)
+                root['axis'] = _vector(values)
             elif section == 'bonedata' and key == 'begin':
                 bone = {'dof': [], 'axis': np.zeros(3), 'order': 'xyz'}
-            elif section == 'bonedata' and key == 'end':
-                bones[bone['name']] = {**bone, 'tip': bone['length'] * bone['direction']}
-            elif section == 'bonedata' and key == 'name':
-                bone['name'] = values[0]
-            elif section == 'bonedata' and key == 'length':
-                bone['length'] = float(values[0])
-            elif section == 'bonedata' and key == 'direction':
-                bone['direction'] = np.array(values, float)
-            elif section == 'bonedata' and key == 'axis':
-                bone['axis'], bone['order'] = np.array(values[:3], float), values[3].lower()
-            elif section == 'bonedata' and key == 'dof':
-                bone['dof'] = [value.lower() for value in values]
+            elif section == 'bonedata' and bone is None:
+                raise ValueError("expected 'begin' before it")
+            elif section == 'bonedata' and bone is not None:
+                if key == 'end':
+                    for needed in ('name', 'length', 'direction'):
+                        if needed not in bone:
+                            raise ValueError(f'the bone has no {needed}')
+                    bones[bone['name']] = {**bone, 'tip': bone['length'] * bone['direction']}
+                    bone = None
+                elif key == 'name':
+                    (bone['name'],) = values
+                    if bone['name'] in bones:
+                        raise ValueError('the name is taken')
+                elif key == 'length':
+                    bone['length'] = _number(values)
+                elif key == 'direction':
+                    bone['direction'] = _vector(values)
+                elif key == 'axis':
+                    bone['axis'], bone['order'] = _vector(values[:3]), _order(values[3:])
+                elif key == 'dof':
+                    bone['dof'] = _dofs(values)
             elif section == 'hierarchy' and key not in ('begin', 'end'):
                 if words[0] not in ('root', *children):
                     raise ValueError('a bone whose own parent is not named above')
                 for child in values:
+                    if child not in bones:
+                        raise ValueError(errors.unknown('bone', child, bones))
+                    if child in ('root', *children):
+                        raise ValueError(f'{child!r} has a parent already')
                     bones[child]['parent'] = words[0]
                     children.append(child)
-        except (ValueError, KeyError, IndexError) as error:
-            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error!r}') from None
+        except ValueError as error:
+            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error}') from None
     if not root['dof'] or not children:
         raise ValueError(f'{path}: expected the sections :root and :hierarchy')
     return {name: bones[name] for name in ('root', *children)}, length, degrees
 
 
+def _number(values: Sequence[str], positive: bool = False) -> float:
+    (number,) = map(float, values)
+    if not 0 <= number < np.inf or (positive and not number):
+        raise ValueError(f'expected a {"positive" if positive else "finite"} number')
+    return number
+
+
+def _vector(values: Sequence[str]) -> np.ndarray:
+    if not _three_numbers(values):
+        raise ValueError('expected three finite numbers')
+    return np.array(values, float)
+
+
+def _order(values: Sequence[str]) -> str:
+    (order,) = values
+    if sorted(order.lower()) != ['x', 'y', 'z']:
+        raise ValueError('expected an order of axes, such as XYZ')
+    return order.lower()
+
+
+def _dofs(values: Sequence[str]) -> list[str]:
+    found = [value.lower() for value in values]
+    known = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz', 'l')
+    for dof in found:
+        if dof not in known:
+            raise ValueError(errors.unknown('degree of freedom', dof, known))
+    if len({*found}) < len(found):
+        raise ValueError('one of them is given twice')
+    return found
+
+
 def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[str, list[float]]]:
     """Reads a .amc file: the numbers of every bone, frame by frame."""
     frames: list[dict[str, list[float]]] = []
-    for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0][0] in '#:':
             continue
@@ -278,12 +359,20 @@ def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[s
                 frames.append({})
                 continue
             name, values = words[0], list(map(float, words[1:]))
+            if not frames:
+                raise ValueError('expected the number of a frame before it')
+            if name not in bones:
+                raise ValueError(errors.unknown('bone', name, bones))
             expected = len(bones[name]['dof'])
             if len(values) != expected:
                 raise ValueError(f'{len(values)} numbers; expected {expected}')
+            if not np.isfinite(values).all():
+                raise ValueError('expected finite numbers')
             frames[-1][name] = values
-        except (ValueError, KeyError, IndexError) as error:
-            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error!r}') from None
+        except ValueError as error:
+            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error}') from None
+    if len(frames) < 2:
+        raise ValueError(f'{path}: {len(frames)} frames; expected at least 2')
     for i, found in enumerate(frames):
         if 'root' not in found:
             raise ValueError(f'{path}: frame {i} has no root')

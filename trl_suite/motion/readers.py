@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.files import replacing
+from trl_suite.files import read_json, replacing
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES
 
@@ -82,10 +82,10 @@ def read_terrainrl(
 
 def read_deepmimic(
     path: str | os.PathLike[str],
-    joints: Sequence[str] = tuple(HUMANOID3D),
-    sizes: Sequence[int] = tuple(HUMANOID3D.values()),
+    joints: Sequence[str] | None = None,
+    sizes: Sequence[int] | None = None,
 ) -> Clip:
-    """Reads a DeepMimic motion file; the layout is humanoid3d's unless given.
+    """Reads a DeepMimic motion file.
 
     As in DeepMimic the first frame is moved over the origin, and `CycleSyncRootRot` lets the
     heading that a cycle gains accumulate. A looping clip gains no height over cycles unless
@@ -94,7 +94,8 @@ def read_deepmimic(
 
     Args:
       path: JSON file.
-      joints: joint names in the order of the character file, without fixed joints.
+      joints: joint names in the order of the character file, without fixed joints; by default those
+        of `HUMANOID3D` or `DOG3D`, whichever has as many numbers as a frame.
       sizes: columns of each, 1 (hinge) or 4 (ball).
 
     Returns:
@@ -115,6 +116,9 @@ def read_deepmimic(
     if not isinstance(turning, bool):
         raise ValueError(f'{path}: CycleSyncRootRot: true or false is needed, found {turning!r}')
     frames = _frames(path, motion)
+    if joints is None or sizes is None:
+        layout = _deepmimic_layout(path, frames.shape[1])
+        joints, sizes = tuple(layout), tuple(layout.values())
     if looping:
         if motion.get('CycleSyncRootPos', True) is not True:
             found = motion['CycleSyncRootPos']
@@ -126,6 +130,17 @@ def read_deepmimic(
     frames[:, [1, 3]] -= frames[0, [1, 3]]
     clip = _clip(path, frames, joints, sizes, 'free', looping)
     return dataclasses.replace(clip, turning=looping and turning)
+
+
+def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
+    """Returns the layout whose frames have so many numbers."""
+    known = {_HEADER + sum(layout.values()): layout for layout in (HUMANOID3D, DOG3D)}
+    if length not in known:
+        lengths = ' or '.join(f'{count} ({len(layout)} joints)' for count, layout in known.items())
+        raise ValueError(
+            f"{path}: frame 0 has {length} numbers; DeepMimic's humanoid and dog have {lengths}"
+        )
+    return known[length]
 
 
 def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
@@ -156,10 +171,7 @@ def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
 
 
 def _parse(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        motion = json.loads(path.read_text(encoding='utf-8'))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f'{path}: not JSON: {error}') from None
+    motion = read_json(path)
     if not isinstance(motion, dict):
         raise ValueError(f'{path}: an object with Frames is needed')
     return motion
