@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import io
 import json
 import os
 import pathlib
+import zipfile
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 Path = str | os.PathLike[str]
+LARGEST = 2**28  # bytes of a text, or of the arrays of an archive, 268 MB
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
@@ -56,13 +61,50 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
         )
 
 
+def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> None:
+    """Checks how many bytes a file has, before it is read.
+
+    Args:
+      path: of the file.
+      largest: bytes.
+      size: bytes once it is read, if not those of the file.
+
+    Raises:
+      ValueError: too many; the message names the file and both sizes.
+    """
+    size = pathlib.Path(path).stat().st_size if size is None else size
+    if size > largest:
+        raise ValueError(
+            f'{path}: has {size / 1e6:.0f} MB; expected no more than {largest / 1e6:.0f} MB'
+        )
+
+
+def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
+    """Opens an archive of arrays (.npz) without pickled objects.
+
+    Raises:
+      ValueError: it is too large, once inflated; or no archive.
+      OSError: it cannot be read.
+    """
+    check_size(path)
+    content = io.BytesIO(pathlib.Path(path).read_bytes())
+    try:
+        with zipfile.ZipFile(content) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(f'{path}: no archive of arrays (.npz): {error}') from None
+    check_size(path, size=size)
+    return np.load(content, allow_pickle=False)
+
+
 def read_text(path: Path) -> str:
     """Returns the text of a file.
 
     Raises:
-      ValueError: it is not UTF-8; the message names the file and the byte.
+      ValueError: it is too large or not UTF-8; the message names the file and the byte.
       OSError: it cannot be read.
     """
+    check_size(path)
     try:
         return pathlib.Path(path).read_text(encoding='utf-8-sig')
     except UnicodeDecodeError as error:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from trl_suite import errors
 from trl_suite import terrain as terrains
 from trl_suite.files import Path, check_path, replacing
 from trl_suite.terrain.spatial_ground import AHEAD, SAMPLES
@@ -29,6 +30,7 @@ MAP_PIXELS = 8  # of each sample of a height map, along both axes
 HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
 ROOT_COLOUR = (20, 20, 20)  # where the character stands on its height map
 MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
+MOST_DRAWS = 100  # in one plot
 MAP_POINTS = 400  # at most, along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
@@ -227,8 +229,7 @@ def plot_terrain(
     """
     terrain = terrains.load(terrain)
     target = check_path(path, IMAGE_SUFFIXES)
-    if draws < 1:
-        raise ValueError(f'draws is {draws}; expected at least 1')
+    errors.check_whole('draws', draws, 1, MOST_DRAWS)
     longest = MAX_SPAN if terrain.spatial else 10_000.0
     if not 0 < length <= longest:
         raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')

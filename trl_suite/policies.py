@@ -73,7 +73,6 @@ Floats are written as float32, or as float16 where nothing is lost by it.
 from __future__ import annotations
 
 import difflib
-import io
 import json
 import os
 from typing import Any
@@ -81,7 +80,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite import resources
-from trl_suite.files import check_path, existing, replacing
+from trl_suite.files import check_path, existing, load_arrays, replacing
 from trl_suite.network import ACTIVATIONS, Convolution, Policy, placed
 from trl_suite.symmetry import Mirror
 
@@ -162,13 +161,10 @@ def load(path: str | os.PathLike[str]) -> Policy:
       FileNotFoundError: there is no such file.
     """
     path = existing(path, ('.npz',))
-    content = io.BytesIO(path.read_bytes())
     fields: dict[str, Any] = {}
     read = _Reader()
     try:
-        archive = np.load(content, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError('a single array')
+        archive = load_arrays(path)
         read.archive = archive
         for name, (kind, axes) in _FIELDS.items():
             fields[name] = read(name, kind, axes).tolist()
@@ -206,7 +202,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
     except Exception as error:  # a damaged archive fails in a dozen ways
         where = f'field {read.field!r}' if read.field else 'no readable policy'
-        raise ValueError(f'{path}: {where}: {error}') from None
+        raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
     for name in ('format', 'version', 'layers'):
         del fields[name]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pathlib
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.files import replacing
+from trl_suite.files import load_arrays, replacing
 
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
@@ -39,21 +38,20 @@ def read(
       ValueError: for a broken file or a malformed field (names file and field).
       FileNotFoundError: if there is no file at the path.
     """
-    content = io.BytesIO(path.read_bytes())
     found: dict[str, Any] = {}
     field = ''
     try:
-        archive = np.load(content, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError('a single array')
+        archive = load_arrays(path)
         for field in fields:
             if field in archive:
                 found[field] = archive[field]
             elif not defaults or field not in defaults:
                 raise ValueError('is missing')
+    except FileNotFoundError:
+        raise
     except Exception as error:  # a damaged archive fails in a dozen ways
         where = f'field {field!r}' if field else f'no readable {what}'
-        raise ValueError(f'{path}: {where}: {error}') from None
+        raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     for field, value in found.items():
         form = fields[field]
         if form is None:

@@ -30,6 +30,7 @@ from trl_suite.kinematics.planar import (
 )
 from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.task import (
+    MOST_SUBSTEPS,
     Outcome,
     Task,
     begin,
@@ -430,8 +431,7 @@ class GaitTask(Task):
         """
         if interface not in INTERFACES:
             raise ValueError(errors.unknown('interface', interface, INTERFACES))
-        if int(substeps) != substeps or substeps < 1:
-            raise ValueError(f'substeps is {substeps}; expected a positive integer')
+        errors.check_whole('substeps', substeps, 1, MOST_SUBSTEPS)
         if not 0 <= start_noise < np.inf:
             raise ValueError(f'start_noise is {start_noise}; expected 0 or a positive number')
         self.character, self.arena, self.interface = character, arena, interface

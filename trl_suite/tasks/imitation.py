@@ -34,6 +34,7 @@ from trl_suite.motion import Clip
 from trl_suite.tasks import rewards
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    MOST_SUBSTEPS,
     Outcome,
     Task,
     begin,
@@ -52,6 +53,7 @@ CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
 VIEW_BEHIND = 0.5  # m; where the line of terrain samples begins
 VIEW_AHEAD = 3.0  # m; where it ends
+MOST_SAMPLES = 10_000  # of that line
 PHASE_BINS = 4
 CENTRES = ('clip', 'posture', 'original')  # of position control
 
@@ -358,12 +360,10 @@ class Imitation(Task):
             raise ValueError(f'centre and half_range shape position control, not {model} control')
         if half_range is not None and not 0 < half_range < np.inf:
             raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-        if int(terrain_samples) != terrain_samples or terrain_samples < 0 or terrain_samples == 1:
-            raise ValueError(f'terrain_samples is {terrain_samples}; expected 0, or at least 2')
-        if int(substeps) != substeps or substeps < 4:
-            raise ValueError(
-                f'substeps is {substeps}; expected an integer of at least 4 (physics at 120 Hz)'
-            )
+        if terrain_samples != 0:
+            why = ', or 0 for none'
+            errors.check_whole('terrain_samples', terrain_samples, 2, MOST_SAMPLES, why)
+        errors.check_whole('substeps', substeps, 4, MOST_SUBSTEPS, ' (physics at 120 Hz to 30 kHz)')
 
     @property
     def root_entity(self) -> PlanarTerrain:

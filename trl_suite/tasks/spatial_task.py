@@ -28,6 +28,7 @@ from trl_suite.symmetry import Mirror
 from trl_suite.tasks import reflection3d
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    MOST_SUBSTEPS,
     Outcome,
     Task,
     consecutive,
@@ -528,10 +529,7 @@ def check_drive(actuation_model: str, centre: str, half_range: float | None, sub
         raise ValueError("centre 'original' has ranges of its own: give no half_range")
     if half_range is not None and not 0 < half_range < np.inf:
         raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-    if int(substeps) != substeps or substeps < 6:
-        raise ValueError(
-            f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
-        )
+    errors.check_whole('substeps', substeps, 6, MOST_SUBSTEPS, ' (physics at 180 Hz to 30 kHz)')
 
 
 def position_range(

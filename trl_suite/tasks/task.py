@@ -18,6 +18,7 @@ from trl_suite.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.util.compiled import compiled
 
+MOST_SUBSTEPS = 1000  # physics steps per control step
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite import actuation
+from trl_suite import actuation, errors
 from trl_suite.action_map import Drive, drive
 from trl_suite.arenas import PlanarTerrain, SpatialTerrain
 from trl_suite.characters import Character
@@ -37,6 +37,7 @@ from trl_suite.tasks import parts
 from trl_suite.tasks.imitation import CONTROL_TIMESTEP, SUBSTEPS, VIEW_AHEAD, VIEW_BEHIND
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
+    MOST_SUBSTEPS,
     Outcome,
     Task,
     conclude,
@@ -246,8 +247,7 @@ class Walk(Task):
         Raises:
           ValueError: options out of range.
         """
-        if int(substeps) != substeps or substeps < 4:
-            raise ValueError(f'substeps is {substeps}; expected an integer of at least 4')
+        errors.check_whole('substeps', substeps, 4, MOST_SUBSTEPS)
         self.character, self.arena = character, arena
         self._blend, self._spatial = blend, character.row.spatial
         self.terrain_map = terrain_view and self._spatial
