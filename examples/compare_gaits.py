@@ -19,6 +19,7 @@ import numpy as np
 import train_all
 
 from trl_suite import evaluation, files, policies, resources
+from trl_suite.util.program import begin_script
 
 
 def line(name: str, found: dict[str, Any]) -> str:
@@ -56,4 +57,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

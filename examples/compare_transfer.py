@@ -15,6 +15,7 @@ import json
 import train_all
 
 from trl_suite import catalogue, evaluation, files, policies, resources
+from trl_suite.util.program import begin_script
 
 
 def flat_ground(row: catalogue.Row) -> str:
@@ -52,4 +53,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

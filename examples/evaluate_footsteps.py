@@ -22,6 +22,7 @@ import numpy as np
 
 from trl_suite import files, policies, suite
 from trl_suite.catalogue import Row
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped3D_LLC_General_Step-v0'
@@ -143,4 +144,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

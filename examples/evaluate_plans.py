@@ -24,6 +24,7 @@ import numpy as np
 from trl_suite import catalogue, errors, files, policies, resources
 from trl_suite.scripted import scripted
 from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
@@ -135,4 +136,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

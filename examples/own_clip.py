@@ -10,6 +10,7 @@ Reads BVH, CMU's AMC, and the JSON of TerrainRL and DeepMimic. Where joints have
 import argparse
 
 from trl_suite import clip_check, rendering, retargeting, suite
+from trl_suite.util.program import begin_script
 
 
 def main(arguments=None):
@@ -36,4 +37,5 @@ def main(arguments=None):
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -19,6 +19,7 @@ import numpy as np
 import train_all
 
 from trl_suite import catalogue, resources
+from trl_suite.util.program import begin_script
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
@@ -365,4 +366,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

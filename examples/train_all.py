@@ -39,6 +39,7 @@ import search_gaits
 import tqdm
 
 from trl_suite import catalogue, errors, evaluation, files, policies, resources
+from trl_suite.util.program import begin_script
 
 EPISODES, SEED = 50, 0  # of the published evaluation
 FALL_EPISODES, FALL_STEPS = 200, 5000  # cycles; how far gaits get before they fall
@@ -217,4 +218,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -34,6 +34,7 @@ from trl_suite import errors
 from trl_suite.catalogue import Row
 from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
 from trl_suite.tasks.gait import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 START_NOISE = 0.01  # rad, of the joints; see `GaitTask`
@@ -364,4 +365,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -24,9 +24,7 @@ import contextlib
 import os
 import pathlib
 import re
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -34,6 +32,7 @@ import trl_suite
 from trl_suite import acting
 from trl_suite.commands import engine
 from trl_suite.commands.list import FILTERS
+from trl_suite.util import program
 
 
 def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
@@ -47,40 +46,27 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
       The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
       error, with one line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, _terminate) if in_main_thread else None
     try:
-        arguments = _parser(prog).parse_args(argv)
-        command = engine.load(f'trl_suite.commands.{arguments.command}')
-        status = command.run(arguments) or 0
-        sys.stdout.flush()
+        with program.terminable():
+            arguments = _parser(prog).parse_args(argv)
+            command = engine.load(f'trl_suite.commands.{arguments.command}')
+            status = command.run(arguments) or 0
+            sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except _Terminated:
+    except program.Terminated:
         print('trl-suite: terminated', file=sys.stderr)
         return 143
     except KeyboardInterrupt:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
-    except (ValueError, ImportError, RuntimeError, OSError) as error:
-        print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
+    except program.EXPECTED as error:
+        print(f'trl-suite: error: {program.in_one_line(error)}', file=sys.stderr)
         return 2
-    finally:
-        if in_main_thread:
-            signal.signal(signal.SIGTERM, before)
     return status
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM: unfinished files are removed, as after an interrupt."""
-
-
-def _terminate(number: int, frame: object) -> None:
-    signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
-    raise _Terminated
 
 
 class _Parser(argparse.ArgumentParser):
