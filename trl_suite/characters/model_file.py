@@ -11,6 +11,7 @@ import numpy as np
 from lxml import etree
 
 from trl_suite import errors
+from trl_suite.files import check_size
 
 # Of a file, besides bodies: what must have a name to be found again.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
@@ -56,9 +57,10 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
       file: which is read with all that it includes and loads.
       above: files that load it, the first one first.
     """
+    check_size(file)
     try:
         parser = etree.XMLParser(resolve_entities=False)
-        elements = [*etree.parse(file, parser).getroot().iter(etree.Element)]
+        elements = [*etree.fromstring(file.read_bytes(), parser).iter(etree.Element)]
     except etree.XMLSyntaxError as error:
         raise problem(file, f'not a model: {error}') from None
     names = {element.get(key) for element in elements for key in ('name', 'class')}

@@ -22,6 +22,7 @@ import numpy as np
 from trl_suite import errors
 from trl_suite.files import existing, read_text
 from trl_suite.motion import quaternion
+from trl_suite.motion.layout import LARGEST
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; inches, times what the file says
@@ -89,7 +90,12 @@ def read_bvh(
             found = pybvh.read_bvh_file(copy, world_up='+y', warn_on_world_up_disagreement=False)
         except (ValueError, IndexError) as error:
             raise ValueError(f'{path}: {error}'.replace(str(copy), path.name)) from None
-    if not 0 < found.frame_time < np.inf:
+    values = np.concatenate(
+        [found.root_pos, found.joint_angles.reshape(len(found.root_pos), -1)], axis=1
+    )
+    for bad in np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1)):
+        raise ValueError(f'{path}: frame {bad}: a number is not finite, or too large')
+    if not 0 < found.frame_time < LARGEST:
         raise ValueError(f'{path}: Frame Time is {found.frame_time}; expected a positive number')
     nodes = [node for node in found.nodes if not node.is_end_site()]
     numbers = {node: i for i, node in enumerate(nodes)}
@@ -213,8 +219,9 @@ def _capture(
             rest[i] = rest[parent] + offsets[i]
             turns[:, i] = quaternion.multiply(turns[:, parent], local[i])
     turns[..., 1:] = turns[..., 1:] @ axes.T
-    if not (np.isfinite(turns).all() and np.isfinite(place).all()):
-        raise ValueError(f'{path}: a value is not finite')
+    for what, values in (('rotation', turns), ('position', place), ('length', rest)):
+        if not (np.abs(values) < LARGEST).all():
+            raise ValueError(f'{path}: a {what} is not finite, or larger than {LARGEST:g}')
     return Capture(
         path.stem, times, tuple(names), tuple(parents), rest @ axes.T, place @ axes.T, turns
     )
@@ -241,7 +248,7 @@ def _check_bvh(path: pathlib.Path, text: str) -> None:
 
 def _three_numbers(words: Sequence[str]) -> bool:
     try:
-        return len(words) == 3 and bool(np.isfinite(np.array(words, float)).all())
+        return len(words) == 3 and bool((np.abs(np.array(words, float)) < LARGEST).all())
     except ValueError:
         return False
 
@@ -317,7 +324,7 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
 
 def _number(values: Sequence[str], positive: bool = False) -> float:
     (number,) = map(float, values)
-    if not 0 <= number < np.inf or (positive and not number):
+    if not (1 / LARGEST if positive else 0) <= number < LARGEST:
         raise ValueError(f'expected a {"positive" if positive else "finite"} number')
     return number
 
@@ -366,7 +373,7 @@ def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[s
             expected = len(bones[name]['dof'])
             if len(values) != expected:
                 raise ValueError(f'{len(values)} numbers; expected {expected}')
-            if not np.isfinite(values).all():
+            if not (np.abs(values) < LARGEST).all():
                 raise ValueError('expected finite numbers')
             frames[-1][name] = values
         except ValueError as error:

@@ -22,12 +22,11 @@ import numpy as np
 
 from trl_suite.files import read_json, replacing
 from trl_suite.motion.clip import Clip
-from trl_suite.motion.layout import JOINT_SIZES
+from trl_suite.motion.layout import JOINT_SIZES, LARGEST
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
 _FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by
 _ZERO = 1e-6  # length below which a quaternion has no direction
-_LARGEST = 1e300  # beyond it an integer of the file may not fit a float
 
 
 # Joint layouts of DeepMimic's characters: name -> columns. Fixed joints (wrists) have no columns.
@@ -193,8 +192,11 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
             )
         for j, value in enumerate(frame):
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (number and abs(value) < _LARGEST):  # false for NaN, too
-                raise ValueError(f'{path}: frame {i}, {_field(j)}: {value!r} is no finite number')
+            if not (number and abs(value) < LARGEST):  # false for NaN, too
+                shown = repr(value) if len(repr(value)) < 40 else f'{repr(value)[:40]}...'
+                raise ValueError(
+                    f'{path}: frame {i}, {_field(j)}: {shown} is no finite number below {LARGEST:g}'
+                )
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
     array = np.array(frames, dtype=float)
