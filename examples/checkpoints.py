@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from trl_suite import files
+from trl_suite.util import files
 
 try:
     import fcntl

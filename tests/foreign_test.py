@@ -83,15 +83,15 @@ class ForeignFileTest(parameterized.TestCase):
 
     @parameterized.parameters(*FILES)
     def test_the_same_geoms_collide_as_in_the_file(self, path):
-        row = read(self, path)
+        made = read(self, path)
         spec = mujoco.MjSpec.from_file(str(file(self, path)))
-        root = next(body for body in spec.bodies if body.name == row.links[0])
+        root = next(body for body in spec.bodies if body.name == made.links[0])
         if not root.joints:
             root.add_freejoint()  # or all that hangs on it is welded to the world
         theirs = spec.compile()
-        environment = suite.build(row, task='walk')
+        environment = suite.build(made, task='walk')
         ours = environment.physics.model
-        own = [i for i in range(ours.nbody) if ours.id2name(i, 'body').startswith(f'{row.name}/')]
+        own = [i for i in range(ours.nbody) if ours.id2name(i, 'body').startswith(f'{made.name}/')]
         own = own[1:]  # without the frame to which it is attached
         self.assertEqual(
             colliding(ours.ptr, own),
@@ -105,7 +105,7 @@ class ForeignFileTest(parameterized.TestCase):
         physics = environment.physics
         root = environment.task.character.root_body
         own = np.array([
-            physics.model.id2name(i, 'body').startswith(f'{environment.task.character.row.name}/')
+            physics.model.id2name(i, 'body').startswith(f'{environment.task.character.spec.name}/')
             for i in range(physics.model.nbody)
         ])  # fmt: skip
         bodies = physics.model.geom_bodyid

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from lxml import etree
 
-from trl_suite import errors
-from trl_suite.files import check_size
+from trl_suite.util import errors
+from trl_suite.util.files import check_size
 
 # Of a file, besides bodies: what must have a name to be found again.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
-from trl_suite.files import existing, read_text
 from trl_suite.motion import quaternion
 from trl_suite.motion.layout import LARGEST
+from trl_suite.util import errors
+from trl_suite.util.files import existing, read_text
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; inches, times what the file says

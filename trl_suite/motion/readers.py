@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.files import read_json, replacing
 from trl_suite.motion.clip import Clip
 from trl_suite.motion.layout import JOINT_SIZES, LARGEST
+from trl_suite.util.files import read_json, replacing
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
 _FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by

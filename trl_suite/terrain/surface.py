@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.files import check_size, existing
-from trl_suite.terrain.generators import GENERATORS, Parameters, register_line
-from trl_suite.terrain.layout import GRID, Layout
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.spatial import GENERATORS3D, register3d
+from trl_suite.terrain.planar.generators import GENERATORS, Parameters, register_line
+from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
+from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.files import check_size, existing
 
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
