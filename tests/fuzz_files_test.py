@@ -135,7 +135,7 @@ def policy(path):
 def ground(path):
     """Reads terrain; heights are finite."""
     found = terrain.load(path)
-    draw = terrain.Ground if found.spatial else terrain.Strip
+    draw = terrain.SpatialGround if found.spatial else terrain.PlanarGround
     made = draw(found, seed=1)
     heights = made.height(np.linspace(-5, 5, 50), 0.0) if found.spatial else made.window(0, 400)[0]
     np.testing.assert_array_equal(np.isfinite(heights), True)
