@@ -4,7 +4,7 @@ import pathlib
 
 from setuptools import find_packages, setup
 
-TORCH = 'torch>=2.4,<2.14'
+TORCH = 'torch>=2.5,<2.14'
 BVH = 'pybvh>=0.9,<1'
 
 setup(
@@ -75,6 +75,7 @@ setup(
             'pytest-xdist',
             'build',
             'gymnasium>=1.1',
+            'hypothesis>=6',
             'imageio[ffmpeg]',
             'matplotlib',
             'scipy',

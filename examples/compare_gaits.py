@@ -20,6 +20,7 @@ import train_all
 
 from trl_suite import evaluation, policies
 from trl_suite.util import files, resources
+from trl_suite.util.program import begin_script
 
 
 def line(name: str, found: dict[str, Any]) -> str:
@@ -57,4 +58,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

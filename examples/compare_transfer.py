@@ -17,6 +17,7 @@ import train_all
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.util import files, resources
+from trl_suite.util.program import begin_script
 
 
 def flat_ground(spec: catalogue.EnvSpec) -> str:
@@ -54,4 +55,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -17,6 +17,7 @@ import ppo_settings
 import torch
 
 from trl_suite import sequences
+from trl_suite.util.program import begin_script
 
 
 class FineTuning:
@@ -80,4 +81,5 @@ def main(arguments=None):
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -23,6 +23,7 @@ import numpy as np
 from trl_suite import policies, suite
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped3D_LLC_General_Step-v0'
@@ -144,4 +145,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

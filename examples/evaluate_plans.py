@@ -26,6 +26,7 @@ from trl_suite.registry import catalogue
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.tasks.navigation.scripted import scripted
 from trl_suite.util import errors, files, resources
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
@@ -137,4 +138,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

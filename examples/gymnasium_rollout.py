@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 
 import trl_suite.gym  # noqa: F401, registers the environments
+from trl_suite.util.program import begin_script
 
 ID = 'trl_suite/PD_Biped2D_Gaps_Terrain-v0'
 
@@ -35,4 +36,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

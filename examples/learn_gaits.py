@@ -21,11 +21,11 @@ import collections
 import copy
 import dataclasses
 import json
-import os
 import pathlib
 import time
 from typing import Any
 
+import checkpoints
 import numpy as np
 import ppo
 import ppo_settings
@@ -36,6 +36,7 @@ from torch import nn
 from trl_suite import characters, evaluation, policies
 from trl_suite.tasks.gait import rules as gait_rules
 from trl_suite.util import files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 
@@ -400,10 +401,10 @@ class Learner:
         state = {name: getattr(self, name) for name in _STATE}
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
         state |= {name: getattr(self, name).get_state() for name in ('replay', 'environments')}
-        state |= {'settings': self.settings, 'random': self.random.bit_generator.state}
-        part = folder / '.checkpoint.part'
-        torch.save(state, part)
-        os.replace(part, folder / 'checkpoint.pt')
+        state['past'] = list(map(list, self.past))
+        state['settings'] = dataclasses.asdict(self.settings)
+        state['random'] = self.random.bit_generator.state
+        checkpoints.save(state, folder / 'checkpoint.pt')
         self.write_curve(folder)
         policies.save(self.exported(), folder / 'last.npz')
 
@@ -419,12 +420,16 @@ class Learner:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Goes on where `save` was called."""
-        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file of our own
-        same = {name: getattr(self.settings, name) for name in _CHANGEABLE}
-        if dataclasses.replace(state['settings'], **same) != self.settings:
+        state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
+        if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        empty = self.past
         for name in _STATE:
             setattr(self, name, state[name])
+        self.past = [
+            collections.deque(past, each.maxlen)
+            for past, each in zip(state['past'], empty, strict=True)
+        ]
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
         for name in ('replay', 'environments'):
@@ -438,10 +443,17 @@ def train(
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
     Raises:
-      ValueError: the checkpoint is of other settings; only how long it learns, how it ends and how
-        often it writes and evaluates may have changed.
+      ValueError: the checkpoint is damaged, or of other settings; only how long it learns, how it ends
+        and how often it writes and evaluates may have changed.
+      RuntimeError: another process trains in the folder.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    with checkpoints.only_run(folder):
+        return _train(id_, seed, settings, folder, threads)
+
+
+def _train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int
+) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     learner, s = Learner(id_, seed, settings, threads), settings
     if (folder / 'checkpoint.pt').exists():
@@ -475,4 +487,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -6,11 +6,13 @@ import pathlib
 import numpy as np
 
 from trl_suite import characters, rendering, suite
+from trl_suite.util.program import begin_script
 
 FEET = [f'{end}_{side}_foot' for end in ('front', 'hind') for side in ('right', 'left')]
 LINK = '<link name="{}"><inertial><origin xyz="0 0 {z}"/><mass value="{m}"/><inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="0 0 {z}"/><geometry><box size="{size}"/></geometry></collision></link>'
 JOINT = '<joint name="{}" type="revolute"><parent link="{}"/><child link="{}"/><origin xyz="{}"/><axis xyz="0 -1 0"/><limit lower="{}" upper="1.2" effort="40"/></joint>'
 
+begin_script()
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument('file', nargs='?', type=pathlib.Path)
 parser.add_argument('--feet', nargs='+', default=FEET)

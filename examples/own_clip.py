@@ -11,6 +11,7 @@ import argparse
 
 from trl_suite import rendering, retargeting, suite
 from trl_suite.retargeting import clip_check
+from trl_suite.util.program import begin_script
 
 
 def main(arguments=None):
@@ -37,4 +38,5 @@ def main(arguments=None):
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

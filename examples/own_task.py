@@ -9,8 +9,10 @@ from matplotlib.figure import Figure
 from trl_suite import suite
 from trl_suite.gym import SuiteEnv
 from trl_suite.tasks import parts
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
+begin_script()
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument('id', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0')
 parser.add_argument('--seed', type=int, default=1)

@@ -7,7 +7,9 @@ import imageio.v3 as imageio
 import numpy as np
 
 from trl_suite import rendering, suite, terrain
+from trl_suite.util.program import begin_script
 
+begin_script()
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument('file', nargs='?', type=pathlib.Path)
 parser.add_argument('--spacing', type=float, default=0.2, help='of pixels or points, m')

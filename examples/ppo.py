@@ -19,12 +19,12 @@ import argparse
 import dataclasses
 import itertools
 import json
-import os
 import pathlib
 import time
 from collections.abc import Sequence
 from typing import Any
 
+import checkpoints
 import numpy as np
 import torch
 import tqdm
@@ -37,6 +37,8 @@ from trl_suite import characters, evaluation, policies, suite
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.components import rewards
 from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.util import files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 TEACHERS = {**evaluation.BASELINES, 'expert': expert}
@@ -527,7 +529,7 @@ class Trainer:
         """Writes checkpoint and curve."""
         state = {name: getattr(self, name) for name in _STATE}
         state |= {
-            'settings': self.settings,
+            'settings': dataclasses.asdict(self.settings),
             'networks': [part.state_dict() for part in self.networks],
             'log_std': self.log_std.detach().clone(),
             'optimizer': self.optimizer.state_dict(),
@@ -535,9 +537,7 @@ class Trainer:
             'random': self.random.bit_generator.state,
             'environments': self.environments.get_state(),
         }
-        part = folder / '.checkpoint.part'
-        torch.save(state, part)
-        os.replace(part, folder / 'checkpoint.pt')
+        checkpoints.save(state, folder / 'checkpoint.pt')
         curve = {
             'id': self.spec.id,
             'seed': self.seed,
@@ -545,14 +545,13 @@ class Trainer:
             'threads': self.threads,
             'curve': self.curve,
         }
-        part = folder / '.curve.part'
-        part.write_text(json.dumps(curve, indent=1))
-        os.replace(part, folder / 'curve.json')
+        with files.replacing(folder / 'curve.json') as part:
+            part.write_text(json.dumps(curve, indent=1))
 
     def restore(self, folder: pathlib.Path) -> None:
         """Goes on where `save` was called."""
-        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file of our own
-        if state['settings'] != self.settings:
+        state = checkpoints.load(folder / 'checkpoint.pt')
+        if state['settings'] != dataclasses.asdict(self.settings):
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
             setattr(self, name, state[name])
@@ -584,8 +583,19 @@ def train(
     threads: int = 0,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
+
+    Raises:
+      ValueError: the checkpoint is damaged, or of other settings.
+      RuntimeError: another process trains in the folder.
+    """
+    with checkpoints.only_run(folder):
+        return _train(id_, seed, settings, folder, threads, progress)
+
+
+def _train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int, progress: bool
+) -> list[dict[str, Any]]:
     torch.set_num_threads(1)  # for networks so small a second one costs more than it brings
     trainer = Trainer(id_, seed, settings, threads)
     if (folder / 'checkpoint.pt').exists():
@@ -666,4 +676,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

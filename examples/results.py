@@ -20,6 +20,7 @@ import train_all
 
 from trl_suite.registry import catalogue
 from trl_suite.util import resources
+from trl_suite.util.program import begin_script
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
@@ -366,4 +367,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -14,6 +14,8 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
+from trl_suite.util.program import begin_script
+
 STEPS = 32  # of every simulation between updates
 NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad; RLlib's 1 fells any walker
 
@@ -68,4 +70,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import checkpoints
 import numpy as np
 import ppo
 import ppo_settings
@@ -31,7 +32,8 @@ import tqdm
 
 from trl_suite import characters, evaluation, policies
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import files
+from trl_suite.util import archive, files
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 
@@ -193,8 +195,19 @@ class Learner:
 def train(
     id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int = 0
 ) -> list[dict[str, Any]]:
-    """Trains to the end, from the decisions in `folder` if there are any; returns the curve."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Trains to the end, from the decisions in `folder` if there are any; returns the curve.
+
+    Raises:
+      ValueError: the decisions are damaged, or were made with other settings.
+      RuntimeError: another process trains in the folder.
+    """
+    with checkpoints.only_run(folder):
+        return _train(id_, seed, settings, folder, threads)
+
+
+def _train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int
+) -> list[dict[str, Any]]:
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     s = settings
@@ -275,16 +288,16 @@ def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarr
     """Decisions that have been made, and the curve so far.
 
     Raises:
-      ValueError: they were made with other settings.
+      ValueError: they are damaged, or were made with other settings.
     """
     path = folder / 'decisions.npz'
     if not path.exists():
         return np.empty((0, 0)), np.empty((0, 0)), []
-    record = json.loads((folder / 'curve.json').read_text())
+    record = files.read_json(folder / 'curve.json')
     if record['settings'] != json.loads(json.dumps(dataclasses.asdict(settings))):
         raise ValueError(f'{folder} holds a run with other settings: {record["settings"]}')
-    with np.load(path) as stored:
-        return stored['observation'], stored['worth'], record['curve']
+    found = archive.read(path, 'decisions', {'observation': None, 'worth': None})
+    return found['observation'], found['worth'], record['curve']
 
 
 def main() -> None:
@@ -297,4 +310,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

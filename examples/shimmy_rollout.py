@@ -9,6 +9,7 @@ import gymnasium
 from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
 from trl_suite import suite
+from trl_suite.util.program import begin_script
 
 
 def main() -> None:
@@ -30,4 +31,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

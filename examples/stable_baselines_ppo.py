@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
+from trl_suite.util.program import begin_script
 
 
 class LearningCurve(BaseCallback):
@@ -81,4 +82,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

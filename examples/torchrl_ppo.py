@@ -18,6 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import trl_suite.gym  # noqa: F401, registers the environments
+from trl_suite.util.program import begin_script
 
 STEPS, EPOCHS, BATCH = 32, 5, 512  # of each row between updates; over them; steps in a minibatch
 NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad
@@ -67,6 +68,7 @@ def train(id_, num_envs=64, samples=100_000, seed=0):
 
 
 if __name__ == '__main__':
+    begin_script()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--environment', default='PD_Biped2D_Flat-v0', help='id or alias')
     parser.add_argument('--num-envs', type=int, default=64, help='simulations at once')

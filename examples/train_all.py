@@ -41,6 +41,7 @@ import tqdm
 from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.util import errors, files, resources
+from trl_suite.util.program import begin_script
 
 EPISODES, SEED = 50, 0  # of the published evaluation
 FALL_EPISODES, FALL_STEPS = 200, 5000  # cycles; how far gaits get before they fall
@@ -219,4 +220,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

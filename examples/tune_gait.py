@@ -35,6 +35,7 @@ from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE, SUBSTEPS
 from trl_suite.tasks.gait.task import GaitTask
 from trl_suite.util import errors
+from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 START_NOISE = 0.01  # rad, of the joints; see `GaitTask`
@@ -365,4 +366,5 @@ def main() -> None:
 
 
 if __name__ == '__main__':
+    begin_script()
     main()

@@ -7,9 +7,11 @@ import json
 import os
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from unittest import mock
 
 import imageio.v3 as iio
@@ -577,6 +579,28 @@ class RolloutTest(CommandTest):
         self.assertEqual((status, out, err), (130, '', 'trl-suite: interrupted\n'))
         self.assert_only()
 
+    def test_sigterm_leaves_nothing_behind(self):
+        begun = threading.Event()
+
+        def frames(*arguments):
+            begun.set()
+            return np.zeros((120, 160, 3), np.uint8)
+
+        def terminate():
+            begun.wait()
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        thread = threading.Thread(target=terminate)
+        thread.start()
+        with mock.patch.object(rendering, 'frame', frames):
+            status, out, err = run(
+                'rollout', GAPS, '--video', 'a.mp4', '--trajectory', 'a.npz', '--steps', '1000000'
+            )
+        thread.join()
+        self.assertEqual((status, out, err), (143, '', 'trl-suite: terminated\n'))
+        self.assertEqual(signal.getsignal(signal.SIGTERM), signal.SIG_DFL)
+        self.assert_only()
+
 
 def save_policy(path, id_, seed=0):
     """Writes a policy with random weights that fits an environment."""
@@ -762,7 +786,7 @@ class ProgramTest(CommandTest):
         self.assert_refused("invalid choice: 'lst'", 'lst')
 
     def test_a_missing_extra_is_named(self):
-        with mock.patch.dict(sys.modules, {'imageio.v2': None}):
+        with mock.patch.dict(sys.modules, {'imageio_ffmpeg': None}):
             self.assert_refused("pip install 'trl_suite", 'rollout', GAPS, '--video', 'a.mp4')
 
     def test_other_errors_are_not_hidden(self):

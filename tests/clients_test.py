@@ -19,6 +19,7 @@ from absl.testing import absltest, parameterized
 
 import trl_suite.gym
 from trl_suite import suite
+from trl_suite.util import program
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / 'examples'
@@ -35,7 +36,11 @@ def needs(module, extra):
 def output(name, *arguments):
     """Runs an example as a program in this process; returns what it printed."""
     out = io.StringIO()
-    with contextlib.redirect_stdout(out), mock.patch.object(sys, 'argv', [name, *arguments]):
+    with (
+        contextlib.redirect_stdout(out),
+        mock.patch.object(sys, 'argv', [name, *arguments]),
+        mock.patch.object(program, 'begin_script'),  # it is for processes of their own
+    ):
         runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
     return out.getvalue()
 

@@ -7,6 +7,7 @@ from unittest import mock
 
 import cli_test
 import numpy as np
+import own_test
 from absl.testing import absltest, parameterized
 from PIL import Image
 
@@ -18,6 +19,45 @@ from trl_suite.viewing import gallery
 
 GAPS = cli_test.GAPS
 CommandTest, run = cli_test.CommandTest, cli_test.run
+
+
+class TryTest(CommandTest):
+    def test_a_character_from_a_file(self):
+        pathlib.Path('figure.xml').write_text(own_test.MJCF)
+        out = self.output('try', 'figure.xml')
+        self.assertRegex(out, r'figure: planar, [\d.]+ kg, 1.\d+ m high')
+        self.assertIn('end effectors: right_shin, left_shin; must not touch the ground: trunk', out)
+        self.assertRegex(out, r'facing: along \[1.0, 0.1\], as left and right')
+        self.assertIn('collide: 6; that touch at the start: 0', out)
+        self.assertIn('actuators: 2 in the file, 2 kept, 0 left out', out)
+        self.assertRegex(out, 'right_hip +hinge +90 +3 +70')
+        self.assertRegex(out, 'note: no torque limits in the file; .*left_hip')
+        self.assertRegex(out, '(?s)flat: root .* m up at the start.*slopes: .*steps: ')
+        self.assertEqual(Image.open('try_figure.png').size, (3 * 480 + 2 * 4, 360))
+
+    def test_it_is_turned_and_its_tendons_are_left_out(self):
+        tendon = '<tendon><fixed name="both"><joint joint="left_hip" coef="1"/></fixed></tendon>'
+        text = own_test.MJCF.replace('<actuator>', f'{tendon}<actuator><motor tendon="both"/>')
+        pathlib.Path('dog.xml').write_text(text)  # a name of the suite's own
+        out = self.output(
+            'try', 'dog.xml', '--spatial', '--turn', '0.7071', '0', '0', '0.7071', '--end-effectors',
+            'left_shin', '--output', 'a.png',
+        )  # fmt: skip
+        self.assertIn('dog_file: three-dimensional', out)
+        self.assertRegex(out, r'facing: along \[-?0.\d*, 1.0\]')
+        self.assertIn('end effectors: left_shin; must', out)
+        self.assertIn('actuators: 3 in the file, 2 kept, 1 left out', out)
+        self.assertTrue(pathlib.Path('a.png').exists())
+
+    def test_bad_files(self):
+        pathlib.Path('two.urdf').write_text(own_test.URDF)
+        self.assert_refused('spatial=True or spatial=False', 'try', 'two.urdf')
+        self.assert_refused("no such file; did you mean 'two.urdf'", 'try', 'tow.urdf')
+        self.assert_refused(
+            "unknown root 'leg2'; did you mean 'leg'", 'try', 'two.urdf', '--root', 'leg2'
+        )
+        self.assert_refused("suffix '.jpg'; expected .png", 'try', 'two.urdf', '--output', 'a.jpg')
+        self.assertEqual([path.name for path in pathlib.Path().iterdir()], ['two.urdf'])
 
 
 class DoctorTest(CommandTest):

@@ -701,7 +701,7 @@ class ReaderTest(parameterized.TestCase):
 
     def test_binary(self):
         self.path.write_bytes(b'\xff\xfe\x00\x01')
-        with self.assertRaisesRegex(ValueError, 'walk.txt: not JSON'):
+        with self.assertRaisesRegex(ValueError, 'walk.txt: not text in UTF-8: .* at byte 0'):
             motion.read_terrainrl(self.path, (), (), 'planar')
 
     def test_last_duration_is_ignored(self):

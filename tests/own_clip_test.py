@@ -6,6 +6,7 @@ import importlib.util
 import io
 import json
 import pathlib
+import re
 import tempfile
 
 import numpy as np
@@ -243,13 +244,13 @@ class ReadingTest(FolderTest):
             (self.folder / name).write_text(text)
         for message, name, skeleton in (
             (r'a\.bvh: ', 'a.bvh', None), (r'a\.json: not JSON', 'a.json', None),
-            (r'a\.asf: expected the sections', 'a.amc', 'a.asf'),
+            (r"a\.asf, line 2: 'order TX': expected TX, TY and TZ", 'a.amc', 'a.asf'),
             (r"b\.asf, line 4: 'length far'", 'a.amc', 'b.asf'),
             ('needs its skeleton, an .asf file', 'a.amc', None),
             (r'a skeleton \(.*a\.asf\) belongs', 'a.bvh', 'a.asf'),
-            ('unknown suffix', 'a.asf', None),
+            (r'a skeleton \(.asf\); expected the motion', 'a.asf', None),
         ):  # fmt: skip
-            with self.subTest(name), self.assertRaisesRegex(ValueError, message):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 skeleton = skeleton and self.folder / skeleton
                 retargeting.read(self.folder / name, PLAIN, skeleton)
         with self.assertRaisesRegex(FileNotFoundError, "did you mean 'a.bvh'"):
@@ -258,6 +259,127 @@ class ReadingTest(FolderTest):
             motion.read_bvh(self.folder / 'a.bvh', forward='w')
         with self.assertRaisesRegex(ValueError, 'expected two axes'):
             motion.read_bvh(self.folder / 'a.bvh', forward='-y')
+
+    def capture(self):
+        """Files of a figure: BVH, skeleton, motion."""
+        paths = [self.folder / name for name in ('a.bvh', 'a.asf', 'a.amc')]
+        figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 4)
+        write_bvh(figure, paths[0])
+        write_acclaim(figure, *paths[1:])
+        return paths
+
+    def test_content_tells_the_format(self):
+        bvh, asf, amc = self.capture()
+        for path in (bvh, amc):
+            skeleton = asf if path == amc else None
+            expected = retargeting.read(path, PLAIN, skeleton)
+            found = retargeting.read(path.rename(self.folder / 'walk.txt'), PLAIN, skeleton)
+            np.testing.assert_array_equal(found.rotations, expected.rotations)
+        clip = motion.load('biped2d_walk')
+        for write in (clip.save, lambda path: motion.write_terrainrl(clip, path)):
+            write(self.folder / 'walk.txt')
+            found = retargeting.read(self.folder / 'walk.txt', 'biped2d')
+            np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
+        for text, message in (('', 'is empty; expected one of: BVH'), ('<xml/>', 'no motion file')):
+            path = self.folder / 'walk.bvh'
+            path.write_text(text)
+            with self.assertRaisesRegex(ValueError, f'walk.bvh: {message}'):
+                retargeting.read(path, PLAIN)
+
+    @parameterized.parameters(motion.HUMANOID3D, motion.DOG3D)
+    def test_deepmimics_layouts(self, **layout):
+        frame = [0.1, 0, 0.9, 0, 1, 0, 0, 0]
+        for size in layout.values():
+            frame += [0] if size == 1 else [1, 0, 0, 0]
+        path = self.folder / 'deepmimic.txt'
+        path.write_text(json.dumps({'Loop': 'wrap', 'Frames': [frame, frame]}))
+        found = retargeting.read(path, PLAIN)
+        self.assertEqual((found.joints, found.sizes), (tuple(layout), tuple(layout.values())))
+        path.write_text(json.dumps({'Loop': 'wrap', 'Frames': [frame[:-1]] * 2}))
+        with self.assertRaisesRegex(ValueError, r'frame 0 has \d+ numbers; .* 44 .* or 84 \('):
+            retargeting.read(path, PLAIN)
+
+    @parameterized.parameters(
+        ('"Loop": true, "Frames": ' + 2000 * '[' + 2000 * ']', 'nested too deeply'),
+        ('"Loop": ' + 5000 * '9', 'not JSON: .*4300'),
+        ('"Loop": true', 'not JSON'),
+    )
+    def test_json_that_cannot_be_read(self, text, message):
+        path = self.folder / 'a.json'
+        path.write_text('{' + text + ('}' if '9' in text or '[' in text else ''))
+        with self.assertRaisesRegex(ValueError, f'a.json: .*{message}'):
+            retargeting.read(path, PLAIN)
+
+    @parameterized.parameters(
+        ('OFFSET 0.000000', 'OFFSET nan', "line 4: 'OFFSET nan .*'; expected OFFSET and three finite"),
+        ('Frame Time: ', 'Frame Time: inf ', 'Frame Time is inf; expected a positive'),
+        ('OFFSET 0.000000 0.000000 0.000000\nCHANNELS 3 Zrotation', 'OFFSET 0 0 0\nCHANNELS 0 Zrotation',
+         'line .* without channels is not read; expected'),
+        ('MOTION', 'MOTON', 'no line MOTION'),
+        ('Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
+    )  # fmt: skip
+    def test_bad_bvh(self, before, after, message):
+        path = self.capture()[0]
+        text = path.read_text()
+        if 'CHANNELS' in before:
+            lines = text.splitlines()
+            last = max(i for i, line in enumerate(lines) if line.startswith('CHANNELS 3'))
+            lines[last] = 'CHANNELS 0'
+            text = '\n'.join(lines)
+        else:
+            self.assertIn(before, text)
+            text = text.replace(before, after, 1)
+        path.write_text(text)
+        with self.assertRaisesRegex(ValueError, rf'a\.bvh.*{message}'):
+            retargeting.read(path, PLAIN)
+
+    @parameterized.parameters(
+        ('begin\nid 2', 'id 2', "'id 2': expected 'begin' before it"),
+        ('length 0.45', 'length 0', "'length 0': expected a positive number"),
+        ('length 0.45', 'length nan', "'length nan': expected a positive number"),
+        ('direction 0 -1 0', 'direction 0 inf 0', 'expected three finite numbers'),
+        ('direction 0 -1 0', 'direction', 'expected three finite numbers'),
+        ('direction 0 -1 0\n', '', "'end': the bone has no direction"),
+        ('XYZ\ndof', 'XYX\ndof', 'expected an order of axes, such as XYZ'),
+        ('dof rx ry rz', 'dof rx rw rz', "unknown degree of freedom 'rw'; known: l, rx"),
+        ('dof rx ry rz', 'dof rx rx rz', 'given twice'),
+        ('name thorax', 'name root', "'name root': the name is taken"),
+        ('\nend\n', '\nthorax to_thorax\nend\n', "'to_thorax' has a parent already"),
+        ('\nend\n', '\nthorax tooth\nend\n', "unknown bone 'tooth'"),
+        ('\nend\n', '\nthorax root\nend\n', "'root' has a parent already"),
+    )  # fmt: skip
+    def test_bad_skeletons(self, before, after, message):
+        _, skeleton, path = self.capture()
+        head, found, tail = skeleton.read_text().rpartition(before)
+        self.assertTrue(found)
+        skeleton.write_text(head + after + tail)
+        with self.assertRaisesRegex(ValueError, rf'a\.asf, line \d+: .*{message}'):
+            motion.read_amc(path, skeleton)
+
+    @parameterized.parameters(
+        (lambda text: '', 'a.amc: 0 frames; expected at least 2'),
+        (lambda text: text.replace('\n1\n', '\n'), 'line 4: .*expected the number of a frame'),
+        (lambda text: text.replace('thorax', 'throax', 1), "unknown bone 'throax'; did you mean"),
+        (lambda text: text.replace('root ', 'root nan ', 1), 'line 5: .*7 numbers; expected 6'),
+        (lambda text: re.sub(r'root \S+', 'root nan', text), 'line 5: .*expected finite numbers'),
+        (lambda text: text.replace('root', 'rfoot', 1), 'line 5: .*6 numbers; expected 3'),
+    )  # fmt: skip
+    def test_bad_acclaim_motions(self, change, message):
+        _, skeleton, path = self.capture()
+        path.write_text(change(path.read_text()))
+        with self.assertRaisesRegex(ValueError, message):
+            motion.read_amc(path, skeleton)
+
+    def test_text_that_is_not_utf8(self):
+        for path, skeleton in zip(self.capture(), (None, None, self.folder / 'a.asf'), strict=True):
+            text = path.read_bytes()
+            path.write_bytes(text.replace(b'o', b'\xff', 1))
+            with self.subTest(path.name), self.assertRaisesRegex(ValueError, 'not text in UTF-8'):
+                if path.suffix == '.asf':
+                    motion.read_amc(self.folder / 'a.amc', path)
+                else:
+                    motion.read_bvh(path) if skeleton is None else motion.read_amc(path, skeleton)
+            path.write_bytes(text)
 
 
 class RetargetTest(FolderTest):

@@ -21,6 +21,7 @@ from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.tasks import parts
 from trl_suite.tasks.walk.task import Walk
 from trl_suite.terrain.planar import generators
+from trl_suite.util import program
 from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
@@ -228,6 +229,12 @@ class CharacterTest(Folder):
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
         ('name', {'name': 'dog'}, "may not be named 'dog'"),
+        ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
+        ('spatial', {'spatial': 'x'}, "spatial is 'x'; expected True or False or None"),
+        ('short_turn', {'turn': (0, 0, 90)}, r'turn is \(0, 0, 90\); expected a quaternion wxyz'),
+        ('no_turn', {'turn': (0, 0, 0, 0)}, 'expected a quaternion wxyz'),
+        ('word_turn', {'turn': 'left'}, "turn is 'left'; expected a quaternion"),
+        ('nan_turn', {'turn': (1, 0, 0, math.nan)}, 'expected a quaternion wxyz'),
     )  # fmt: skip
     def test_bad_names(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
@@ -244,6 +251,73 @@ class CharacterTest(Folder):
         self.assertNotRegex('; '.join(self.planar().notes), message)
         self.assertRegex('; '.join(self.planar(MJCF.replace(before, after)).notes), message)
 
+    def test_what_is_no_joint_and_no_character(self):
+        with self.assertRaisesRegex(
+            TypeError, r"joints\['left_hip'\] is 3; expected a characters.J"
+        ):
+            self.planar(joints={'left_hip': 3})
+        with self.assertRaisesRegex(TypeError, 'character is 3; expected a name, or what'):
+            characters.make(3)
+
+    def test_actuators_of_other_things_are_noted(self):
+        tendon = '<tendon><fixed name="both"><joint joint="left_hip" coef="1"/></fixed></tendon>'
+        text = MJCF.replace('<actuator>', f'{tendon}<actuator><motor name="pull" tendon="both"/>')
+        notes = '; '.join(self.planar(text).notes)
+        self.assertRegex(notes, r'actuators that are left out.*: pull \(tendon\)(;|$)')
+        self.assertNotIn('left out', '; '.join(self.planar().notes))
+
+    def test_a_mask_that_cannot_be_moved(self):
+        with self.assertRaisesRegex(ValueError, f"geom 'trunk_geom0' has contype {2**30}"):
+            self.planar(MJCF.replace('<geom size=".15', f'<geom contype="{2**30}" size=".15'))
+
+    @parameterized.parameters(True, False)
+    def test_a_turned_file_is_the_same_figure(self, in_file):
+        turn = np.array([0.859, 1, 1, 0.859]) / np.linalg.norm([0.859, 1, 1, 0.859])
+        back = turn * [1, -1, -1, -1]
+        text = MJCF.replace('<geom size=".15', '<geom name="box" euler="0 20 0" size=".15')
+        joint, end = '<joint name="p" axis="0 1 0"/>', '</body></worldbody>'
+        inertial = '<inertial pos="{} {} {}" quat="{} {} {} {}" mass="3" diaginertia=".3 .2 .1"/>'
+        upright = text.replace(joint, joint + inertial.format(0.1, 0, 0.2, 1, 0, 0, 0))
+        place = np.empty(3)
+        mujoco.mju_rotVecQuat(place, np.array([0.1, 0, 0.2]), back)
+        turned = text.replace(
+            joint,
+            f'{joint}{inertial.format(*place, *back)}<frame quat="{" ".join(map(str, back))}">',
+        )
+        turned = turned.replace(end, f'</frame>{end}')
+        if in_file:
+            root = 'name="trunk" pos="0 0 1"'
+            turned = turned.replace(root, f'{root} quat="{" ".join(map(str, turn))}"')
+        spec = self.planar(turned, turn=None if in_file else turn)
+        figures = []
+        for model in (compiled(self.planar(upright)), compiled(spec)):
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            order = [model.geom(name).id for name in spec.collision_geoms]
+            figures.append((
+                data.xpos, data.xmat, data.xipos, model.body_mass, data.xaxis, model.dof_M0,
+                data.geom_xpos[order], data.geom_xmat[order],
+            ))  # fmt: skip
+        for first, second in zip(*figures, strict=True):
+            np.testing.assert_allclose(first, second, atol=1e-6)  # files have six digits
+
+    @parameterized.parameters(
+        ('', 'it may lie: the end effectors are'),
+        ('turn', "it may look along .0.1, -1.0., as left and right bodies lie"),
+    )  # fmt: skip
+    def test_a_posture_that_may_be_wrong_is_noted(self, turn, note):
+        self.assertNotIn('it may', '; '.join(self.planar().notes))
+        # On its face, or looking to the right.
+        turn = (0.7071, 0, 0, -0.7071) if turn else (0.7071, 0, 0.7071, 0)
+        self.assertRegex('; '.join(self.planar(spatial=True, turn=turn).notes), note)
+
+    def test_lights_and_cameras_are_the_suites(self):
+        things = '<light name="mine" pos="0 0 3"/><camera name="side" pos="0 -99 0"/>'
+        spec = self.planar(MJCF.replace('<geom size=".15', f'{things}<geom size=".15'))
+        model = compiled(spec)
+        self.assertEqual([model.light(i).name for i in range(model.nlight)], ['sun'])
+        self.assertLess(np.abs(model.cam_pos[model.camera('side').id]).max(), 5)
+
     def test_a_root_that_says_otherwise_is_noted(self):
         spec = self.planar(spatial=True)
         self.assertTrue(spec.spatial)
@@ -257,7 +331,7 @@ class CharacterTest(Folder):
         ('out_of_plane', 'name="left_knee" axis="0 -1 0"', 'name="left_knee" axis="1 0 0"', "hinge 'left_knee' .* leaves"),
         ('free_slide', 'name="left_knee" axis="0 -1 0" range="-120 0"', 'name="left_knee" type="slide" axis="0 0 1"', "slide 'left_knee' has no limits"),
         ('mass', '<geom type="capsule"', '<geom mass="0" type="capsule"', 'mass and inertia of moving bodies'),
-        ('turned', 'name="trunk" pos="0 0 1"', 'name="trunk" euler="0 0 90"', "root 'trunk' is turned"),
+        ('turned', 'name="trunk" pos="0 0 1"', 'name="trunk" euler="0 0 90"', 'leaves the x-z plane'),
         ('two_roots', '</worldbody>', '<body name="ball"><freejoint/><geom size="1"/></body></worldbody>', 'several bodies may be the root'),
         ('broken', '</mujoco>', '', 'not a model'),
         ('nan', 'name="left_knee" axis', 'name="left_knee" armature="nan" axis', 'armature="nan" of .left_knee. .<joint>.; expected finite'),
@@ -279,8 +353,18 @@ class CharacterTest(Folder):
         with self.assertRaisesRegex(ValueError, 'part.xml: line 1: size="nan"'):
             self.planar(text, root='trunk')
         self.write('<mujocoinclude><include file="part.xml"/></mujocoinclude>', 'part.xml')
-        with self.assertRaisesRegex(ValueError, 'figure.xml: not a model'):
+        with self.assertRaisesRegex(ValueError, 'part.xml: line 1: <include file="part.xml">'):
             self.planar(text, root='trunk')
+
+    @parameterized.parameters('figure.xml', 'other.xml')
+    def test_a_model_that_loads_itself(self, name):
+        self.write(
+            '<mujoco><asset><model name="more" file="figure.xml"/></asset></mujoco>', 'other.xml'
+        )
+        text = MJCF.replace('<worldbody>', f'<asset><model file="{name}"/></asset><worldbody>')
+        # MuJoCo would read it without end, and crash.
+        with self.assertRaisesRegex(ValueError, 'line 1: <model file="figure.xml"> loads a file'):
+            self.planar(text)
 
     def test_a_body_may_be_named_nan(self):
         self.assertIn(
@@ -665,8 +749,11 @@ class ExampleTest(Folder):
     @parameterized.parameters('own_character', 'own_terrain', 'own_task')
     def test_example(self, name):
         path, output = EXAMPLES / f'{name}.py', self.folder / 'picture.png'
-        self.assertLess(len(path.read_text().splitlines()), 40)
-        with mock.patch.object(sys, 'argv', [name, '--output', str(output)]):
+        self.assertLess(len(path.read_text().splitlines()), 42)
+        with (
+            mock.patch.object(sys, 'argv', [name, '--output', str(output)]),
+            mock.patch.object(program, 'begin_script'),  # it is for processes of their own
+        ):
             runpy.run_path(str(path), run_name='__main__')
         self.assertGreater(imageio.imread(output).std(), 10)
 

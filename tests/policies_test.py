@@ -44,12 +44,12 @@ def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes
     return policies.Policy(**{**fields, **changes})
 
 
-def make_convolving(seed=0, **changes):
+def make_convolving(seed=0, size=0.6, **changes):
     """A policy that sees 9 heights through convolutions, relative to the first of 4 other numbers."""
     rng = np.random.default_rng(seed)
     shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
     line = policies.Convolution(
-        line=9, strides=(2, 1), weights=[rng.normal(0, 0.6, shape) for shape in shapes],
+        line=9, strides=(2, 1), weights=[rng.normal(0, size, shape) for shape in shapes],
         biases=[rng.normal(0, 0.3, shape[2]) for shape in shapes], origin=9,
     )  # fmt: skip
     sizes = (3 * 5 + 4, 6, 5, 2)
@@ -514,6 +514,27 @@ class FileTest(FolderTest):
     def test_refuses(self, changes, message):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
             self.load_with(**changes)
+
+    @parameterized.parameters(
+        ('relu', 1e30, False, r'weight_\d: is too large: sums may reach \S+e\+(6|9)\d'),
+        ('elu', 1e30, False, 'weight_1: is too large'), ('tanh', 1e30, False, None),
+        ('tanh', 3e38, False, 'weight_0: is too large'), ('tanh', 1e30, True, 'weight_0: is too'),
+        ('relu', 1e15, True, None),
+    )  # fmt: skip
+    def test_weights_so_large_that_actions_are_nan(self, activation, size, layer_norm, message):
+        shapes = (7, 6), (6, 5), (5, 2)
+        weights = [np.where(np.indices(shape).sum(0) % 2, size, -size) for shape in shapes]
+        fields = {'weights': weights, 'activation': activation, 'layer_norm': layer_norm}
+        if message is not None:
+            with self.assertRaisesRegex(ValueError, message):
+                make(**fields)
+            return
+        observations = np.random.default_rng(0).normal(0, 1e6, (50, 7))
+        self.assertTrue(np.isfinite(make(**fields)(observations)).all())
+
+    def test_filters_so_large_that_actions_are_nan(self):
+        with self.assertRaisesRegex(ValueError, 'filter_1: is too large'):
+            make_convolving(size=1e30, activation='relu')
 
     def fields(self):
         policies.save(make(), self.folder / 'p.npz')

@@ -1,7 +1,10 @@
 """The trainer of examples/ppo.py: its parts, that it goes on where it was stopped, that it learns."""
 
 import dataclasses
+import io
+import os
 import pathlib
+import subprocess
 import sys
 import tempfile
 from unittest import mock
@@ -14,8 +17,11 @@ from trl_suite import evaluation, policies
 from trl_suite.registry import catalogue
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import checkpoints
 import ppo
 import ppo_settings
+
+EXAMPLES = pathlib.Path(ppo.__file__).parent
 
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 TINY = {
@@ -116,6 +122,55 @@ class RunTest(parameterized.TestCase):
                 np.testing.assert_array_equal(a, b)
         with self.assertRaisesRegex(ValueError, 'other settings'):
             self.train('whole', clip=0.1)
+
+    def test_a_damaged_checkpoint_is_refused(self):
+        self.train('run', samples=128)
+        path = self.folder / 'run' / 'checkpoint.pt'
+        whole = path.read_bytes()
+        flipped = bytearray(whole)
+        flipped[len(whole) // 2] ^= 1
+        other = io.BytesIO()
+        torch.save({'settings': {}}, other)
+        for content, message in (
+            (whole[: len(whole) // 2], 'damaged or cut off'), (whole[:-1], 'damaged or cut off'),
+            (bytes(flipped), 'damaged or cut off'), (b'', 'no checkpoint of this version'),
+            (other.getvalue(), 'no checkpoint of this version'), (whole[1:], 'no checkpoint of'),
+        ):  # fmt: skip
+            path.write_bytes(content)
+            with self.assertRaisesRegex(ValueError, f'checkpoint.pt: .*{message}.*; remove it to'):
+                self.train('run', samples=256)
+            self.assertEqual(path.read_bytes(), content)
+        path.write_bytes(whole)
+        self.assertLen(self.train('run', samples=128), 1)
+
+    def test_a_checkpoint_runs_no_code(self):
+        path = self.folder / 'checkpoint.pt'
+        checkpoints.save({'where': pathlib.PurePosixPath('x'), 'a': np.arange(3)}, path)
+        with self.assertRaisesRegex(
+            ValueError, 'it holds pathlib.PurePosixPath; expected arrays, numbers'
+        ):
+            checkpoints.load(path)
+
+    def test_two_runs_in_one_folder(self):
+        with checkpoints.only_run(self.folder / 'run'):
+            message = f'process {os.getpid()} trains in this folder'
+            with self.assertRaisesRegex(RuntimeError, message):
+                self.train('run')
+        self.assertNotIn('checkpoint.pt', os.listdir(self.folder / 'run'))
+        program = 'import sys, pathlib, checkpoints, os, signal\n'
+        program += 'with checkpoints.only_run(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)'
+        folder = str(self.folder / 'run')
+        subprocess.run([sys.executable, '-c', program, folder], cwd=EXAMPLES, check=False)
+        with checkpoints.only_run(self.folder / 'run'):  # a run that was killed locks nothing
+            pass
+
+    def test_bad_input_ends_in_one_line(self):
+        done = subprocess.run(
+            [sys.executable, '-W', 'ignore', 'ppo.py', 'PD_Biped2D', '--output', str(self.folder)],
+            cwd=EXAMPLES, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        self.assertEqual((done.returncode, done.stdout), (1, ''))
+        self.assertRegex(done.stderr, "^ppo.py: error: unknown environment 'PD_Biped2D'; .*\n$")
 
     def test_the_exported_policy_may_be_an_average(self):
         batch = TINY['num_envs'] * TINY['horizon']

@@ -263,6 +263,55 @@ class VideoTest(FolderTest):
         self.assertEqual(path.read_text(), 'old')
         self.assert_only(name)
 
+    @parameterized.parameters('a.mp4', 'a.gif', 'a.png', 'a.npz')
+    def test_a_full_disk(self, name):
+        path = self.folder / name
+        path.write_text('old')
+        program = """
+import resource, signal, sys
+import numpy as np
+from trl_suite import motion, rendering
+path, kind = sys.argv[1], sys.argv[1][-3:]
+images = list(np.random.default_rng(0).integers(0, 255, (40, 240, 320, 3), dtype=np.uint8))
+clip = motion.load('biped2d_walk')
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))  # bytes
+try:
+    if kind == 'png':
+        rendering.film_strip(images, path)
+    elif kind == 'npz':
+        clip.save(path)
+    else:
+        rendering.video(images, path)
+except OSError as error:
+    print(error)
+"""
+        done = subprocess.run(
+            [sys.executable, '-W', 'ignore', '-c', program, str(path)], capture_output=True, text=True,
+            timeout=60, check=False,
+        )  # fmt: skip
+        self.assertEqual((done.returncode, done.stderr), (0, ''))
+        self.assertIn(str(path), done.stdout)
+        self.assertLen(done.stdout.splitlines(), 1)
+        self.assertEqual(path.read_text(), 'old')
+        self.assert_only(name)
+
+    def test_an_encoder_that_ends_says_why(self):
+        with (
+            self.assertRaisesRegex(OSError, 'a.mp4: the encoder failed: .*(directory|Permission)'),
+            rendering.Video(self.folder / 'a.mp4') as video,
+        ):
+            video._part = self.folder / 'no' / 'a.mp4'
+            for image in 50 * numbered(4, 320, 480):
+                video.add(image)
+        self.assert_only()
+
+    def test_a_folder_that_cannot_be_written(self):
+        with (
+            mock.patch.object(os, 'access', lambda path, mode: False),
+            self.assertRaisesRegex(PermissionError, "a.gif: the folder '.*' cannot be written"),
+        ):
+            rendering.video(numbered(2), self.folder / 'a.gif')
+
     def test_odd_sizes_are_fine_in_a_gif(self):
         rendering.video(numbered(2, 33, 47), self.folder / 'a.gif')
         self.assertEqual(iio.imread(self.folder / 'a.gif').shape, (2, 33, 47, 3))
@@ -432,9 +481,9 @@ def run_headless(program, variables):
 
 class MissingPartsTest(FolderTest):
     @parameterized.parameters(
-        ('imageio.v2', lambda path: rendering.video(numbered(2), path / 'a.mp4')),
+        ('PIL.Image', lambda path: rendering.video(numbered(2), path / 'a.gif')),
         ('imageio_ffmpeg', lambda path: rendering.video(numbered(2), path / 'a.mp4')),
-        ('imageio.v3', lambda path: rendering.film_strip(numbered(2), path / 'a.png')),
+        ('PIL.Image', lambda path: rendering.film_strip(numbered(2), path / 'a.png')),
         ('matplotlib.figure', lambda path: rendering.plot_terrain('gaps', path / 'a.png')),
     )
     def test_the_extra_is_named(self, module, draw):

@@ -33,9 +33,14 @@ def make(character: str | CharacterSpec) -> Character:
 
     Raises:
       ValueError: an unknown name, or an MJCF file that lacks a link or joint of the row.
+      TypeError: neither a name nor a row.
     """
     if isinstance(character, str):
         if character not in CHARACTERS:
             raise ValueError(errors.unknown('character', character, CHARACTERS))
         character = CHARACTERS[character]
+    if not isinstance(character, CharacterSpec):
+        raise TypeError(
+            f'character is {character!r}; expected a name, or what characters.from_file returns'
+        )
     return Character(character)

@@ -1,8 +1,8 @@
 """A character of the user's, from an MJCF or URDF file.
 
-    row = characters.from_file('walker.urdf', fall_links=('trunk',),
+    spec = characters.from_file('walker.urdf', fall_links=('trunk',),
                                end_effectors=('left_foot', 'right_foot'), spatial=True)
-    environment = suite.build(row, terrain='hills3d', task='walk')
+    environment = suite.build(spec, terrain='hills3d', task='walk')
 
 MuJoCo reads the file. Frames are MuJoCo's: the character looks along +x, z points up. What the file
 says about masses, limits, damping of joints, servos and torques is kept; where it is silent,
@@ -14,9 +14,10 @@ says about masses, limits, damping of joints, servos and torques is kept; where 
   300 N m/rad;
 * a joint works about its first key frame, or else its zero, if that is within its limits.
 
-`row.notes` tells what of it was assumed. The passive damping of joints is added to kd (see
-`trl_suite.actuation`); friction, springs, equalities and tendons stay; actuators, sensors and what
-is not part of the character go.
+`spec.notes` tells what of it was assumed, and which actuators were left out: those that act on a tendon,
+a site or a body, since every joint gets an actuator of its own. The passive damping of joints is added
+to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons stay; sensors, lights and
+what is not part of the character go.
 """
 
 from __future__ import annotations
@@ -30,7 +31,17 @@ import numpy as np
 from dm_control import mjcf
 
 from trl_suite.characters.character import CharacterSpec, Joint
-from trl_suite.characters.inspect import KINDS, ModelInspector, check_numbers, named, problem
+from trl_suite.characters.inspect import KINDS, ModelInspector
+from trl_suite.characters.model_file import (
+    Rotation,
+    check_numbers,
+    compiled,
+    find_root,
+    flat,
+    named,
+    problem,
+    turned,
+)
 from trl_suite.characters.specs import CHARACTERS
 from trl_suite.util import errors
 from trl_suite.util.files import existing
@@ -54,12 +65,13 @@ def from_file(
     fall_links: Sequence[str],
     root: str | None = None,
     spatial: bool | None = None,
+    turn: Sequence[float] | None = None,
     joints: Mapping[str, Joint] | None = None,
     stumble_exempt: Sequence[str] | None = None,
     name: str | None = None,
     description: str = "A user's own character.",
 ) -> CharacterSpec:
-    """Reads a character, for `suite.build`, `characters.make` and what else takes a row.
+    """Reads a character, for `suite.build`, `characters.make` and what else takes a spec.
 
     Links are all bodies with mass, in the order of the file; joints keep their names.
 
@@ -71,6 +83,8 @@ def from_file(
       root: body that carries all others, a child of the world; by default the only one there is.
       spatial: whether it is to move in three dimensions, instead of in the x-z plane; by default as
         the root's own joints say: a free joint, or two slides and a hinge.
+      turn: rotation, as a quaternion wxyz, that makes the character of the file look along +x with z
+        up; by default none. (0.7071, 0.7071, 0, 0) raises one whose up is y.
       joints: figures of joints by name, in place of those found.
       stumble_exempt: bodies that may touch the ground without a stumble; by default the end effectors.
       name: of the character; by default the file's.
@@ -78,28 +92,52 @@ def from_file(
 
     Raises:
       FileNotFoundError: there is no such file; the message has similar names.
-      ValueError: the file, or a name, does not make a character; the message has what is wrong, what
-        was expected, and the closest matches of an unknown name.
+      ValueError: the file, or an argument, does not make a character; the message has what is wrong,
+        what was expected, and the closest matches of an unknown name.
+      TypeError: figures of a joint that are no `Joint`.
     """
+    for option, value, kind in (
+        ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
+        ('description', description, str),
+    ):  # fmt: skip
+        errors.check_kind(option, value, kind)
+    if name == '':
+        raise ValueError("name is ''; expected a name, or None for that of the file")
+    rotation = _rotation(turn)
     file = existing(path, SUFFIXES)
     check_numbers(file)
     name = file.stem if name is None else name
     if name in CHARACTERS or '/' in name:
         raise ValueError(f'a character may not be named {name!r}, as one of the suite; give name=')
     spec = named(file)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise problem(file, ' '.join(str(error).split())) from None
-    found = ModelInspector(file, model, root, spatial)
+    model = compiled(file, spec)
+    number = find_root(file, model, root)
+    own_turn = model.body_quat[number]
+    if abs(own_turn[0]) < 1 - 1e-6 or turn is not None:
+        rotation = Rotation(rotation).quaternion(own_turn)
+        model = turned(file, spec, model.body(number).name, rotation)
+    found = ModelInspector(file, model, number, spatial)
+    if abs(own_turn[0]) < 1 - 1e-6:
+        found.notes.append(
+            f'the root is turned in the file by {own_turn.round(3).tolist()}; its axes are now those of '
+            'the world'
+        )
     found.check_names('end effector', end_effectors)
+    found.check_posture(end_effectors)
     found.check_names('fall link', fall_links, solid=True)
     exempt = tuple(end_effectors if stumble_exempt is None else stumble_exempt)
     found.check_names('link exempt from stumbling', exempt)
     figures = found.figures()
-    for joint in joints or {}:
+    if left_out := found.left_out():
+        found.notes.append(
+            f'actuators that are left out, as they act on other things than one joint of the '
+            f'character: {", ".join(left_out)}'
+        )
+    for joint, own in (joints or {}).items():
         if joint not in figures:
             raise problem(file, errors.unknown('joint', joint, figures))
+        if not isinstance(own, Joint):
+            raise TypeError(f'joints[{joint!r}] is {own!r}; expected a characters.Joint')
     tree = _tree(file, spec, found)
     tree.model = name
     return CharacterSpec(
@@ -119,11 +157,25 @@ def from_file(
     )
 
 
+def _rotation(turn: Sequence[float] | None) -> np.ndarray:
+    """Returns a unit quaternion."""
+    try:
+        found = np.array((1, 0, 0, 0) if turn is None else turn, float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    length = np.linalg.norm(found)
+    if found.shape != (4,) or not 0 < length < np.inf:
+        raise ValueError(
+            f'turn is {turn!r}; expected a quaternion wxyz, such as (0.7071, 0.7071, 0, 0)'
+        )
+    return found / length
+
+
 def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjcf.RootElement:
     """Returns the character alone: no world, root joints, actuators or options; figures explicit."""
     model = found.model
     try:
-        tree = mjcf.from_xml_string(spec.to_xml(), model_dir=str(file.parent))
+        tree = mjcf.from_xml_string(flat(spec.to_xml()), model_dir=str(file.parent))
     except (ValueError, KeyError, AttributeError, OSError) as error:
         raise problem(file, f'cannot be taken over: {error}') from None
     root = tree.find('body', found.bodies[0])
@@ -147,7 +199,7 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
             delattr(tree.compiler, attribute)
     if tree.default.dclass is None:
         tree.default.dclass = 'own'  # what is written could not be read without a name
-    root.pos = (0, 0, 0)
+    root.pos, root.quat = (0, 0, 0), None
     for i, name in zip(found.ids, found.bodies, strict=True):
         if model.body_mass[i] > 0:  # as compiled by the file's rules
             body = tree.find('body', name)
@@ -162,12 +214,17 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         joint = tree.find('joint', name)
         limited = bool(model.jnt_limited[i])
         joint.type, joint.limited = KINDS[int(model.jnt_type[i])], limited
+        joint.pos = model.jnt_pos[i]
+        joint.axis = model.jnt_axis[i]
         joint.range = model.jnt_range[i] if limited else None
         joint.actuatorfrclimited = True
         joint.actuatorfrcrange = (-found.limits[name], found.limits[name])
     for i in found.geoms:
         geom = tree.find('geom', model.geom(i).name)
-        geom.conaffinity = int(model.geom_conaffinity[i]) | 1  # the ground's contype is 1
+        # The first bit is the ground's. The file's masks move up by one, so that two geoms of the
+        # character collide exactly if they do in the file.
+        geom.contype = int(model.geom_contype[i]) << 1
+        geom.conaffinity = int(model.geom_conaffinity[i]) << 1 | 1
         if file.suffix.lower() == '.urdf':
             geom.rgba = COLOUR  # what is only looked at, and has colours, was left out
     _stage(tree, root, found.reach(found.data.xpos[found.root], found.root))
@@ -175,13 +232,16 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
 
 
 def _stage(tree: mjcf.RootElement, root: mjcf.Element, reach: float) -> None:
-    """Adds the cameras that pictures ask for, and a light, unless the file has them."""
+    """Replaces the file's lights by the suite's, and its cameras of the same names by fitting ones."""
     away = CAMERA_AWAY * reach
+    for item in (*tree.find_all('light'), *tree.find_all('camera')):
+        if item.tag == 'light' or item.name in _CAMERAS:
+            item.remove()
     for name, (place, axes) in _CAMERAS.items():
-        if tree.find('camera', name) is None:
-            root.add('camera', name=name, mode='trackcom', pos=away * np.array(place), xyaxes=axes)
-    if not tree.find_all('light'):
         root.add(
-            'light', name='sun', mode='trackcom', pos=(-1.2, 1.2, 4), dir=(0.3, -0.3, -1),
-            directional=True, castshadow=True, diffuse=(0.5, 0.5, 0.48), specular=(0.1,) * 3,
-        )  # fmt: skip
+            'camera', name=name, mode='trackcom', pos=away * np.array(place), xyaxes=axes, fovy=45
+        )
+    root.add(
+        'light', name='sun', mode='trackcom', pos=(-1.2, 1.2, 4), dir=(0.3, -0.3, -1),
+        directional=True, castshadow=True, diffuse=(0.5, 0.5, 0.48), specular=(0.1,) * 3,
+    )  # fmt: skip

@@ -1,20 +1,20 @@
 """What an MJCF or URDF file holds of a character: names, links, joints and their figures.
 
-`own.py` says what is assumed where a file is silent, and makes a character of what is found here.
+`from_file.py` says what is assumed where a file is silent, and makes a character of what is found here.
 """
 
 from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-from lxml import etree
 
 from trl_suite.characters.character import Joint
+from trl_suite.characters.model_file import problem
 from trl_suite.util import errors
 
 GRAVITY = 9.8  # m/s^2, of the arenas
@@ -26,6 +26,8 @@ LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
 MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
 SIZES = (0.05, 10.0)  # m, from the root to the farthest end
 MASSES = (0.1, 2000.0)  # kg
+LYING = 0.2  # share of the way to the end effectors that goes down; what has less may lie
+FACING = 0.7  # cosine of an angle; what looks farther aside than that may look elsewhere
 LATERAL = 1e-3  # how far an axis of a planar character may be from its plane or normal, rad
 
 _FREE, _BALL, _SLIDE, _HINGE = (
@@ -35,97 +37,46 @@ _FREE, _BALL, _SLIDE, _HINGE = (
         mujoco.mjtJoint.mjJNT_HINGE,
     )
 )  # fmt: skip
+_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_SIDES = (
+    ('left', 'right'), ('Left', 'Right'), ('(^|_)l', r'\1r'), ('(^|_)L', r'\1R'), ('l$', 'r'), ('L$', 'R'),
+)  # fmt: skip
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
-# Of a file, besides bodies: what must have a name to be found again.
-_NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
 
-def problem(file: pathlib.Path, what: str) -> ValueError:
-    """Returns what to raise about a file."""
-    return ValueError(f'{file}: {what}')
+def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Returns the direction (2,) that something looks along, or None if nothing tells it.
+
+    Args:
+      places: of its bodies by name, (3,) m; those named left or right are taken to lie there.
+    """
+    aside = np.zeros(3)
+    for left, place in places.items():
+        right = next((name for name in _right(left) if name in places), None)
+        if right is not None:
+            aside += place - places[right]
+    length = np.linalg.norm(aside[:2])
+    # Of what lies on its side, x and y say nothing.
+    if length < FACING * np.linalg.norm(aside) or not length:
+        return None
+    return np.array([aside[1], -aside[0]]) / length
 
 
-def named(file: pathlib.Path) -> mujoco.MjSpec:
-    """Reads a file; what has no name in it gets one."""
-    try:
-        spec = mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        raise problem(file, f'not a model: {" ".join(str(error).split())}') from None
-    spec.compiler.fusestatic = False  # bodies without joints may be end effectors
-    for mesh in spec.meshes:
-        mesh.file = _in_package(file, mesh.file)
-    for body in spec.bodies[1:]:
-        if not body.name:
-            body.name = body.joints[0].name if body.joints else ''
-        body.name = body.name or f'{body.parent.name}_{body.id}'
-        for kind, items in (('', body.joints), ('_geom', body.geoms)):
-            for i, item in enumerate(items):
-                if not item.name:
-                    item.name = f'{body.name}{kind}{i if kind or len(items) > 1 else ""}'
-    for kind in _NAMED:
-        for i, item in enumerate(getattr(spec, kind)):
-            item.name = item.name or f'unnamed_{kind}_{i}'
-    for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
-        if '/' in item.name:
-            raise problem(file, f'the name {item.name!r} has a slash; expected none in names')
-    return spec
-
-
-def check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset()) -> None:
-    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity."""
-    try:
-        elements = [*etree.parse(file).getroot().iter(etree.Element)]
-    except etree.XMLSyntaxError as error:
-        raise problem(file, f'not a model: {error}') from None
-    names = {element.get(key) for element in elements for key in ('name', 'class')}
-    for element in elements:
-        for key, text in element.items():
-            if text not in names and key not in ('name', 'class') and not _finite(text):
-                of = f' of {element.get("name")!r}' if element.get('name') else ''
-                raise problem(
-                    file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
-                    'finite numbers',
-                )  # fmt: skip
-    seen |= {file.resolve()}
-    for element in elements:
-        if element.tag == 'include':
-            included = file.parent / element.get('file', '')
-            if included.is_file() and included.resolve() not in seen:  # else MuJoCo complains
-                check_numbers(included, seen)
-
-
-def _finite(text: str) -> bool:
-    """Whether a text is no list of numbers, or one of finite ones."""
-    try:
-        return bool(np.isfinite([float(number) for number in text.split()]).all())
-    except ValueError:
-        return True
-
-
-def _in_package(file: pathlib.Path, name: str) -> str:
-    """Returns where a mesh of a ROS package lies, given a file somewhere in that package."""
-    address = re.fullmatch(r'package:/+([^/]+)/(.+)', name)
-    if address is None:
-        return name
-    package, inside = address.groups()
-    places = [
-        parent / part
-        for parent in file.resolve().parents
-        for part in (inside, f'{package}/{inside}')
-    ]
-    return str(next((place for place in places if place.is_file()), name))
+def _right(left: str) -> list[str]:
+    """Returns what the right counterpart of a left body may be called."""
+    return [name for a, b in _SIDES if (name := re.sub(a, b, left, count=1)) != left]
 
 
 class ModelInspector:
     """What a compiled file holds of a character."""
 
     def __init__(
-        self, file: pathlib.Path, model: mujoco.MjModel, root: str | None, spatial: bool | None
+        self, file: pathlib.Path, model: mujoco.MjModel, root: int, spatial: bool | None
     ) -> None:
         self.file, self.model, self.notes = file, model, list[str]()
         self.data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.data)
-        self.root = self._root(root)
+        self.root = root
         self.ids = np.flatnonzero(model.body_rootid == self.root)
         self.bodies = [model.body(i).name for i in self.ids]
         own = np.isin(model.jnt_bodyid, self.ids)
@@ -139,6 +90,13 @@ class ModelInspector:
                 file, 'no geom of the character can touch the ground: expected some whose contype '
                 'and conaffinity are not both 0 (in URDF, <collision> elements)',
             )  # fmt: skip
+        for i in self.geoms:
+            masks = int(model.geom_contype[i]), int(model.geom_conaffinity[i])
+            if not all(-(2**30) <= mask < 2**30 for mask in masks):
+                raise problem(
+                    file, f'geom {model.geom(i).name!r} has contype {masks[0]} and conaffinity '
+                    f'{masks[1]}; expected masks below 2^30, as one bit is for the ground',
+                )  # fmt: skip
         self.collision_geoms = tuple(model.geom(i).name for i in self.geoms)
         heavy = model.body_mass[self.ids] > 0
         heavy[0] = True
@@ -147,31 +105,6 @@ class ModelInspector:
         if not self.weight > 0:
             raise problem(file, f'the mass of {self.bodies[0]!r} and all that hangs on it is 0')
         self._doubt()
-
-    def _root(self, root: str | None) -> int:
-        model = self.model
-        top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
-        if root is None and len(top) == 1:
-            (root,) = top
-        if root in top:
-            number = top[root]
-            if abs(model.body_quat[number, 0]) < 1 - 1e-6:
-                raise problem(
-                    self.file, f'the root {root!r} is turned against the world; expected none, x '
-                    'ahead and z up: turn what it holds instead',
-                )  # fmt: skip
-            return number
-        if not top:
-            raise problem(self.file, 'there is no body; expected one that carries all others')
-        if root is None:
-            raise problem(self.file, f'several bodies may be the root; give root=, one of {[*top]}')
-        names = [model.body(i).name for i in range(1, model.nbody)]
-        if root in names:
-            above = model.body(model.body_rootid[model.body(root).id]).name
-            raise problem(
-                self.file, f'root {root!r} hangs on another body; did you mean {above!r}?'
-            )
-        raise problem(self.file, errors.unknown('root', root, names))
 
     def _dimensions(self, root_joints: np.ndarray, spatial: bool | None) -> bool:
         kinds = sorted(KINDS[int(kind)] for kind in self.model.jnt_type[root_joints])
@@ -226,6 +159,43 @@ class ModelInspector:
             self.notes.append(f'it reaches {reach:.3g} m from its root; are lengths in m?')
         if not MASSES[0] <= self.weight / GRAVITY <= MASSES[1]:
             self.notes.append(f'it weighs {self.weight / GRAVITY:.4g} kg; are masses in kg?')
+
+    def check_posture(self, end_effectors: Sequence[str]) -> None:
+        """Notes that a character may lie, or may not look along +x, in its working posture."""
+        model, data = self.model, mujoco.MjData(self.model)
+        for i in self.joints.tolist():
+            if model.jnt_type[i] in (_HINGE, _SLIDE):
+                data.qpos[model.jnt_qposadr[i]] = self._posture(i, [])
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        ends = np.mean([data.xipos[model.body(name).id] for name in end_effectors], axis=0)
+        away = ends - data.subtree_com[self.root]
+        distance = np.linalg.norm(away)
+        if distance > 0 and -away[2] < LYING * distance:
+            self.notes.append(
+                f'it may lie: the end effectors are {away.round(3).tolist()} m from the centre of mass; '
+                'expected below it, z up. turn= turns it'
+            )
+            return
+        forward = facing(
+            {name: data.xipos[i] for name, i in zip(self.bodies, self.ids, strict=True)}
+        )
+        if forward is not None and forward[0] < FACING:
+            self.notes.append(
+                f'it may look along {forward.round(2).tolist()}, as left and right bodies lie; expected '
+                'along +x, (1, 0). turn= turns it'
+            )
+
+    def left_out(self) -> list[str]:
+        """Names of actuators that have no part in the character: what each acts on, in brackets."""
+        model, names = self.model, []
+        for a in range(model.nu):
+            kind = mujoco.mjtTrn(model.actuator_trntype[a])
+            if kind in _OF_JOINTS and model.actuator_trnid[a, 0] in self.joints:
+                continue
+            on = kind.name.removeprefix('mjTRN_').lower()
+            names.append(f'{model.actuator(a).name or a} ({on})')
+        return names
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
         if isinstance(names, str) or not names:
@@ -295,7 +265,7 @@ class ModelInspector:
         """Returns kp, kv and torque limit of a joint as the file's actuators have them."""
         model = self.model
         kp, kv, limits = 0.0, 0.0, []
-        at = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+        at = np.isin(model.actuator_trntype, [*map(int, _OF_JOINTS)]) & (
             model.actuator_trnid[:, 0] == joint
         )
         for a in np.flatnonzero(at):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 
 from trl_suite import rendering
@@ -59,10 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _joint_map(path: pathlib.Path) -> dict[str, str]:
     """Reads which joint of the motion each joint of the character follows."""
-    try:
-        content = json.loads(files.existing(path, ('.json',)).read_text(encoding='utf-8'))
-    except ValueError as error:
-        raise ValueError(f'{path}: not JSON: {error}') from None
+    content = files.read_json(files.existing(path))
     if not isinstance(content, dict) or not all(isinstance(v, str) for v in content.values()):
         raise ValueError(
             f'{path}: expected an object of names, {{"joint of the character": "joint of the motion"}}'

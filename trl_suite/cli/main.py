@@ -7,12 +7,14 @@
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
+    trl-suite try robot.urdf --spatial
     trl-suite doctor
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
     trl-suite gallery --filter Dog2D_Gaps
 
 Bad input ends with one line on stderr and exit status 2. A command NAME is the function `run` of the
-module `trl_suite.cli.NAME`; the engine is imported only by those that need it.
+module `trl_suite.cli.NAME` (of try, a word of Python: `try_file`); the engine is imported only by
+those that need it.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ import trl_suite
 from trl_suite.cli import engine
 from trl_suite.cli.list import FILTERS
 from trl_suite.environments import named_policies as acting
+from trl_suite.util import program
 
 
 def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
@@ -41,23 +44,27 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
 
     Returns:
       The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
-      error, with one line on stderr; 130 after an interrupt.
+      error, with one line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
     try:
-        arguments = _parser(prog).parse_args(argv)
-        command = engine.load(f'trl_suite.cli.{arguments.command}')
-        status = command.run(arguments) or 0
-        sys.stdout.flush()
+        with program.terminable():
+            arguments = _parser(prog).parse_args(argv)
+            command = engine.load(f'trl_suite.cli.{arguments.command}')
+            status = command.run(arguments) or 0
+            sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except program.Terminated:
+        print('trl-suite: terminated', file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
-    except (ValueError, ImportError, RuntimeError, OSError) as error:
-        print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
+    except program.EXPECTED as error:
+        print(f'trl-suite: error: {program.in_one_line(error)}', file=sys.stderr)
         return 2
     return status
 
@@ -149,7 +156,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command = add('clip', 'carry a motion file over to a character, and check it')
     command.add_argument(
         'file', metavar='FILE', type=pathlib.Path,
-        help='a .bvh, .amc, .json (TerrainRL, DeepMimic) or .npz',
+        help='BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; its content tells',
     )  # fmt: skip
     command.add_argument('--character', required=True, help='name of a character')
     command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')
@@ -165,6 +172,29 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--frames', action='store_true', help='print every fault in every frame')
     command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
     command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+
+    command = add('try', 'read a character from a file, tell what becomes of it, and draw it')
+    command.set_defaults(command='try_file')
+    command.add_argument('file', metavar='FILE', type=pathlib.Path, help='an .xml, .mjcf or .urdf')
+    command.add_argument('--root', metavar='BODY', help='that carries all others')
+    command.add_argument(
+        '--end-effectors', nargs='+', metavar='BODY', help='by default the last ones of each limb'
+    )
+    command.add_argument(
+        '--fall-links', nargs='+', metavar='BODY',
+        help='that must not touch the ground; by default the first one that can',
+    )  # fmt: skip
+    command.add_argument(
+        '--spatial', action=argparse.BooleanOptionalAction,
+        help="moves in three dimensions, or not; by default as the root's joints say",
+    )  # fmt: skip
+    command.add_argument(
+        '--turn', nargs=4, type=float, metavar=('W', 'X', 'Y', 'Z'),
+        help='a quaternion that makes it look along +x with z up',
+    )  # fmt: skip
+    command.add_argument(
+        '--output', type=pathlib.Path, metavar='FILE', help='a .png of it on three terrains'
+    )
 
     add('doctor', 'look at the installation; say what is wrong and what to do')
 

@@ -25,6 +25,7 @@ from trl_suite.registry.catalogue import EnvSpec, find
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
 
+MOST_ENVS = 2**20  # simulations of one batch
 AUTORESET = ('next_step', 'same_step', 'disabled')
 
 
@@ -96,8 +97,7 @@ class VectorEnvironment:
         Raises:
           ValueError: unknown names or options, or numbers out of range.
         """
-        if int(num_envs) != num_envs or num_envs < 1:
-            raise ValueError(f'num_envs is {num_envs}; expected a positive integer')
+        errors.check_whole('num_envs', num_envs, 1, MOST_ENVS)
         if int(num_threads) != num_threads or num_threads < 0:
             raise ValueError(f'num_threads is {num_threads}; expected 0 or a positive integer')
         if autoreset not in AUTORESET:

@@ -13,13 +13,16 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
+import tempfile
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from trl_suite.motion import quaternion
-from trl_suite.util.files import existing
+from trl_suite.motion.layout import LARGEST
+from trl_suite.util import errors
+from trl_suite.util.files import existing, read_text
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; inches, times what the file says
@@ -70,18 +73,30 @@ def read_bvh(
       FileNotFoundError: there is no such file.
       ImportError: the extra 'clips' is not installed.
     """
-    path = existing(path, ('.bvh',))
+    path = existing(path)
     axes = frame(forward, up)
+    text = read_text(path)
+    _check_bvh(path, text)
     try:
         import pybvh
     except ImportError as error:
         raise ImportError(
             "pybvh is needed to read BVH and missing; pip install 'trl_suite[clips]'"
         ) from error
-    try:
-        found = pybvh.read_bvh_file(path, world_up='+y', warn_on_world_up_disagreement=False)
-    except (ValueError, IndexError) as error:
-        raise ValueError(f'{path}: {error}') from None
+    with tempfile.TemporaryDirectory() as folder:
+        copy = pathlib.Path(folder, 'copy.bvh')  # pybvh reads no other suffix
+        copy.write_text(text)
+        try:
+            found = pybvh.read_bvh_file(copy, world_up='+y', warn_on_world_up_disagreement=False)
+        except (ValueError, IndexError) as error:
+            raise ValueError(f'{path}: {error}'.replace(str(copy), path.name)) from None
+    values = np.concatenate(
+        [found.root_pos, found.joint_angles.reshape(len(found.root_pos), -1)], axis=1
+    )
+    for bad in np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1)):
+        raise ValueError(f'{path}: frame {bad}: a number is not finite, or too large')
+    if not 0 < found.frame_time < LARGEST:
+        raise ValueError(f'{path}: Frame Time is {found.frame_time}; expected a positive number')
     nodes = [node for node in found.nodes if not node.is_end_site()]
     numbers = {node: i for i, node in enumerate(nodes)}
     parents = [-1 if node.parent is None else numbers[node.parent] for node in nodes]
@@ -108,7 +123,7 @@ def read_amc(
     A joint has the name of the bone that hangs on it.
 
     Args:
-      path: the .amc file.
+      path: the motion, an .amc file.
       skeleton: the .asf file that belongs to it.
       rate: frames per second.
       unit: of lengths, m, before the file's own factor.
@@ -118,7 +133,7 @@ def read_amc(
       ValueError: a malformed file; the message names file and line.
       FileNotFoundError: there is no such file.
     """
-    path, skeleton = existing(path, ('.amc',)), existing(skeleton, ('.asf',))
+    path, skeleton = existing(path), existing(skeleton)
     axes = frame(forward, up)
     if not 0 < rate < np.inf:
         raise ValueError(f'rate is {rate}; expected a positive number of frames per second')
@@ -204,11 +219,38 @@ def _capture(
             rest[i] = rest[parent] + offsets[i]
             turns[:, i] = quaternion.multiply(turns[:, parent], local[i])
     turns[..., 1:] = turns[..., 1:] @ axes.T
-    if not (np.isfinite(turns).all() and np.isfinite(place).all()):
-        raise ValueError(f'{path}: a value is not finite')
+    for what, values in (('rotation', turns), ('position', place), ('length', rest)):
+        if not (np.abs(values) < LARGEST).all():
+            raise ValueError(f'{path}: a {what} is not finite, or larger than {LARGEST:g}')
     return Capture(
         path.stem, times, tuple(names), tuple(parents), rest @ axes.T, place @ axes.T, turns
     )
+
+
+def _check_bvh(path: pathlib.Path, text: str) -> None:
+    """Refuses, by line, what pybvh does not read or does not refuse."""
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        key = words[0].upper() if words else ''
+        if key == 'MOTION':
+            return
+        if key == 'OFFSET' and not _three_numbers(words[1:]):
+            raise ValueError(
+                f'{path}, line {number}: {line.strip()!r}; expected OFFSET and three finite numbers'
+            )
+        if key == 'CHANNELS' and words[1:2] == ['0']:
+            raise ValueError(
+                f'{path}, line {number}: {line.strip()!r}: a joint without channels is not read; '
+                "expected 'CHANNELS 3 Zrotation Xrotation Yrotation', and three zeros in every frame"
+            )
+    raise ValueError(f'{path}: there is no line MOTION; expected one after the HIERARCHY')
+
+
+def _three_numbers(words: Sequence[str]) -> bool:
+    try:
+        return len(words) == 3 and bool((np.abs(np.array(words, float)) < LARGEST).all())
+    except ValueError:
+        return False
 
 
 def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, bool]:
@@ -217,10 +259,10 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
         'root': {'parent': '', 'dof': [], 'axis': np.zeros(3), 'order': 'xyz', 'tip': np.zeros(3)}
     }
     root = bones['root']
-    bone: dict[str, Any] = {}
+    bone: dict[str, Any] | None = None
     children: list[str] = []
     section, length, degrees = '', 1.0, True
-    for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split('#')[0].split()
         if not words:
             continue
@@ -229,46 +271,92 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
             if key.startswith(':'):
                 section = key[1:]
             elif section == 'units' and key == 'length':
-                length = float(values[0])
+                length = _number(values, positive=True)
             elif section == 'units' and key == 'angle':
-                degrees = values[0].lower().startswith('deg')
+                degrees = ''.join(values).lower().startswith('deg')
             elif section == 'root' and key == 'order':
-                root['dof'] = [value.lower() for value in values]
+                root['dof'] = _dofs(values)
+                if not {'tx', 'ty', 'tz'} <= {*root['dof']}:
+                    raise ValueError('expected TX, TY and TZ among them')
             elif section == 'root' and key == 'axis':
-                root['order'] = values[0].lower()
+                root['order'] = _order(values)
             elif section == 'root' and key == 'orientation':
-                root['axis'] = np.array(values, float)
+                root['axis'] = _vector(values)
             elif section == 'bonedata' and key == 'begin':
                 bone = {'dof': [], 'axis': np.zeros(3), 'order': 'xyz'}
-            elif section == 'bonedata' and key == 'end':
-                bones[bone['name']] = {**bone, 'tip': bone['length'] * bone['direction']}
-            elif section == 'bonedata' and key == 'name':
-                bone['name'] = values[0]
-            elif section == 'bonedata' and key == 'length':
-                bone['length'] = float(values[0])
-            elif section == 'bonedata' and key == 'direction':
-                bone['direction'] = np.array(values, float)
-            elif section == 'bonedata' and key == 'axis':
-                bone['axis'], bone['order'] = np.array(values[:3], float), values[3].lower()
-            elif section == 'bonedata' and key == 'dof':
-                bone['dof'] = [value.lower() for value in values]
+            elif section == 'bonedata' and bone is None:
+                raise ValueError("expected 'begin' before it")
+            elif section == 'bonedata' and bone is not None:
+                if key == 'end':
+                    for needed in ('name', 'length', 'direction'):
+                        if needed not in bone:
+                            raise ValueError(f'the bone has no {needed}')
+                    bones[bone['name']] = {**bone, 'tip': bone['length'] * bone['direction']}
+                    bone = None
+                elif key == 'name':
+                    (bone['name'],) = values
+                    if bone['name'] in bones:
+                        raise ValueError('the name is taken')
+                elif key == 'length':
+                    bone['length'] = _number(values)
+                elif key == 'direction':
+                    bone['direction'] = _vector(values)
+                elif key == 'axis':
+                    bone['axis'], bone['order'] = _vector(values[:3]), _order(values[3:])
+                elif key == 'dof':
+                    bone['dof'] = _dofs(values)
             elif section == 'hierarchy' and key not in ('begin', 'end'):
                 if words[0] not in ('root', *children):
                     raise ValueError('a bone whose own parent is not named above')
                 for child in values:
+                    if child not in bones:
+                        raise ValueError(errors.unknown('bone', child, bones))
+                    if child in ('root', *children):
+                        raise ValueError(f'{child!r} has a parent already')
                     bones[child]['parent'] = words[0]
                     children.append(child)
-        except (ValueError, KeyError, IndexError) as error:
-            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error!r}') from None
+        except ValueError as error:
+            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error}') from None
     if not root['dof'] or not children:
         raise ValueError(f'{path}: expected the sections :root and :hierarchy')
     return {name: bones[name] for name in ('root', *children)}, length, degrees
 
 
+def _number(values: Sequence[str], positive: bool = False) -> float:
+    (number,) = map(float, values)
+    if not (1 / LARGEST if positive else 0) <= number < LARGEST:
+        raise ValueError(f'expected a {"positive" if positive else "finite"} number')
+    return number
+
+
+def _vector(values: Sequence[str]) -> np.ndarray:
+    if not _three_numbers(values):
+        raise ValueError('expected three finite numbers')
+    return np.array(values, float)
+
+
+def _order(values: Sequence[str]) -> str:
+    (order,) = values
+    if sorted(order.lower()) != ['x', 'y', 'z']:
+        raise ValueError('expected an order of axes, such as XYZ')
+    return order.lower()
+
+
+def _dofs(values: Sequence[str]) -> list[str]:
+    found = [value.lower() for value in values]
+    known = ('tx', 'ty', 'tz', 'rx', 'ry', 'rz', 'l')
+    for dof in found:
+        if dof not in known:
+            raise ValueError(errors.unknown('degree of freedom', dof, known))
+    if len({*found}) < len(found):
+        raise ValueError('one of them is given twice')
+    return found
+
+
 def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[str, list[float]]]:
     """Reads a .amc file: the numbers of every bone, frame by frame."""
     frames: list[dict[str, list[float]]] = []
-    for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0][0] in '#:':
             continue
@@ -278,12 +366,20 @@ def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[s
                 frames.append({})
                 continue
             name, values = words[0], list(map(float, words[1:]))
+            if not frames:
+                raise ValueError('expected the number of a frame before it')
+            if name not in bones:
+                raise ValueError(errors.unknown('bone', name, bones))
             expected = len(bones[name]['dof'])
             if len(values) != expected:
                 raise ValueError(f'{len(values)} numbers; expected {expected}')
+            if not (np.abs(values) < LARGEST).all():
+                raise ValueError('expected finite numbers')
             frames[-1][name] = values
-        except (ValueError, KeyError, IndexError) as error:
-            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error!r}') from None
+        except ValueError as error:
+            raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error}') from None
+    if len(frames) < 2:
+        raise ValueError(f'{path}: {len(frames)} frames; expected at least 2')
     for i, found in enumerate(frames):
         if 'root' not in found:
             raise ValueError(f'{path}: frame {i} has no root')

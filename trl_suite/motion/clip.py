@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trl_suite.motion import quaternion
-from trl_suite.motion.layout import Layout, Mirror
+from trl_suite.motion.layout import LARGEST, Layout, Mirror
 from trl_suite.util import archive, errors, resources
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a velocity
@@ -99,9 +99,11 @@ class Clip:
                 'poses', f'shape is {self.poses.shape}, needed ({self.times.size}, {columns})'
             )
         for field in ('times', 'poses'):
-            bad = np.argwhere(~np.isfinite(getattr(self, field)))
+            values = getattr(self, field)
+            bad = np.argwhere(~(np.abs(values) < LARGEST))  # NaN, too
             if bad.size:
-                raise self._error(field, f'not finite at {bad[0].tolist()}')
+                what = 'too large' if np.isfinite(values[tuple(bad[0])]) else 'not finite'
+                raise self._error(field, f'{what} at {bad[0].tolist()}')
         if self.times[0] != 0 or np.any(np.diff(self.times) <= 0):
             raise self._error('times', 'must start at 0 and increase strictly')
         for q, _ in self.layout.rotations:

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from trl_suite.motion.clip import Clip
-from trl_suite.motion.layout import JOINT_SIZES
+from trl_suite.motion.layout import JOINT_SIZES, LARGEST
+from trl_suite.util.files import read_json, replacing
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
 _FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by
 _ZERO = 1e-6  # length below which a quaternion has no direction
-_LARGEST = 1e300  # beyond it an integer of the file may not fit a float
 
 
 # Joint layouts of DeepMimic's characters: name -> columns. Fixed joints (wrists) have no columns.
@@ -81,10 +81,10 @@ def read_terrainrl(
 
 def read_deepmimic(
     path: str | os.PathLike[str],
-    joints: Sequence[str] = tuple(HUMANOID3D),
-    sizes: Sequence[int] = tuple(HUMANOID3D.values()),
+    joints: Sequence[str] | None = None,
+    sizes: Sequence[int] | None = None,
 ) -> Clip:
-    """Reads a DeepMimic motion file; the layout is humanoid3d's unless given.
+    """Reads a DeepMimic motion file.
 
     As in DeepMimic the first frame is moved over the origin, and `CycleSyncRootRot` lets the
     heading that a cycle gains accumulate. A looping clip gains no height over cycles unless
@@ -93,7 +93,8 @@ def read_deepmimic(
 
     Args:
       path: JSON file.
-      joints: joint names in the order of the character file, without fixed joints.
+      joints: joint names in the order of the character file, without fixed joints; by default those
+        of `HUMANOID3D` or `DOG3D`, whichever has as many numbers as a frame.
       sizes: columns of each, 1 (hinge) or 4 (ball).
 
     Returns:
@@ -114,6 +115,9 @@ def read_deepmimic(
     if not isinstance(turning, bool):
         raise ValueError(f'{path}: CycleSyncRootRot: true or false is needed, found {turning!r}')
     frames = _frames(path, motion)
+    if joints is None or sizes is None:
+        layout = _deepmimic_layout(path, frames.shape[1])
+        joints, sizes = tuple(layout), tuple(layout.values())
     if looping:
         if motion.get('CycleSyncRootPos', True) is not True:
             found = motion['CycleSyncRootPos']
@@ -125,6 +129,17 @@ def read_deepmimic(
     frames[:, [1, 3]] -= frames[0, [1, 3]]
     clip = _clip(path, frames, joints, sizes, 'free', looping)
     return dataclasses.replace(clip, turning=looping and turning)
+
+
+def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
+    """Returns the layout whose frames have so many numbers."""
+    known = {_HEADER + sum(layout.values()): layout for layout in (HUMANOID3D, DOG3D)}
+    if length not in known:
+        lengths = ' or '.join(f'{count} ({len(layout)} joints)' for count, layout in known.items())
+        raise ValueError(
+            f"{path}: frame 0 has {length} numbers; DeepMimic's humanoid and dog have {lengths}"
+        )
+    return known[length]
 
 
 def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
@@ -150,20 +165,12 @@ def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
         frames[:, here] = _upright(frames[:, here])
     rows = ',\n'.join(json.dumps(frame) for frame in frames.tolist())
     text = f'{{\n"Loop": {json.dumps(clip.loop)},\n"Frames": [\n{rows}\n]\n}}\n'
-    path = pathlib.Path(path)
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
+    with replacing(pathlib.Path(path)) as part:
         part.write_text(text)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _parse(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        motion = json.loads(path.read_text(encoding='utf-8'))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f'{path}: not JSON: {error}') from None
+    motion = read_json(path)
     if not isinstance(motion, dict):
         raise ValueError(f'{path}: an object with Frames is needed')
     return motion
@@ -185,8 +192,11 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
             )
         for j, value in enumerate(frame):
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (number and abs(value) < _LARGEST):  # false for NaN, too
-                raise ValueError(f'{path}: frame {i}, {_field(j)}: {value!r} is no finite number')
+            if not (number and abs(value) < LARGEST):  # false for NaN, too
+                shown = repr(value) if len(repr(value)) < 40 else f'{repr(value)[:40]}...'
+                raise ValueError(
+                    f'{path}: frame {i}, {_field(j)}: {shown} is no finite number below {LARGEST:g}'
+                )
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
     array = np.array(frames, dtype=float)

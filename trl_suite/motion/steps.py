@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from trl_suite.motion import quaternion
 from trl_suite.motion.clip import STEPS_SUFFIX, VELOCITY_STEP, Clip, shipped
-from trl_suite.motion.layout import Layout
+from trl_suite.motion.layout import LARGEST, Layout
 from trl_suite.util import archive, resources
 
 FEATURES = (
@@ -93,8 +93,8 @@ class Steps:
             array, shape = getattr(self, field), (len(self), columns)
             if array.shape != shape:
                 raise self._error(field, f'shape is {array.shape}, needed {shape}')
-            if not np.isfinite(array).all():
-                raise self._error(field, 'not finite')
+            if not (np.abs(array) < LARGEST).all():
+                raise self._error(field, 'not finite, or too large')
         for i in range(len(self)):
             self.clip(i)  # checks the rest
 

@@ -73,7 +73,6 @@ Floats are written as float32, or as float16 where nothing is lost by it.
 from __future__ import annotations
 
 import difflib
-import io
 import json
 import os
 from typing import Any
@@ -83,7 +82,7 @@ import numpy as np
 from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Convolution, Policy
 from trl_suite.util import resources
-from trl_suite.util.files import check_path, existing, replacing
+from trl_suite.util.files import check_path, existing, load_arrays, replacing
 
 FORMAT = 'trl_suite policy'
 VERSION = 1
@@ -158,13 +157,10 @@ def load(path: str | os.PathLike[str]) -> Policy:
       FileNotFoundError: there is no such file.
     """
     path = existing(path, ('.npz',))
-    content = io.BytesIO(path.read_bytes())
     fields: dict[str, Any] = {}
     read = _Reader()
     try:
-        archive = np.load(content, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError('a single array')
+        archive = load_arrays(path)
         read.archive = archive
         for name, (kind, axes) in _FIELDS.items():
             fields[name] = read(name, kind, axes).tolist()
@@ -202,7 +198,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
     except Exception as error:  # a damaged archive fails in a dozen ways
         where = f'field {read.field!r}' if read.field else 'no readable policy'
-        raise ValueError(f'{path}: {where}: {error}') from None
+        raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
     for name in ('format', 'version', 'layers'):
         del fields[name]

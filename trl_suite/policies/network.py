@@ -20,6 +20,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 _FLAT = 'observations'  # key of the flat vector, where an environment gives one
 _LEAST_VARIANCE = 1e-5  # of the sums of a layer that are brought to deviation 1
+_LARGEST = float(np.finfo(np.float32).max)  # that a sum may reach
 REACH = 1.0  # m; within which a network sees where a place is, and farther away its direction
 
 
@@ -215,6 +216,7 @@ class Policy:
             inputs = outputs
         put('weights', tuple(weights))
         put('biases', tuple(biases))
+        self._check_sums()
         try:
             put('info', json.loads(json.dumps(self.info, allow_nan=False)))
         except (TypeError, ValueError) as error:
@@ -223,6 +225,27 @@ class Policy:
             raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
         if self.mirror is not None:
             self.mirror.check(k, a)
+
+    def _check_sums(self) -> None:
+        """Refuses weights with which a sum may overflow, so that an action may be NaN."""
+        bound = self.clip
+        if self.convolution is not None:
+            for i, layer in enumerate(
+                zip(self.convolution.weights, self.convolution.biases, strict=True)
+            ):
+                bound = self._hidden(_largest_sum(f'filter_{i}', *layer, bound))
+            bound = max(bound, self.clip)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            bound = _largest_sum(f'weight_{i}', weight, bias, bound)
+            if i < len(self.weights) - 1:
+                if self.layer_norm:
+                    _largest_sum(f'weight_{i}', np.full((len(bias), 1), bound), np.zeros(1), bound)
+                    bound = len(bias) ** 0.5
+                bound = self._hidden(bound)
+
+    def _hidden(self, bound: float) -> float:
+        """Returns the bound of what the activation makes of numbers with a bound."""
+        return min(bound, 1.0) if self.activation == 'tanh' else max(bound, 1.0)
 
     @property
     def observation_size(self) -> int:
@@ -335,6 +358,21 @@ class Policy:
         if self.mirror is not None and left is not None:
             x = self.mirror.unmirror_action(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+
+def _largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) -> float:
+    """Returns how large a layer's sums may be, given the bound of what it sums up.
+
+    Raises:
+      ValueError: larger than float32 can hold; the message has the name.
+    """
+    axes = tuple(range(weight.ndim - 1))
+    most = float((np.abs(weight.astype(float)).sum(axes) * bound + np.abs(bias)).max())
+    if most > _LARGEST:
+        raise ValueError(
+            f'{name}: is too large: sums may reach {most:.3g}; expected at most {_LARGEST:.3g}'
+        )
+    return most
 
 
 def _bounded(x: np.ndarray, bound: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import subprocess
 from collections.abc import Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ import numpy as np
 
 from trl_suite import terrain as terrains
 from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
+from trl_suite.util import errors
 from trl_suite.util.files import Path, check_path, replacing
 
 if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
@@ -28,6 +30,7 @@ MAP_PIXELS = 8  # of each sample of a height map, along both axes
 HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
 ROOT_COLOUR = (20, 20, 20)  # where the character stands on its height map
 MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
+MOST_DRAWS = 100  # in one plot
 MAP_POINTS = 400  # at most, along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
@@ -53,34 +56,27 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
 
 
 class Video:
-    """A video to which pictures are added one by one, so that none is kept in memory.
+    """A video to which pictures are added one by one; an .mp4 keeps none of them in memory.
 
     Used as a context manager; the file appears at the end, and not at all after an exception.
     Arguments and errors are those of `video`.
     """
+
+    _encoder: subprocess.Popen[bytes] | None = None
 
     def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
         self._path = check_path(path, VIDEO_SUFFIXES)
         if not 0 < fps < np.inf:
             raise ValueError(f'fps is {fps}; expected a positive number')
         self._fps = fps
-        self._imageio = _optional('imageio.v2')
-        if self._path.suffix == '.mp4':
-            _optional('imageio_ffmpeg')
+        self._images: list[Any] = []  # of a .gif
+        module = 'imageio_ffmpeg' if self._path.suffix == '.mp4' else 'PIL.Image'
+        self._library = _optional(module)
         self._shape: tuple[int, ...] | None = None
         self._files = contextlib.ExitStack()
 
     def __enter__(self) -> Video:
         self._part = self._files.enter_context(replacing(self._path))
-        if self._path.suffix == '.mp4':
-            options: dict[str, Any] = {
-                # imageio would scale frames up to multiples of 16 by itself.
-                'fps': self._fps, 'codec': 'libx264', 'macro_block_size': 1, 'quality': 7,
-                'ffmpeg_log_level': 'error',
-            }  # fmt: skip
-        else:
-            options = {'duration': 1000 / self._fps, 'loop': 0}  # ms per frame; play for ever
-        self._writer = self._imageio.get_writer(self._part, **options)
         return self
 
     def add(self, image: np.ndarray) -> None:
@@ -97,7 +93,37 @@ class Video:
             raise ValueError(
                 f'{self._path}: a frame has shape {image.shape}, those before it {self._shape}'
             )
-        self._writer.append_data(image)
+        if self._path.suffix != '.mp4':
+            self._images.append(self._library.fromarray(image))
+            return
+        if self._encoder is None:
+            self._encoder = self._started(*image.shape[:2])
+        assert self._encoder.stdin is not None
+        try:
+            self._encoder.stdin.write(np.ascontiguousarray(image).data)
+        except OSError:
+            raise self._failure(self._encoder) from None
+
+    def _started(self, height: int, width: int) -> subprocess.Popen[bytes]:
+        """Starts ffmpeg, whose exit status tells whether all was written; imageio ignores it."""
+        command = [
+            self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
+            '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
+            'yuv420p', '-crf', '15', str(self._part),
+        ]  # fmt: skip
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            start_new_session=True,  # an interrupt from the keyboard is for this process alone
+        )  # fmt: skip
+
+    def _failure(self, encoder: subprocess.Popen[bytes]) -> OSError:
+        """Returns why the encoder ended, which it must have done."""
+        assert encoder.stderr is not None
+        lines = encoder.stderr.read().decode(errors='replace').split('\n')
+        said = next((line.strip() for line in reversed(lines) if line.strip()), '')
+        return OSError(
+            f'{self._path}: the encoder failed: {said or f"exit status {encoder.wait()}"}'
+        )
 
     def __exit__(
         self,
@@ -106,17 +132,33 @@ class Video:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            self._writer.close()
-        except Exception:
             if kind is None:
-                self._files.__exit__(OSError, OSError(), None)
-                raise
-        if kind is None and not (self._part.exists() and self._part.stat().st_size):
-            reason = 'no frames were given' if self._shape is None else 'the encoder wrote nothing'
-            error = ValueError(f'{self._path}: {reason}')
-            self._files.__exit__(ValueError, error, None)
-            raise error
-        self._files.__exit__(kind, error, traceback)
+                self._finish()
+        except BaseException as failure:
+            kind, error, traceback = type(failure), failure, failure.__traceback__
+            raise
+        finally:
+            if self._encoder is not None:
+                self._encoder.kill()  # nothing, if it has ended
+                with contextlib.suppress(OSError, ValueError):
+                    self._encoder.communicate()
+            self._files.__exit__(kind, error, traceback)  # removes the part after an exception
+
+    def _finish(self) -> None:
+        if self._shape is None:
+            raise ValueError(f'{self._path}: no frames were given')
+        if self._encoder is None:
+            first, *others = self._images
+            first.save(
+                self._part, save_all=True, append_images=others, duration=1000 / self._fps, loop=0
+            )
+            return
+        assert self._encoder.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._encoder.stdin.close()
+        failure = self._failure(self._encoder)
+        if self._encoder.wait():
+            raise failure
 
 
 def film_strip(
@@ -149,9 +191,7 @@ def film_strip(
     parts = [part for i in chosen for part in (margin, images[i])]
     strip = np.concatenate(parts[1:], axis=1)
     if path is not None:
-        imageio = _optional('imageio.v3')
-        with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
-            imageio.imwrite(part, strip)
+        _write_png(strip, path)
     return strip
 
 
@@ -189,8 +229,7 @@ def plot_terrain(
     """
     terrain = terrains.load(terrain)
     target = check_path(path, IMAGE_SUFFIXES)
-    if draws < 1:
-        raise ValueError(f'draws is {draws}; expected at least 1')
+    errors.check_whole('draws', draws, 1, MOST_DRAWS)
     longest = MAX_SPAN if terrain.spatial else 10_000.0
     if not 0 < length <= longest:
         raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
@@ -322,10 +361,14 @@ def height_map(
     mark = MAP_PIXELS // 2
     image[env_id - mark : env_id + mark, column - mark : column + mark] = ROOT_COLOUR
     if path is not None:
-        imageio = _optional('imageio.v3')
-        with replacing(check_path(path, IMAGE_SUFFIXES)) as file:
-            imageio.imwrite(file, image)
+        _write_png(image, path)
     return image
+
+
+def _write_png(image: np.ndarray, path: Path) -> None:
+    picture = _optional('PIL.Image').fromarray(image)
+    with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
+        picture.save(part)
 
 
 def _image(image: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Motions of the user's own on a character of the suite: read, transferred, cut, and checked."""
 
 from trl_suite.retargeting.transfer import (
+    FORMATS,
     NAMES,
-    SUFFIXES,
     counterparts,
     cycle,
     guess_map,
@@ -10,4 +10,4 @@ from trl_suite.retargeting.transfer import (
     retarget,
 )
 
-__all__ = ['NAMES', 'SUFFIXES', 'counterparts', 'cycle', 'guess_map', 'read', 'retarget']
+__all__ = ['FORMATS', 'NAMES', 'counterparts', 'cycle', 'guess_map', 'read', 'retarget']

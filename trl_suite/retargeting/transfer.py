@@ -14,7 +14,7 @@ slide or ground that is entered: `trl_suite.retargeting.clip_check` tells where 
 from __future__ import annotations
 
 import dataclasses
-import json
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,9 +26,13 @@ from trl_suite.motion import clip as clips
 from trl_suite.motion.capture import read_amc, read_bvh
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import errors
-from trl_suite.util.files import Path, existing
+from trl_suite.util.files import Path, existing, read_json
 
-SUFFIXES = ('.bvh', '.amc', '.json', '.npz')
+FORMATS = {
+    'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepMimic)',
+    'npz': 'a clip (.npz)',
+}  # fmt: skip
+HEAD = 65536  # bytes of a file that tell its format
 STRAIGHT = 0.2  # m; a motion that gets farther is turned until it goes along +x
 SINKING = 0.05  # share of the frames that may enter the ground; captured heights are not exact
 CYCLE = (0.3, 2.5)  # s; shortest and longest cycle that is looked for
@@ -60,45 +64,70 @@ CharacterLike = str | characters.CharacterSpec
 def read(
     path: Path, character: CharacterLike, skeleton: Path | None = None, **options: Any
 ) -> Clip | Capture:
-    """Reads a motion file of any format.
+    """Reads a motion file of any format, which its content tells, whatever its name.
 
     Args:
-      path: .bvh; .amc (Acclaim, CMU); .json of TerrainRL, whose joints are those of the character, in
-        its order, or of DeepMimic, whose joints are those of its humanoid; .npz of `Clip.save`.
+      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, whose joints are those of the character, in
+        its order, or of DeepMimic, whose joints are those of its humanoid or its dog; or what
+        `Clip.save` wrote (.npz).
       character: for TerrainRL's files.
-      skeleton: for .amc, the .asf file that belongs to it.
+      skeleton: for Acclaim, the .asf file that belongs to it.
       **options: of `motion.read_bvh` or `motion.read_amc`.
 
     Raises:
-      ValueError: another suffix, a malformed file, or options that do not belong to the format.
+      ValueError: another format, a malformed file, or options that do not belong to the format.
       FileNotFoundError: there is no such file.
-      ImportError: for .bvh, if the extra 'clips' is not installed.
+      ImportError: for BVH, if the extra 'clips' is not installed.
     """
-    path = existing(path, SUFFIXES)
-    if path.suffix.lower() == '.amc' and skeleton is None:
+    path = existing(path)
+    found = _format(path)
+    if found == 'amc' and skeleton is None:
         raise ValueError(f'{path}: an .amc file needs its skeleton, an .asf file')
-    if path.suffix.lower() != '.amc' and skeleton is not None:
+    if found != 'amc' and skeleton is not None:
         raise ValueError(
             f'{path}: a skeleton ({skeleton}) belongs to an .amc file, and to no other'
         )
-    if path.suffix.lower() == '.bvh':
+    if found == 'bvh':
         return read_bvh(path, **options)
-    if path.suffix.lower() == '.amc':
+    if found == 'amc':
         assert skeleton is not None
         return read_amc(path, skeleton, **options)
     if options:
         raise ValueError(f'{path}: {", ".join(options)}: for .bvh and .amc only')
-    if path.suffix.lower() == '.npz':
+    if found == 'npz':
         return clips.load(path)
-    try:
-        content = json.loads(path.read_text(encoding='utf-8'))
-    except ValueError as error:
-        raise ValueError(f'{path}: not JSON: {error}') from None
+    content = read_json(path)
     # The two differ in how they say that a motion repeats.
     if isinstance(content, dict) and isinstance(content.get('Loop'), str):
         return readers.read_deepmimic(path)
     layout = KinematicViewer(character).layout
     return readers.read_terrainrl(path, layout.joints, layout.sizes, layout.root)
+
+
+def _format(path: pathlib.Path) -> str:
+    """Returns which of `FORMATS` a file has."""
+    with path.open('rb') as file:
+        head = file.read(HEAD)
+    if head.startswith(b'PK'):
+        return 'npz'
+    text = head.decode('utf-8-sig', errors='replace').lstrip()
+    if text.startswith('{'):
+        return 'json'
+    if text.upper().startswith('HIERARCHY'):
+        return 'bvh'
+    lines = [line.split('#')[0].strip() for line in text.splitlines()]
+    words = [line.split() for line in lines if line]
+    if any(line[0].lower() in (':bonedata', ':hierarchy', ':root') for line in words):
+        raise ValueError(
+            f'{path}: a skeleton (.asf); expected the motion (.amc) that belongs to it'
+        )
+    # After sections, the first frame begins with its number.
+    first = next((line for line in words if not line[0].startswith(':')), [''])
+    if len(first) == 1 and first[0].isdigit():
+        return 'amc'
+    known = '; '.join(FORMATS.values())
+    what = 'is empty' if not text else 'no motion file'
+    raise ValueError(f'{path}: {what}; expected one of: {known}')
 
 
 def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:

@@ -35,6 +35,7 @@ from trl_suite.tasks.components.spatial_rules import (
     View,
 )
 from trl_suite.tasks.task import (
+    MOST_SUBSTEPS,
     START_PHASE,
     TERRAIN_LEVEL,
     Task,
@@ -53,7 +54,9 @@ class SpatialConfig(Config):
     """Options of tasks of a walker in three dimensions that drive its joints."""
 
     terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
-    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6)
+    substeps: int = option(
+        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6, at_most=MOST_SUBSTEPS
+    )
     action_offset: str = option(
         'clip',
         "pose at action 0: the mean of the motion ('clip'), left and right made alike, the working "

@@ -18,6 +18,8 @@ from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.util.compiled import compiled
 
+MOST_SUBSTEPS = 1000  # physics steps per control step
+MOST_SAMPLES = 10_000  # heights observed on a line
 # Meanings of options that several tasks have.
 START_PHASE = 'phase of every start, in [0, 1), or pairs to draw it between; by default any'
 TERRAIN_LEVEL = (

@@ -30,12 +30,14 @@ from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.planar.generators import GENERATORS, Parameters, register_line
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
-from trl_suite.util.files import existing
+from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.files import check_size, existing
 
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
 Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
-LARGEST = 1e7  # vertices of an array
+LARGEST = 1e7  # vertices of an array, pixels of a picture
+MOST_BYTES = 10**9  # of a mesh file
 
 HeightFunction = Callable[..., npt.ArrayLike]
 
@@ -268,8 +270,17 @@ def from_image(
         raise ValueError(f'{file}: black is {low} m and white {high} m; expected two heights')
     imageio = library('imageio.v3', "'trl_suite[video]'")
     try:
-        pixels = np.asarray(imageio.imread(file, plugin='pillow'))
+        shape = imageio.improps(file, plugin='pillow').shape  # without reading pixels
     except Exception as error:  # of the reader's own kinds
+        raise ValueError(f'{file}: not a picture that can be read ({error})') from None
+    if len(shape) < 2 or math.prod(shape[:2]) > LARGEST:
+        raise ValueError(
+            f'{file}: the picture has {" x ".join(map(str, shape[:2]))} pixels; expected no more than '
+            f'{LARGEST:g} in all'
+        )
+    try:
+        pixels = np.asarray(imageio.imread(file, plugin='pillow'))
+    except Exception as error:
         raise ValueError(f'{file}: not a picture that can be read ({error})') from None
     if not np.issubdtype(pixels.dtype, np.integer) and pixels.dtype != bool:
         raise ValueError(f'{file}: pixels are {pixels.dtype}; expected whole numbers')
@@ -357,25 +368,38 @@ def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
     bounds = [np.searchsorted(x, low[0]), np.searchsorted(x, high[0])]
     bounds += [np.searchsorted(y, low[1]), np.searchsorted(y, high[1])]
     spans = np.stack(bounds, 1)
-    hit = (spans[:, 1] > spans[:, 0]) & (spans[:, 3] > spans[:, 2])
-    for corner, (a, b, c, d) in zip(triangles[hit], spans[hit].tolist(), strict=True):
-        p, u, v = corner[0], corner[1] - corner[0], corner[2] - corner[0]
-        area = u[0] * v[1] - u[1] * v[0]
+    _raise(np.ascontiguousarray(triangles), spans, x, y, heights)
+    return heights
+
+
+@compiled_loop
+def _raise(
+    triangles: np.ndarray, spans: np.ndarray, x: np.ndarray, y: np.ndarray, heights: np.ndarray
+) -> None:
+    """Raises heights (k, m) to triangles, each over the points of its span."""
+    for t in range(len(triangles)):
+        corner = triangles[t]
+        px, py, pz = corner[0, 0], corner[0, 1], corner[0, 2]
+        ux, uy, uz = corner[1, 0] - px, corner[1, 1] - py, corner[1, 2] - pz
+        vx, vy, vz = corner[2, 0] - px, corner[2, 1] - py, corner[2, 2] - pz
+        area = ux * vy - uy * vx
         if abs(area) < 1e-12:  # seen edge on
             continue
-        dx, dy = x[a:b, None] - p[0], y[c:d] - p[1]
-        s, t = (dx * v[1] - dy * v[0]) / area, (u[0] * dy - u[1] * dx) / area
-        inside = (s >= -1e-9) & (t >= -1e-9) & (s + t <= 1 + 1e-9)
-        height = np.where(inside, p[2] + s * u[2] + t * v[2], -np.inf)
-        np.maximum(heights[a:b, c:d], height, out=heights[a:b, c:d])
-    return heights
+        for i in range(spans[t, 0], spans[t, 1]):
+            for j in range(spans[t, 2], spans[t, 3]):
+                dx, dy = x[i] - px, y[j] - py
+                along, across = (dx * vy - dy * vx) / area, (ux * dy - uy * dx) / area
+                if along >= -1e-9 and across >= -1e-9 and along + across <= 1 + 1e-9:
+                    heights[i, j] = max(heights[i, j], pz + along * uz + across * vz)
 
 
 def _triangles(file: os.PathLike[str]) -> np.ndarray:
     """Returns the corners of a mesh file's triangles, (t, 3, 3), in its own units."""
     trimesh = library('trimesh', 'trimesh')
+    check_size(file, MOST_BYTES)
     try:
-        mesh = trimesh.load_scene(file).to_mesh()
+        # Unprocessed: merging equal corners takes most of the time, and changes no height.
+        mesh = trimesh.load_scene(file, process=False).to_mesh()
         triangles = np.asarray(mesh.triangles, float)
     except Exception as error:  # of the reader's own kinds
         raise ValueError(f'{file}: not a mesh that can be read ({error})') from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pathlib
 from collections.abc import Mapping
@@ -10,18 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.util.files import load_arrays, replacing
+
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
     """Writes an archive; an old file stays until the new one is whole."""
-    path = pathlib.Path(path)
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
-        with part.open('wb') as file:
-            arrays = {name: np.asarray(value) for name, value in fields.items()}
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    arrays = {name: np.asarray(value) for name, value in fields.items()}
+    with replacing(pathlib.Path(path)) as part, part.open('wb') as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def read(
@@ -43,21 +38,20 @@ def read(
       ValueError: for a broken file or a malformed field (names file and field).
       FileNotFoundError: if there is no file at the path.
     """
-    content = io.BytesIO(path.read_bytes())
     found: dict[str, Any] = {}
     field = ''
     try:
-        archive = np.load(content, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError('a single array')
+        archive = load_arrays(path)
         for field in fields:
             if field in archive:
                 found[field] = archive[field]
             elif not defaults or field not in defaults:
                 raise ValueError('is missing')
+    except FileNotFoundError:
+        raise
     except Exception as error:  # a damaged archive fails in a dozen ways
         where = f'field {field!r}' if field else f'no readable {what}'
-        raise ValueError(f'{path}: {where}: {error}') from None
+        raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     for field, value in found.items():
         form = fields[field]
         if form is None:

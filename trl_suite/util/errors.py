@@ -44,6 +44,23 @@ def _listed(names: list[str]) -> str:
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
 
 
+def check_whole(name: str, value: object, low: int, high: int, why: str = '') -> None:
+    """Checks that an argument is a whole number between two bounds.
+
+    Args:
+      name: of the argument.
+      value: may be any number that is whole.
+      low, high: bounds, which are allowed.
+      why: where a bound comes from, for the message.
+
+    Raises:
+      ValueError: it is not; the message has its name and the bounds.
+    """
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not number or value % 1 or not low <= value <= high:  # type: ignore[operator]
+        raise ValueError(f'{name} is {value!r}; expected a whole number from {low} to {high}{why}')
+
+
 def check_kind(name: str, value: object, hint: object) -> None:
     """Checks an option by the annotation of what takes it, before that stumbles over it.
 

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import io
 import json
 import os
 import pathlib
+import zipfile
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 Path = str | os.PathLike[str]
+LARGEST = 2**28  # bytes of a text, or of the arrays of an archive, 268 MB
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
@@ -18,7 +23,7 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
 
     Raises:
       ValueError: the suffix is none of the given ones.
-      OSError: the folder does not exist, or the path is a folder.
+      OSError: the folder does not exist or cannot be written, or the path is a folder.
     """
     path = pathlib.Path(path)
     _check_suffix(path, suffixes)
@@ -26,18 +31,21 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
         raise FileNotFoundError(f'{path}: the folder {str(path.parent)!r} does not exist')
     if path.is_dir():
         raise IsADirectoryError(f'{path}: is a folder')
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f'{path}: the folder {str(path.parent)!r} cannot be written')
     return path
 
 
-def existing(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
+def existing(path: Path, suffixes: tuple[str, ...] | None = None) -> pathlib.Path:
     """Returns a path that can be read.
 
     Raises:
-      ValueError: the suffix is none of the given ones.
+      ValueError: suffixes are given, and that of the path is none of them.
       FileNotFoundError: there is no such file; the message has those with similar names beside it.
     """
     path = pathlib.Path(path)
-    _check_suffix(path, suffixes)
+    if suffixes is not None:
+        _check_suffix(path, suffixes)
     if not path.is_file():
         beside = [p.name for p in path.parent.glob('*')] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, beside, n=3, cutoff=0.5)
@@ -53,13 +61,89 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
         )
 
 
+def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> None:
+    """Checks how many bytes a file has, before it is read.
+
+    Args:
+      path: of the file.
+      largest: bytes.
+      size: bytes once it is read, if not those of the file.
+
+    Raises:
+      ValueError: too many; the message names the file and both sizes.
+    """
+    size = pathlib.Path(path).stat().st_size if size is None else size
+    if size > largest:
+        raise ValueError(
+            f'{path}: has {size / 1e6:.0f} MB; expected no more than {largest / 1e6:.0f} MB'
+        )
+
+
+def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
+    """Opens an archive of arrays (.npz) without pickled objects.
+
+    Raises:
+      ValueError: it is too large, once inflated; or no archive.
+      OSError: it cannot be read.
+    """
+    check_size(path)
+    content = io.BytesIO(pathlib.Path(path).read_bytes())
+    try:
+        with zipfile.ZipFile(content) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(f'{path}: no archive of arrays (.npz): {error}') from None
+    check_size(path, size=size)
+    return np.load(content, allow_pickle=False)
+
+
+def read_text(path: Path) -> str:
+    """Returns the text of a file.
+
+    Raises:
+      ValueError: it is too large or not UTF-8; the message names the file and the byte.
+      OSError: it cannot be read.
+    """
+    check_size(path)
+    try:
+        return pathlib.Path(path).read_text(encoding='utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f'{path}: not text in UTF-8: {error.reason} at byte {error.start}'
+        ) from None
+
+
+def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+      ValueError: it is not JSON, or nested too deeply; the message names the file.
+      OSError: it cannot be read.
+    """
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError(f'{path}: not JSON: nested too deeply') from None
+    except ValueError as error:  # also of numbers with too many digits
+        raise ValueError(f'{path}: not JSON: {error}') from None
+
+
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary path beside `path` that takes its place once all went well."""
+    """Yields a temporary path beside `path` that takes its place once all went well.
+
+    Raises:
+      OSError: what was raised within, with the path if it had none, as errors of writing have not.
+    """
     part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
     try:
         yield part
         os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(part), part):
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
 

@@ -15,6 +15,7 @@ Constructors, `trl-suite info`, the pages and the messages read the same fields.
 from __future__ import annotations
 
 import dataclasses
+import operator
 import typing
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple, Self
@@ -23,6 +24,10 @@ import numpy as np
 
 from trl_suite.util import errors
 
+_COMPARISONS = {
+    'at_least': operator.ge, 'at_most': operator.le, 'above': operator.gt, 'below': operator.lt,
+}  # fmt: skip
+
 
 def option(
     default: Any,
@@ -30,6 +35,7 @@ def option(
     *,
     unit: str = '',
     at_least: float | None = None,
+    at_most: float | None = None,
     above: float | None = None,
     below: float | None = None,
     choices: Collection[str] = (),
@@ -42,12 +48,12 @@ def option(
       default: its value where none is given.
       meaning: one line for people.
       unit: of numbers.
-      at_least, above, below: bounds of every number in the value.
+      at_least, at_most, above, below: bounds of every number in the value.
       choices: the only strings that the value may be, or hold.
       actuation: the only actuation model that has the option.
       policy: the value may be the id of an environment whose shipped policy is meant.
     """
-    bounds = {'at_least': at_least, 'above': above, 'below': below}
+    bounds = {'at_least': at_least, 'at_most': at_most, 'above': above, 'below': below}
     metadata = {
         'meaning': meaning, 'unit': unit, 'bounds': bounds, 'choices': tuple(choices),
         'actuation': actuation, 'policy': policy,
@@ -126,21 +132,16 @@ def _check_choices(name: str, value: Any, choices: tuple[str, ...]) -> None:
 
 
 def _check_bounds(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    at_least, above, below = (metadata['bounds'][key] for key in ('at_least', 'above', 'below'))
-    if value is None or (at_least is None and above is None and below is None):
+    bounds: dict[str, float | None] = metadata['bounds']
+    if value is None or set(bounds.values()) == {None}:
         return
     numbers = np.ravel(np.asarray(value, float))
     good = np.isfinite(numbers) & (len(numbers) > 0)
     words = []
-    if at_least is not None:
-        good &= numbers >= at_least
-        words.append(f'at least {at_least:g}')
-    if above is not None:
-        good &= numbers > above
-        words.append(f'above {above:g}')
-    if below is not None:
-        good &= numbers < below
-        words.append(f'below {below:g}')
+    for key, bound in bounds.items():
+        if bound is not None:
+            good &= _COMPARISONS[key](numbers, bound)
+            words.append(f'{key.replace("_", " ")} {bound:g}')
     if not len(numbers) or not good.all():
         what = 'numbers' if np.ndim(value) else 'a number'
         unit = f', in {metadata["unit"]}' if metadata['unit'] else ''

@@ -216,7 +216,8 @@ class Ball:
         root.asset.add('material', name='ball', texture='ball')
         body.add(
             'geom', name='ball', type='sphere', size=(RADIUS,), mass=MASS, material='ball', condim=3,
-            friction=FRICTION, priority=1, solref=SOLREF, contype=0, conaffinity=7,
+            # Like the ground: all that collides with the ground collides with the ball, too.
+            friction=FRICTION, priority=1, solref=SOLREF, contype=1, conaffinity=1,
         )  # fmt: skip
 
     def bind(self, world: World) -> None:

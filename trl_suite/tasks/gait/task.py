@@ -44,6 +44,7 @@ from trl_suite.tasks.gait.rules import (
     run,
 )
 from trl_suite.tasks.task import (
+    MOST_SUBSTEPS,
     SPAWNS,
     TERRAIN_LEVEL,
     Task,
@@ -68,7 +69,9 @@ class GaitConfig(Config):
         'preference per base action, of which the largest counts when the next cycle begins',
         choices=INTERFACES,
     )
-    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1)
+    substeps: int = option(
+        SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1, at_most=MOST_SUBSTEPS
+    )
     spawn: str = option(
         'intended',
         "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "

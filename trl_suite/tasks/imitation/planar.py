@@ -42,6 +42,8 @@ from trl_suite.tasks.imitation.planar_rules import (
     observe_all,
 )
 from trl_suite.tasks.task import (
+    MOST_SAMPLES,
+    MOST_SUBSTEPS,
     SPAWNS,
     START_PHASE,
     TERRAIN_LEVEL,
@@ -65,8 +67,11 @@ class PlanarConfig(Config):
         0,
         'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
         at_least=0,
+        at_most=MOST_SAMPLES,
     )
-    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    substeps: int = option(
+        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
+    )
     action_offset: str = option(
         'clip',
         "pose at action 0: the mean of the 'clip', the working 'posture', or the 'original' map, whose "

@@ -73,6 +73,7 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
 )
 from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask, maps
 from trl_suite.tasks.task import (
+    MOST_SUBSTEPS,
     TERRAIN_LEVEL,
     Marker,
     check_simulated,
@@ -126,7 +127,7 @@ class HierarchicalConfig(Config):
     start_phases: Sequence[float] = option(
         (0.1, 0.6), 'phases of the clock, one of which an episode starts with', at_least=0, below=1
     )
-    substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6)
+    substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6, at_most=MOST_SUBSTEPS)
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
 
     def __post_init__(self) -> None:

@@ -31,6 +31,8 @@ from trl_suite.tasks.imitation.planar_rules import (
 )
 from trl_suite.tasks.spatial_task import maps
 from trl_suite.tasks.task import (
+    MOST_SAMPLES,
+    MOST_SUBSTEPS,
     TERRAIN_LEVEL,
     Task,
     check_position_options,
@@ -58,7 +60,9 @@ from trl_suite.util.options import Config, option
 class WalkConfig(Config):
     """Options of `Walk`."""
 
-    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    substeps: int = option(
+        SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
+    )
     action_scale: float | None = option(
         None, 'joint angle per unit action about the working posture; by default 1.5',
         unit='rad', above=0, actuation='position',
@@ -74,6 +78,7 @@ class PlanarWalkConfig(WalkConfig):
         0,
         'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
         at_least=0,
+        at_most=MOST_SAMPLES,
     )
 
 

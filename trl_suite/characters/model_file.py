@@ -1,0 +1,223 @@
+"""MJCF and URDF files as MuJoCo reads them: names for all that is in them, finite numbers, turned roots."""
+
+from __future__ import annotations
+
+import pathlib
+import re
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from lxml import etree
+
+from trl_suite.util import errors
+from trl_suite.util.files import check_size
+
+# Of a file, besides bodies: what must have a name to be found again.
+_NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
+
+
+def problem(file: pathlib.Path, what: str) -> ValueError:
+    """Returns what to raise about a file."""
+    return ValueError(f'{file}: {what}')
+
+
+def named(file: pathlib.Path) -> mujoco.MjSpec:
+    """Reads a file; what has no name in it gets one."""
+    try:
+        spec = mujoco.MjSpec.from_file(str(file))
+    except ValueError as error:
+        raise problem(file, f'not a model: {" ".join(str(error).split())}') from None
+    spec.compiler.fusestatic = False  # bodies without joints may be end effectors
+    for mesh in spec.meshes:
+        mesh.file = _in_package(file, mesh.file)
+    for body in spec.bodies[1:]:
+        if not body.name:
+            body.name = body.joints[0].name if body.joints else ''
+        body.name = body.name or f'{body.parent.name}_{body.id}'
+        for kind, items in (('', body.joints), ('_geom', body.geoms)):
+            for i, item in enumerate(items):
+                if not item.name:
+                    item.name = f'{body.name}{kind}{i if kind or len(items) > 1 else ""}'
+    for kind in _NAMED:
+        for i, item in enumerate(getattr(spec, kind)):
+            item.name = item.name or f'unnamed_{kind}_{i}'
+    for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
+        if '/' in item.name:
+            raise problem(file, f'the name {item.name!r} has a slash; expected none in names')
+    return spec
+
+
+def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
+    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity.
+
+    Refuses models that load themselves, too: they would crash the process.
+
+    Args:
+      file: which is read with all that it includes and loads.
+      above: files that load it, the first one first.
+    """
+    check_size(file)
+    try:
+        parser = etree.XMLParser(resolve_entities=False)
+        elements = [*etree.fromstring(file.read_bytes(), parser).iter(etree.Element)]
+    except etree.XMLSyntaxError as error:
+        raise problem(file, f'not a model: {error}') from None
+    names = {element.get(key) for element in elements for key in ('name', 'class')}
+    for element in elements:
+        for key, text in element.items():
+            if text not in names and key not in ('name', 'class') and not _finite(text):
+                of = f' of {element.get("name")!r}' if element.get('name') else ''
+                raise problem(
+                    file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
+                    'finite numbers',
+                )  # fmt: skip
+    above = (*above, file.resolve())
+    for element in elements:
+        if element.tag not in ('include', 'model') or not element.get('file'):
+            continue
+        # MuJoCo takes paths from the file that it was given, too.
+        for folder in dict.fromkeys((file.parent, above[0].parent)):
+            inside = folder / element.get('file', '')
+            if inside.resolve() in above:
+                raise problem(
+                    file, f'line {element.sourceline}: <{element.tag} file="{element.get("file")}"> '
+                    'loads a file that loads this one; expected another model',
+                )  # fmt: skip
+            if inside.is_file():  # else MuJoCo complains
+                check_numbers(inside, above)
+                break
+
+
+def _finite(text: str) -> bool:
+    """Whether a text is no list of numbers, or one of finite ones."""
+    try:
+        return bool(np.isfinite([float(number) for number in text.split()]).all())
+    except ValueError:
+        return True
+
+
+def _in_package(file: pathlib.Path, name: str) -> str:
+    """Returns where a mesh of a ROS package lies, given a file somewhere in that package."""
+    address = re.fullmatch(r'package:/+([^/]+)/(.+)', name)
+    if address is None:
+        return name
+    package, inside = address.groups()
+    places = [
+        parent / part
+        for parent in file.resolve().parents
+        for part in (inside, f'{package}/{inside}')
+    ]
+    return str(next((place for place in places if place.is_file()), name))
+
+
+def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> int:
+    """Returns the number of the body that carries all others; by default the only one there is."""
+    top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
+    if root is None and len(top) == 1:
+        (root,) = top
+    if root in top:
+        return top[root]
+    if not top:
+        raise problem(file, 'there is no body; expected one that carries all others')
+    if root is None:
+        raise problem(file, f'several bodies may be the root; give root=, one of {[*top]}')
+    names = [model.body(i).name for i in range(1, model.nbody)]
+    if root in names:
+        above = model.body(model.body_rootid[model.body(root).id]).name
+        raise problem(file, f'root {root!r} hangs on another body; did you mean {above!r}?')
+    raise problem(file, errors.unknown('root', root, names))
+
+
+def turned(
+    file: pathlib.Path, spec: mujoco.MjSpec, root: str, rotation: np.ndarray
+) -> mujoco.MjModel:
+    """Turns all that a body holds, and the body back: its axes become those of the world.
+
+    Args:
+      file: for messages.
+      spec: is changed.
+      root: name of the body, a child of the world.
+      rotation: of what it holds, unit quaternion wxyz.
+
+    Returns:
+      The compiled file.
+    """
+    body = spec.body(root)
+    for equality in spec.equalities:
+        if equality.objtype == mujoco.mjtObj.mjOBJ_BODY and root in (
+            equality.name1, equality.name2,
+        ):  # fmt: skip
+            raise problem(
+                file, f'the root {root!r} is turned, and equality {equality.name!r} holds it; expected '
+                'none at the root, or that the file is turned as it should be',
+            )  # fmt: skip
+    frame = body.add_frame(quat=rotation)
+    for item in (*body.geoms, *body.sites, *body.cameras, *body.lights, *body.bodies):
+        if item.frame is None:
+            item.set_frame(frame)
+    for each in body.frames:
+        if each is not frame and each.frame is None:
+            each.set_frame(frame)
+    if body.explicitinertial:
+        model = spec.compile()  # resolves what is written in other ways than by a quaternion
+        number = model.body(root).id
+        turn = Rotation(rotation)
+        body.ipos = turn.vector(model.body_ipos[number])
+        body.iquat = turn.quaternion(model.body_iquat[number])
+        body.inertia, body.fullinertia = model.body_inertia[number], np.full(6, np.nan)
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.quat = 1, 0, 0, 0
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    return compiled(file, spec)
+
+
+def compiled(file: pathlib.Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a file."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise problem(file, ' '.join(str(error).split())) from None
+
+
+def flat(text: str) -> str:
+    """Returns MJCF, as `MjSpec.to_xml` writes it, without frames, which dm_control does not read."""
+    tree = etree.fromstring(text.encode())
+    for frame in reversed([*tree.iter('frame')]):  # the innermost first
+        turn = Rotation(_numbers(frame, 'quat', (1, 0, 0, 0)))
+        origin = _numbers(frame, 'pos', (0, 0, 0))
+        above, place = frame.getparent(), frame.getparent().index(frame)
+        for child in reversed(frame):
+            if child.tag in ('body', 'geom', 'site', 'camera', 'frame'):
+                position = origin + turn.vector(_numbers(child, 'pos', (0, 0, 0)))
+                rotation = turn.quaternion(_numbers(child, 'quat', (1, 0, 0, 0)))
+                child.set('pos', ' '.join(map(repr, position.tolist())))
+                child.set('quat', ' '.join(map(repr, rotation.tolist())))
+            key = 'childclass' if child.tag in ('body', 'frame') else 'class'
+            if frame.get('childclass') and child.get(key) is None:
+                child.set(key, frame.get('childclass'))
+            above.insert(place, child)
+        above.remove(frame)
+    return etree.tostring(tree, encoding='unicode')
+
+
+def _numbers(element: etree._Element, key: str, default: Sequence[float]) -> np.ndarray:
+    text = element.get(key)
+    return np.array(default if text is None else text.split(), float)
+
+
+class Rotation:
+    """A rotation, of vectors and of other rotations."""
+
+    def __init__(self, quaternion: Sequence[float] | np.ndarray) -> None:
+        self._turn = np.array(quaternion, float)
+
+    def vector(self, vector: np.ndarray) -> np.ndarray:
+        result = np.empty(3)
+        mujoco.mju_rotVecQuat(result, vector, self._turn)
+        return result
+
+    def quaternion(self, quaternion: np.ndarray) -> np.ndarray:
+        result = np.empty(4)
+        mujoco.mju_mulQuat(result, self._turn, quaternion)
+        return result

@@ -1,0 +1,184 @@
+"""`trl-suite try`: reads a character from a file, tells what became of it, and draws it."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import pathlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite import rendering
+from trl_suite.cli import engine
+from trl_suite.util import files, tables
+
+if TYPE_CHECKING:
+    from trl_suite.characters import CharacterSpec
+    from trl_suite.environments.environment import Environment
+
+TERRAINS = {True: ('plane', 'hills3d', 'stairs3d'), False: ('flat', 'slopes', 'steps')}
+SECONDS = 1.0  # under actions of zero, before a picture is drawn
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Prints what of a file became of the character, then draws it on three terrains."""
+    output = arguments.output or pathlib.Path(f'try_{arguments.file.stem}.png')
+    files.check_path(output, rendering.IMAGE_SUFFIXES)
+    suite = engine.load()
+    from trl_suite import characters
+
+    ends, falls = _links(arguments)
+    name = arguments.file.stem
+    spec = characters.from_file(
+        arguments.file, end_effectors=ends, fall_links=falls, root=arguments.root,
+        spatial=arguments.spatial, turn=arguments.turn,
+        name=f'{name}_file' if name in characters.CHARACTERS else name,
+    )  # fmt: skip
+    pictures: list[np.ndarray] = []
+    for terrain in TERRAINS[spec.spatial]:
+        environment = suite.build(spec, terrain=terrain, task='walk', task_kwargs={'random': 0})
+        environment.reset()
+        if not pictures:
+            print(_report(spec, environment, arguments.file), flush=True)
+        print(f'{terrain}: {_stand(environment)}', flush=True)
+        pictures.append(rendering.frame(environment, 360, 480))
+    rendering.film_strip(pictures, output, len(pictures))
+    print(output)
+
+
+def _links(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """Returns end effectors and links that must not touch the ground, by default what looks like them.
+
+    End effectors are the last bodies of limbs that reach below the centre of mass.
+    """
+    import mujoco
+
+    from trl_suite.characters import model_file
+
+    file = files.existing(arguments.file, ('.xml', '.mjcf', '.urdf'))
+    model_file.check_numbers(file)
+    model = model_file.compiled(file, model_file.named(file))
+    root = model_file.find_root(file, model, arguments.root)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    w, *axis = arguments.turn or (1, 0, 0, 0)
+    up = model_file.Rotation((w, *(-x for x in axis))).vector(np.array([0.0, 0.0, 1.0]))
+    touching = model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]
+    solid = [int(i) for i in np.flatnonzero(model.body_rootid == root) if i in touching]
+    inner = {body for i in solid for body in _above(model, i)}
+    last = [i for i in solid if i not in inner]
+    low = [i for i in last if (data.xipos[i] - data.subtree_com[root]) @ up < 0]
+    falls = [i for i in solid if i in inner] or last
+    return (
+        arguments.end_effectors or [model.body(i).name for i in low or last],
+        arguments.fall_links or [model.body(i).name for i in falls[:1]],
+    )
+
+
+def _above(model: Any, body: int) -> list[int]:
+    """Returns the bodies that carry a body."""
+    found = []
+    while body := int(model.body_parentid[body]):
+        found.append(body)
+    return found
+
+
+def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -> str:
+    """Returns what became of a file, for an environment that has just been reset on level ground."""
+    from trl_suite.characters import inspect, model_file
+
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    character = environment.task.character
+    own = np.flatnonzero(model.body_rootid == _root(environment))
+    pairs, inside = _colliding(model, own), _contacts(model, data, own)
+    low, high = _extent(model, data, own)
+    bodies = zip(spec.links, character.bodies, strict=True)
+    forward = inspect.facing({name: environment.physics.bind(body).xipos for name, body in bodies})
+    looks = 'unknown, as no links are named left and right'
+    if forward is not None:
+        looks = f'along {forward.round(2).tolist()}, as left and right links lie'
+    kinds = [joint.type or 'hinge' for joint in character.joints]
+    given = len(model_file.named(file).actuators)
+    left = next((note for note in spec.notes if note.startswith('actuators')), '').count(' (')
+    joints = zip(spec.joints.items(), kinds, character.torque_limits, strict=True)
+    lines = [
+        f'{spec.name}: {"three-dimensional" if spec.spatial else "planar"}, '
+        f'{model.body_mass[own].sum():.4g} kg, {high[2] - low[2]:.3g} m high, '
+        f'{high[0] - low[0]:.3g} m along x (ahead), {high[1] - low[1]:.3g} m along y (to the left)',
+        f'facing: {looks}; expected along [1, 0]',
+        f'links: {", ".join(spec.links)}',
+        f'end effectors: {", ".join(spec.end_effectors)}; must not touch the ground: '
+        f'{", ".join(spec.fall_links)}',
+        f'pairs of its geoms that may collide: {pairs}; that touch at the start: {len(inside)}'
+        + (f', up to {-min(inside):.2g} m deep' if inside else ''),
+        f'actuators: {given} in the file, {given - left} kept, {left} left out; now one per joint',
+        tables.table(
+            ('joint', 'type', 'kp', 'kd', 'torque limit'),
+            (
+                (name, kind, f'{joint.kp:.4g}', f'{joint.kd:.4g}', f'{limit:.4g}')
+                for (name, joint), kind, limit in joints
+            ),
+        ),
+        *(f'note: {note}' for note in spec.notes),
+    ]
+    return '\n'.join(lines)
+
+
+def _root(environment: Environment) -> int:
+    physics = environment.physics
+    body = physics.bind(environment.task.character.root_body).element_id
+    return int(physics.model.body_rootid[body])
+
+
+def _colliding(model: Any, bodies: np.ndarray) -> int:
+    """Returns how many pairs of geoms of bodies may collide."""
+    excluded, count = {*model.exclude_signature.tolist()}, 0
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+    for a, b in itertools.combinations(geoms.tolist(), 2):
+        if not (
+            model.geom_contype[a] & model.geom_conaffinity[b]
+            or model.geom_contype[b] & model.geom_conaffinity[a]
+        ):
+            continue
+        first, second = sorted(model.geom_bodyid[[a, b]].tolist())
+        one, other = model.body_weldid[[first, second]]
+        above = model.body_weldid[model.body_parentid[[one, other]]]
+        joined = one == other or above[0] == other or above[1] == one
+        count += not joined and (first << 16) + second not in excluded
+    return count
+
+
+def _contacts(model: Any, data: Any, bodies: np.ndarray) -> list[float]:
+    """Returns the distances (m, negative inside each other) of contacts among bodies."""
+    return [
+        contact.dist
+        for contact in data.contact
+        if np.isin(model.geom_bodyid[[contact.geom1, contact.geom2]], bodies).all()
+    ]
+
+
+def _extent(model: Any, data: Any, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the lowest and the highest corner (3,) m of what can be touched of bodies."""
+    touching = (model.geom_contype | model.geom_conaffinity) != 0
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & touching)
+    axes = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    middle = data.geom_xpos[geoms] + np.einsum('nij,nj->ni', axes, model.geom_aabb[geoms, :3])
+    half = np.einsum('nij,nj->ni', np.abs(axes), model.geom_aabb[geoms, 3:])
+    return (middle - half).min(0), (middle + half).max(0)
+
+
+def _stand(environment: Environment) -> str:
+    """Runs actions of zero, and tells how that went."""
+    task = environment.task
+    root = environment.physics.bind(task.character.root_body)
+    begin, steps = float(root.xpos[2]), round(SECONDS / environment.control_timestep())
+    zero = np.zeros(environment.action_spec().shape)
+    for step in range(1, steps + 1):
+        if environment.step(zero).last():
+            after = step * environment.control_timestep()
+            how = 'diverges' if environment.info.get('diverged') else 'falls'
+            return f'{how} after {after:.2g} s of zero actions'
+    end = float(root.xpos[2])
+    return f'root {begin:.3g} m up at the start, {end:.3g} m after {SECONDS:g} s of zero actions'

@@ -1,0 +1,65 @@
+"""What programs have in common: bad input ends in one line, and SIGTERM as an interrupt does."""
+
+from __future__ import annotations
+
+import contextlib
+import pathlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import TracebackType
+
+# What users can bring about. Whatever else is raised is a defect, and keeps its traceback.
+EXPECTED = (ValueError, ImportError, RuntimeError, OSError)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: unfinished files are removed, as after an interrupt."""
+
+
+def in_one_line(error: BaseException) -> str:
+    """Returns what an error says."""
+    return ' '.join(str(error).split())
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Lets SIGTERM raise `Terminated`; in other threads than the main one nothing is changed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+    raise Terminated
+
+
+def begin_script() -> None:
+    """Makes a script that is run by itself end as commands do: with one line on stderr.
+
+    Its exit status is 1, as after any exception. With `python -X dev` tracebacks are printed.
+    """
+    if sys.flags.dev_mode:
+        return
+    name = pathlib.Path(sys.argv[0]).name
+    sys.excepthook = lambda *raised: _report(name, *raised)
+    signal.signal(signal.SIGTERM, _terminate)
+
+
+def _report(
+    name: str, kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        how = 'terminated' if issubclass(kind, Terminated) else 'interrupted'
+        print(f'{name}: {how}', file=sys.stderr)
+    elif issubclass(kind, EXPECTED):
+        print(f'{name}: error: {in_one_line(error)}', file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, traceback)
