@@ -21,7 +21,11 @@ from trl_suite.tasks.navigation.scripted import CAUTIOUS
 from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
-REACH, FINE, COARSE = 5.0, 0.125, 2  # half the map's side, m; height spacing, m; node spacing, heights
+REACH, FINE, COARSE = (
+    5.0,
+    0.125,
+    2,
+)  # half the map's side, m; height spacing, m; node spacing, heights
 LEVEL = 0.12  # m; largest height difference to the goal of level ground
 DISTANCE = 0.7  # m; distance from obstacles below which a path costs more
 PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one

@@ -54,7 +54,10 @@ class Settings:
     greedy: float = 0.25  # share of simulations without random actions and without retries
     retry: float = 0.8  # probability that a simulation returns to an earlier state after a fall
     retries: int = 4  # largest number of retries in a row
-    back: tuple[int, int] = (1, 3)  # smallest and largest number of cycles to return before the last one
+    back: tuple[int, int] = (
+        1,
+        3,
+    )  # smallest and largest number of cycles to return before the last one
     retry_epsilon: float = 0.3  # share of random actions in the first cycles of a retry
     retry_cycles: int = 2
     gamma: float = 0.95  # per cycle
@@ -69,7 +72,9 @@ class Settings:
     final_updates: int = 5000  # updates in which the learning rate falls to `final_rate`
     final_rate: float = 1e-5
     view: float = 6.5  # m; distance of the farthest ground height in the input
-    relief: float = 0.8  # m; heights relative to the root are clipped at this deviation from the mean
+    relief: float = (
+        0.8  # m; heights relative to the root are clipped at this deviation from the mean
+    )
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
     ground_units: int = 128  # units of the layer after the convolutions
     hidden: tuple[int, ...] = (256, 128)
@@ -419,7 +424,9 @@ class Learner:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file written by this program
+        state = torch.load(
+            folder / 'checkpoint.pt', weights_only=False
+        )  # a file written by this program
         same = {name: getattr(self.settings, name) for name in _CHANGEABLE}
         if dataclasses.replace(state['settings'], **same) != self.settings:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')

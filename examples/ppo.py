@@ -217,7 +217,9 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
-        self.recent = np.zeros(3)  # sums of returns and steps, and number, of recently ended episodes
+        self.recent = np.zeros(
+            3
+        )  # sums of returns and steps, and number, of recently ended episodes
 
     @property
     def stage(self) -> int:
@@ -267,7 +269,9 @@ class Trainer:
                 )
         offset += 0 if others is None else others.size
         seen = np.arange(offset) if other.columns is None else other.columns
-        entry = np.full(offset + 1, -1)  # indices in the other network's input; the last one is for -1
+        entry = np.full(
+            offset + 1, -1
+        )  # indices in the other network's input; the last one is for -1
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
         entry = entry[column]
         bounded = scales.maps if scales.map_std else []
@@ -349,7 +353,9 @@ class Trainer:
         noise = self.random.standard_normal((*shape, len(self.log_std)), np.float32)
         means, actions = np.empty_like(noise), np.empty_like(noise)
         reward, ended, failed = np.empty(shape), np.empty(shape, bool), np.empty(shape, bool)
-        cut: list[tuple[int, np.ndarray, np.ndarray]] = []  # final observations of truncated episodes
+        cut: list[
+            tuple[int, np.ndarray, np.ndarray]
+        ] = []  # final observations of truncated episodes
         std = self.log_std.exp().detach().numpy()
         for t in range(s.horizon):
             observations[t], left = self.seen(self.observation)
@@ -551,7 +557,9 @@ class Trainer:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        state = torch.load(folder / 'checkpoint.pt', weights_only=False)  # a file written by this program
+        state = torch.load(
+            folder / 'checkpoint.pt', weights_only=False
+        )  # a file written by this program
         if state['settings'] != self.settings:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
