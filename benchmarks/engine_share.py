@@ -3,10 +3,11 @@
     python benchmarks/engine_share.py [IDS ...] [--num-envs 1 64] [--seconds 5] [--json FILE]
 
 The addresses of MuJoCo's functions in `World.engine` are replaced by those of compiled functions
-that read a clock, call MuJoCo, and read the clock again (about 50 ns per call). The remaining time is
-spent in the environment: control, measurements, rewards, observations, resets and Python. Actions are
-random. A share of 1 is the speed of raw `mj_step` in the same states. Resets are excluded for a single
-environment, as in `benchmarks/single_environment.py`, and included for vector environments.
+that read a clock, call MuJoCo, and read the clock again (about 50 ns per call). The remaining time
+is spent in the environment: control, measurements, rewards, observations, resets and Python.
+Actions are random. A share of 1 is the speed of raw `mj_step` in the same states. Resets are
+excluded for a single environment, as in `benchmarks/single_environment.py`, and included for vector
+environments.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
     python benchmarks/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
     python benchmarks/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
-    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  expected values of the test
+    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  expected by the test
 
 Only the public interface is used, so that one version of the suite can record and another compare;
-PYTHONPATH selects the version. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'. Cases:
+PYTHONPATH selects the version. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'.
+Cases:
 
     single/ID       a single environment: random actions, truncated episodes, a state saved in the
                     middle, restored at the end and continued ('repeats': whether it is identical)
@@ -13,13 +14,13 @@ PYTHONPATH selects the version. PATTERN selects cases by name, e.g. 'single/*Dog
     option/ID/...   2 simulations with other options, or a combination without an id
     own/ID          2 simulations with custom reward terms, observations and failures
     use/ID/...      other uses of a vector environment: autoreset, subsets, threads, copies, dtypes
-    policy/ID       an episode of the shipped policy, or its beginning; 'return' is the sum of rewards
+    policy/ID       an episode of the shipped policy, or its beginning; 'return': the sum of rewards
 
-The record has the SHA-256 of the bytes, and the numbers, of each quantity of each case. A comparison
-reports the first step with a difference (0 is the reset), the difference there, and the largest.
-Trajectories are chaotic, so later differences mean little. This applies most to three-dimensional
-characters: when a ball joint's servo is at its limit, the last bit decides whether MuJoCo regards its
-force as limited, and one step later velocities differ by some rad/s.
+The record has the SHA-256 of the bytes, and the numbers, of each quantity of each case. A
+comparison reports the first step with a difference (0 is the reset), the difference there, and the
+largest. Trajectories are chaotic, so later differences mean little. This applies most to
+three-dimensional characters: when a ball joint's servo is at its limit, the last bit decides
+whether MuJoCo regards its force as limited, and one step later velocities differ by some rad/s.
 
 Recording or comparing everything takes about five minutes on one core. Environments whose step is a
 whole gait cycle or footstep are run for fewer steps.
@@ -466,7 +467,7 @@ def summary(id_, seed, nudge=0.0, environment=None):
 
 
 class Controller:
-    """A controller that holds the mean pose; results of a network would differ between processors."""
+    """Holds the mean pose; the results of a network would differ between processors."""
 
     nudge, draw = 0.0, None
 
@@ -487,8 +488,8 @@ def summarised(id_):
 def store(path, pattern=''):
     """Writes summaries of the first steps, as far as small changes of the actions do not matter.
 
-    Of some seeds, the first one with which this holds for all steps is used, or else the one with the
-    most steps. With a pattern the entries of other environments are kept.
+    Of some seeds, the first one with which this holds for all steps is used, or else the one with
+    the most steps. With a pattern the entries of other environments are kept.
     """
     file = pathlib.Path(path)
     stored = json.loads(file.read_text()) if pattern else {}

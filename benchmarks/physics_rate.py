@@ -1,20 +1,22 @@
-"""Determines the physics rate that each character needs: convergence towards the original's 1/3000 s.
+"""Determines the physics rate that each character needs, by convergence towards 1/3000 s.
 
     python benchmarks/physics_rate.py [--quick] [--json FILE] [--plot FILE]
 
-With contact, trajectories diverge exponentially, so no two rates agree for long, however accurate they
-are. Many short episodes are therefore run with the same start and the same actions at every rate and
-compared with 1/3000 s start by start, as means with 95 % confidence intervals over starts. Three
-comparisons at 1/3000 s show the scale of a deviation:
-  perturbed: joints and pitch of the start are displaced by a normal 0.01 rad, like the noise of a reset.
-  soft: contacts and joint limits are as soft as at the default rate. MuJoCo limits a constraint's time
-    constant to at least two time steps, and `trl_suite.actuation` sets that of joint limits to this
-    value, so a coarser rate has softer constraints as well as a coarser integration.
+1/3000 s is the time step of the original. With contact, trajectories diverge exponentially, so no
+two rates agree for long, however accurate they are. Many short episodes are therefore run with the
+same start and the same actions at every rate and compared with 1/3000 s start by start, as means
+with 95 % confidence intervals over starts. Three comparisons at 1/3000 s show the scale of a
+deviation:
+  perturbed: joints and pitch of the start are displaced by a normal 0.01 rad, like the noise of a
+    reset.
+  soft: contacts and joint limits are as soft as at the default rate. MuJoCo limits a constraint's
+    time constant to at least two time steps, and `trl_suite.actuation` sets that of joint limits to
+    this value, so a coarser rate has softer constraints as well as a coarser integration.
   default, against soft: the effect of the coarser integration alone.
 Position and velocity control follow the clip open loop, torque and muscle control a smooth seeded
 sequence. Random full-range actions, continued after falls, test for divergence; in the air without
-actuators, damping, limits and contact, energy should be conserved. Finally solver settings are compared
-at the default rate. The conclusion is in physics_rate.md.
+actuators, damping, limits and contact, energy should be conserved. Finally solver settings are
+compared at the default rate. The conclusion is in physics_rate.md.
 """
 
 import argparse
@@ -45,8 +47,8 @@ REACH = 0.6  # m to both sides of the root that must be clear of the ground ther
 RESAMPLES = 1000  # of the bootstrap
 ONE = np.zeros(1, int)  # the simulation of a single environment
 
-# Compared environments: each character, actuation model and clip of the catalogue on flat ground, and
-# the most difficult terrain for each character that walks over terrain.
+# Compared environments: each character, actuation model and clip of the catalogue on flat ground,
+# and the most difficult terrain for each character that walks over terrain.
 GROUPS = {
     'biped2d position': 'PD_Biped2D_LLC_Imitate_Flat-v0',
     'biped2d position, run': 'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
@@ -84,8 +86,8 @@ SOLVERS = {
     'Euler': {'integrator': mujoco.mjtIntegrator.mjINT_EULER},
 }  # fmt: skip
 
-# A rate is accepted if all of these hold at it and at every finer one. The bounds are a judgement. Of
-# an interval, the end nearest to zero is compared.
+# A rate is accepted if all of these hold at it and at every finer one. The bounds are a judgement.
+# Of an interval, the end nearest to zero is compared.
 ACCEPTED = {
     'diverged share': 0.0,
     'joints 0.1 s / perturbed': 2.0,  # 1 is the effect of 0.01 rad of noise at the start

@@ -2,9 +2,9 @@
 
     python benchmarks/resets.py [IDS ...] [--num-envs 256] [--resets 64] [--repeats 30] [--json FILE]
 
-Prints ms per reset: the smallest CPU time of the repeats, because machines are shared. The parts are
-measured in a second run, because reading the clocks takes time; the time of a part excludes the parts
-that it calls:
+Prints ms per reset: the smallest CPU time of the repeats, because machines are shared. The parts
+are measured in a second run, because reading the clocks takes time; the time of a part excludes the
+parts that it calls:
 
 * seeds: streams of random numbers for terrain and goals
 * drawing: generation of terrain as arrays

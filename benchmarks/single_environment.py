@@ -2,13 +2,14 @@
 
     python benchmarks/single_environment.py [--steps N] [--json FILE]
 
-An environment is stepped with a sequence of actions; `step` calls are timed, resets are not. Then the
-same model is set to the same start states and stepped with the same controls by raw `mj_step`, with the
-same number of substeps. The ratio raw time / environment time is 1 if the environment has no overhead.
-Two workloads: random actions (the character is in the air half of the time, where physics is cheapest)
-and action 0 (the character holds its mean pose until it falls, always in contact). The walker of
-dm_control's suite is measured in the same way. Blocks of all cases alternate, so that changes of the
-machine's speed do not bias the ratios; printed are medians over blocks.
+An environment is stepped with a sequence of actions; `step` calls are timed, resets are not. Then
+the same model is set to the same start states and stepped with the same controls by raw `mj_step`,
+with the same number of substeps. The ratio raw time / environment time is 1 if the environment has
+no overhead. Two workloads: random actions (the character is in the air half of the time, where
+physics is cheapest) and action 0 (the character holds its mean pose until it falls, always in
+contact). The walker of dm_control's suite is measured in the same way. Blocks of all cases
+alternate, so that changes of the machine's speed do not bias the ratios; printed are medians over
+blocks.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python benchmarks/soak.py [--steps 2000000] [--num_envs 256] [--threads 1] [--seed 0]
 
-Runs several environments one after the other with random actions and prints, for each, control steps,
-episodes, divergences, the largest |observation|, and the resident memory after the first tenth and at
-the end.
+Runs several environments one after the other with random actions and prints, for each, control
+steps, episodes, divergences, the largest |observation|, and the resident memory after the first
+tenth and at the end.
 """
 
 import argparse

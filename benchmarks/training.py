@@ -2,8 +2,8 @@
 
     python benchmarks/training.py [--seconds S] [--threads N] [--torch-threads N]
 
-Both rates are measured alternately in one process with the same number of simulations and threads; the
-ratio is the result.
+Both rates are measured alternately in one process with the same number of simulations and threads;
+the ratio is the result.
 """
 
 import argparse

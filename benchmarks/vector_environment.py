@@ -4,16 +4,16 @@
 
 Prints, with random actions and including resets:
 
-- vector environments by number of simulations and threads: control steps per second; the serial part,
-  us per simulation and control step; the cost of a reset; and the projected speed-up on 16 and 64 cores,
-  by Amdahl's law from the serial part;
+- vector environments by number of simulations and threads: control steps per second; the serial
+  part, us per simulation and control step; the cost of a reset; and the projected speed-up on 16
+  and 64 cores, by Amdahl's law from the serial part;
 - memory per simulation, from the difference of new processes with 16 and with 1024 simulations;
-- MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and the single
-  environment;
+- MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and the
+  single environment;
 - installed libraries: dm_control's suite, Gymnasium's MuJoCo environments (single, sync, async) and
-  EnvPool, each as a fraction of the raw `mj_step` rate of its own model with the same number of physics
-  steps, so that models of different cost can be compared. EnvPool 1.2.5 contains MuJoCo 3.6.0; the
-  wheels of 1.2.2 to 1.2.5 cannot be imported because files are missing.
+  EnvPool, each as a fraction of the raw `mj_step` rate of its own model with the same number of
+  physics steps, so that models of different cost can be compared. EnvPool 1.2.5 contains MuJoCo
+  3.6.0; the wheels of 1.2.2 to 1.2.5 cannot be imported because files are missing.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def memory(id_):
 
 
 def single(id_, seconds):
-    """Measures a single environment including resets, and raw mj_step of its model from its start."""
+    """Measures a single environment with resets, and raw mj_step of its model from its start."""
     found = bench.single(id_, seconds)
     return {
         'raw mj_step': found['mj_step'] / SUBSTEPS,

@@ -2,9 +2,9 @@
 
     python docs/generate.py [--overwrite] [--filter PATTERN] [--pages] [--check]
 
-All pages are written. Pictures are rendered if they are missing or show a policy that has been replaced;
---overwrite renders all. Needs `pip install 'trl_suite[video]'`. With --check nothing is written, and the
-exit status is 1 if a page is out of date.
+All pages are written. Pictures are rendered if they are missing or show a policy that has been
+replaced; --overwrite renders all. Needs `pip install 'trl_suite[video]'`. With --check nothing is
+written, and the exit status is 1 if a page is out of date.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python examples/compare_transfer.py                  # all that are trained and not yet compared
     python examples/compare_transfer.py PD_Dog2D_Gaps_Terrain-v0
 
-Prints the distances of both, and writes `trained/transfer.json`: ID -> evaluation of the policy of flat
-ground, in the same episodes as the evaluation in `trained/ID.json`.
+Prints the distances of both, and writes `trained/transfer.json`: ID -> evaluation of the policy of
+flat ground, in the same episodes as the evaluation in `trained/ID.json`.
 """
 
 from __future__ import annotations

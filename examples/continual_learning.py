@@ -3,9 +3,10 @@
     python examples/continual_learning.py plaid_biped --budget 2e5
     python examples/continual_learning.py plaid_dog --budget 1e6 --threads 2 --output runs
 
-Writes OUTPUT/SEQUENCE_sS.json; the same command continues after the last complete stage. The learner is
-that of ppo.py, which keeps its networks, observation scales and optimiser from one environment to the
-next. It does nothing against forgetting and serves as a baseline. Needs `pip install 'trl_suite[train]'`.
+Writes OUTPUT/SEQUENCE_sS.json; the same command continues after the last complete stage. The
+learner is that of ppo.py, which keeps its networks, observation scales and optimiser from one
+environment to the next. It does nothing against forgetting and serves as a baseline. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 import argparse

@@ -3,10 +3,10 @@
     python examples/evaluate_footsteps.py                           # the reference policy
     python examples/evaluate_footsteps.py mine.npz --filter general straight --json mine.json
 
-Prints for every condition, over episodes with the seeds of `evaluation.evaluate`: the share of episodes
-that last to the end, the mean reward per step (0 after a fall), the distance from planned to actual
-footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean heading error at
-landing.
+Prints for every condition, over episodes with the seeds of `evaluation.evaluate`: the share of
+episodes that last to the end, the mean reward per step (0 after a fall), the distance from planned
+to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
+heading error at landing.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
     python examples/evaluate_plans.py                                      # all, both policies
     python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
 
-Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds of
-`evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes without
-a fall, in total and in the first minute, speed towards the goal, goals per minute (not in soccer),
-distance along a trail, the share of time with the ball at its goal, and falls per kilometre.
-Environments without hierarchy have no scripted policy; their episodes are as long as the others. Writes
-the results to trained/plans.json.
+Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds
+of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
+without a fall, in total and in the first minute, speed towards the goal, goals per minute (not in
+soccer), distance along a trail, the share of time with the ball at its goal, and falls per
+kilometre. Environments without hierarchy have no scripted policy; their episodes are as long as the
+others. Writes the results to trained/plans.json.
 """
 
 from __future__ import annotations

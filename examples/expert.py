@@ -1,9 +1,10 @@
 """An expert for footstep planning, with a map of the terrain and the velocities of moving boxes.
 
-While a policy observes coarse maps of the ground ahead, the expert uses privileged information: heights
-every 0.125 m on all sides, and velocities. It finds a short path to the goal that keeps a distance from
-all ground that is not level, and plans footsteps along it. In training a policy imitates the expert
-(learning by cheating, Chen et al. 2019, arXiv:1912.12294); the expert is not a baseline.
+While a policy observes coarse maps of the ground ahead, the expert uses privileged information:
+heights every 0.125 m on all sides, and velocities. It finds a short path to the goal that keeps a
+distance from all ground that is not level, and plans footsteps along it. In training a policy
+imitates the expert (learning by cheating, Chen et al. 2019, arXiv:1912.12294); the expert is not a
+baseline.
 """
 
 from __future__ import annotations
@@ -58,14 +59,15 @@ class Map:
         self.rim = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
 
     def aim(self, cost: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Returns the farthest node of the cheapest path to a goal that a straight line can reach, (2,) m.
+        """Returns the farthest node of the cheapest path that a straight line can reach, (2,) m.
 
-        Grid paths turn by multiples of 45 degrees; a straight line to a far node avoids these turns.
+        Grid paths turn by multiples of 45 degrees; a straight line to a far node avoids these
+        turns.
 
         Args:
           cost: of the nodes, per m.
-          goal: relative to the centre, (2,) m; if it is outside the map, the cost of the last part is
-            estimated.
+          goal: of the path, relative to the centre, (2,) m; if it is outside the map, the cost of
+            the last part is estimated.
         """
         n = len(self.places)
         if np.abs(goal).max() < REACH:
@@ -95,8 +97,9 @@ class Map:
 
 
 def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) -> np.ndarray:
-    """Returns the point of a trail's centre line `ahead` m closer to a goal, relative to `place`, (2,) m.
+    """Returns the point of a trail `ahead` m closer to a goal, relative to `place`, (2,) m.
 
+    The point is on the centre line.
     If the goal is nearer than `ahead`, the point is the one nearest to the goal.
     """
     length = np.linalg.norm(trail.end - trail.start, axis=1)

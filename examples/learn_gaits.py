@@ -3,16 +3,18 @@
     python examples/learn_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1 --threads 1
     python examples/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs
 
-The value of each base action is learnt from a replay buffer (Mnih et al. 2015) with multi-step returns,
-the smaller of two networks' estimates (Fujimoto et al. 2018) and averaged target networks. The networks
-process ground heights relative to the root with 1-D convolutions, as those of Peng, Berseth, van de
-Panne (2016) do. After a fall most simulations return to a state a few cycles earlier and continue with
-other actions, so that the replay contains many states in which the action decides about a fall.
+The value of each base action is learnt from a replay buffer (Mnih et al. 2015) with multi-step
+returns, the smaller of two networks' estimates (Fujimoto et al. 2018) and averaged target networks.
+The networks process ground heights relative to the root with 1-D convolutions, as those of Peng,
+Berseth, van de Panne (2016) do. After a fall most simulations return to a state a few cycles
+earlier and continue with other actions, so that the replay contains many states in which the action
+decides about a fall.
 
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
-identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning curve),
-`last.npz` (the current averaged network), and at the end `policy.npz`, after a final phase in which the
-learning rate falls and no samples are collected. Needs `pip install 'trl_suite[train]'`.
+identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
+curve), `last.npz` (the current averaged network), and at the end `policy.npz`, after a final phase
+in which the learning rate falls and no samples are collected. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
@@ -107,8 +109,8 @@ def settings_for(id_: str, **changes: Any) -> Settings:
 class Network(nn.Module):
     """A network for the values of all actions; the first `line` inputs are ground heights.
 
-    Every layer but the last is followed by a ReLU, and fully connected layers by layer normalisation
-    before it (Ba et al. 2016), which stabilises Q-learning.
+    Every layer but the last is followed by a ReLU, and fully connected layers by layer
+    normalisation before it (Ba et al. 2016), which stabilises Q-learning.
     """
 
     def __init__(self, line: int, others: int, actions: int, settings: Settings) -> None:
@@ -185,7 +187,8 @@ class Learner:
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
         self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]
-        # Observed heights are relative to the ground under the root, which above a gap is its floor.
+        # Observed heights are relative to the ground under the root, which above a gap is its
+        # floor.
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
         others = len(self.columns) - self.line
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))

@@ -51,9 +51,10 @@ NEW_COUNT = 2e4  # sample count of the scales of inputs that the initial policy 
 class Scales:
     """Running mean and standard deviation of observations.
 
-    The phase is not scaled. All elements of a map of the ground share one scale, which preserves its
-    shape and does not amplify noise on flat ground. With `map_bound`, maps are clipped at this bound and
-    divided by it; exported policies include `gain`, the factor for this, in their weights.
+    The phase is not scaled. All elements of a map of the ground share one scale, which preserves
+    its shape and does not amplify noise on flat ground. With `map_bound`, maps are clipped at this
+    bound and divided by it; exported policies include `gain`, the factor for this, in their
+    weights.
     """
 
     def __init__(
@@ -298,7 +299,7 @@ class Trainer:
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
 
     def imitate(self, baseline: str, folder: pathlib.Path | None = None) -> None:
-        """Trains the policy to imitate a baseline (behavioural cloning, or DAgger with several rounds).
+        """Trains the policy to imitate a baseline (behavioural cloning; with several rounds DAgger).
 
         Actions have the exploration noise of the policy, so that the data include recoveries.
 

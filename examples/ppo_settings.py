@@ -39,16 +39,16 @@ class Settings:
     initial_std: float = 0.2  # of actions in [-1, 1]
     bound_cost: float = 0.1  # coefficient of the squared excess of a mean action over 1
     gradient_norm: float = 0.5
-    # Evaluated and shipped policies have an exponential moving average of the weights over about this
-    # number of samples (Polyak averaging); 0: the current weights.
+    # Evaluated and shipped policies have an exponential moving average of the weights over about
+    # this number of samples (Polyak averaging); 0: the current weights.
     averaged: float = 0.0
     # The final policy has the mean weights at the ends of this number of last curriculum stages
-    # (stochastic weight averaging, Izmailov et al. 2018, arXiv:1803.05407), which combines the skills
-    # that different stages emphasise.
+    # (stochastic weight averaging, Izmailov et al. 2018, arXiv:1803.05407), which combines the
+    # skills that different stages emphasise.
     stages_averaged: int = 1
-    # Lower bounds of reward terms, as shares of their maxima: in training an episode also ends when a
-    # term, smoothed over `patience` seconds, falls below its bound. For fast gaits, where standing
-    # still is a local optimum. Not used in evaluations.
+    # Lower bounds of reward terms, as shares of their maxima: in training an episode also ends when
+    # a term, smoothed over `patience` seconds, falls below its bound. For fast gaits, where
+    # standing still is a local optimum. Not used in evaluations.
     least_share: dict[str, float] = dataclasses.field(default_factory=dict)
     patience: float = 0.3
     # Mirror observations and actions in left stance; for walkers in three dimensions.
@@ -58,22 +58,22 @@ class Settings:
     # Bound at which maps are clipped, and by which they are divided, m or m/s; 0: scaled by their
     # standard deviation. With a bound a step of 0.15 m remains visible among hills of 5 m.
     map_bound: float = 0.0
-    # Observation blocks that begin with bearing and distance of a point, whose Cartesian coordinates
-    # are added to the inputs (see `trl_suite.policies.placed`).
+    # Observation blocks that begin with bearing and distance of a point, whose Cartesian
+    # coordinates are added to the inputs (see `trl_suite.policies.placed`).
     places: tuple[str, ...] = ()
-    # Curriculum stages: the share of the samples at which each begins, and its task options, including
-    # `terrain`. Evaluations use the options of the environment.
+    # Curriculum stages: the share of the samples at which each begins, and its task options,
+    # including `terrain`. Evaluations use the options of the environment.
     stages: tuple[tuple[float, dict[str, Any]], ...] = ()
-    # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with its
-    # weights, scales and noise; the weights of inputs that it does not have are 0. Or from one of
-    # `ppo.TEACHERS`, which is imitated for `cloned` control steps.
+    # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with
+    # its weights, scales and noise; the weights of inputs that it does not have are 0. Or from one
+    # of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
     start: str = ''
     # Sample count of the scales of the initial policy. With a small count they adapt quickly to the
     # new environment, but the initial weights may then no longer fit the scales.
     start_count: float = 2e4
     cloned: float = 1e4
-    # Rounds of imitation. After the first round the policy selects the actions, and the baseline only
-    # labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
+    # Rounds of imitation. After the first round the policy selects the actions, and the baseline
+    # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
     cloning_epochs: int = 30  # of each round, over all labels so far
     value_first: float = (
@@ -99,7 +99,7 @@ def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tupl
 
 
 def crowded(preset: str) -> tuple[Any, ...]:
-    """Returns stages on walls only and on all obstacles of a mixed preset, both closer, and on the preset."""
+    """Returns stages on closer walls, on closer obstacles of a mixed preset, and on the preset."""
     mixed = terrain.load(preset)
     near = {
         name: CLOSER * value if 'Spacing' in name else value
@@ -120,14 +120,14 @@ def evenly(stages: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any
 # Differences from the defaults.
 RUNS = {'least_share': {'com': 0.37}}  # a speed error of about 1 m/s
 RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
-# Footsteps: an even walk first, then all step lengths and widths and plans like those of a high-level
-# controller, then sharp turns and pushes. The reward weighs accuracy more than in evaluations, and a
-# large landing error ends the episode, because samples far behind the plan are not useful. In the next
-# stages it does not, and the walker may leave the plan to keep its balance after a push. Then it has to
-# return to the plan, with a reward that extends far enough for that, and to be accurate again. Later a
-# large landing error ends the episode except in the two seconds after a push or a sharp turn; otherwise
-# the walker drifts off the plan. The last stages contain stopping and turning about, which high-level
-# controllers need.
+# Footsteps: an even walk first, then all step lengths and widths and plans like those of a
+# high-level controller, then sharp turns and pushes. The reward weighs accuracy more than in
+# evaluations, and a large landing error ends the episode, because samples far behind the plan are
+# not useful. In the next stages it does not, and the walker may leave the plan to keep its balance
+# after a push. Then it has to return to the plan, with a reward that extends far enough for that,
+# and to be accurate again. Later a large landing error ends the episode except in the two seconds
+# after a push or a sharp turn; otherwise the walker drifts off the plan. The last stages contain
+# stopping and turning about, which high-level controllers need.
 WALKER = 37e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 STAGES = (
@@ -210,7 +210,8 @@ STAGES = (
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
 )  # fmt: skip
-# Running: the environment's plan first, then other lengths and gentle turns, then plans from the root.
+# Running: the environment's plan first, then other lengths and gentle turns, then plans from the
+# root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
 RUN_STAGES = (
     (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'max_landing_error': 0.8}),
@@ -233,8 +234,9 @@ STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgettin
     **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
-# In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward alone
-# the biped would walk a quarter of a metre ahead of the plan, as the reference with its longer steps does.
+# In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward
+# alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its
+# longer steps does.
 PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
 PLANAR_STAGES = (
     (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
@@ -274,7 +276,8 @@ CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with muc
 LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 # Few and varied obstacles: more simulations per update, and a longer time constant of the return.
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
-# With this discount a policy learns to step in place in front of a wall, unless that ends the episode.
+# With this discount a policy learns to step in place in front of a wall, unless that ends the
+# episode.
 CROWDED = {
     'gamma': 0.98, 'stages': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
     'patience': 1.0,

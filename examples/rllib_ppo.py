@@ -1,9 +1,10 @@
 """Trains a policy with RLlib's PPO: each runner is a process that steps many simulations.
 
-This also works on several machines: install the same packages on all, run `ray start --head` on one, and
-the command that it prints on the others. This program, run on the first machine, uses all of them, and
-`--runners` may be the total number of their cores. Runner i has the seed s + i, so runners have different
-terrain. An episode has at most 256 steps of reward at most 1. Needs `pip install 'trl_suite[rllib]'`.
+This also works on several machines: install the same packages on all, run `ray start --head` on
+one, and the command that it prints on the others. This program, run on the first machine, uses all
+of them, and `--runners` may be the total number of their cores. Runner i has the seed s + i, so
+runners have different terrain. An episode has at most 256 steps of reward at most 1. Needs
+`pip install 'trl_suite[rllib]'`.
 """
 
 import argparse
@@ -21,7 +22,7 @@ NOISE = (
 
 
 def configuration(id_, runners=2, num_envs=32, seed=0):
-    """Returns PPO with the given number of runners, which step `num_envs` simulations on a core each."""
+    """Returns PPO whose runners step `num_envs` simulations on one core each."""
 
     def less_noise(algorithm, **_):
         algorithm.learner_group.foreach_learner(

@@ -2,15 +2,15 @@
 
     python examples/search_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1
 
-Before each cycle every base action of the gait is simulated in a copy of the simulation, followed by
-cycles with actions of the network: rollouts improve a policy (Tesauro, Galperin 1996). The network
-learns to predict the result of the search from the observation, as in DAgger (Ross, Gordon, Bagnell
-2011): in half of the simulations the search selects the actions, in the other half the network, so that
-it is trained in states that its own errors lead to. The policy selects one of the base actions, as the
-mixtures of experts of Peng, Berseth, van de Panne (2016) do.
+Before each cycle every base action of the gait is simulated in a copy of the simulation, followed
+by cycles with actions of the network: rollouts improve a policy (Tesauro, Galperin 1996). The
+network learns to predict the result of the search from the observation, as in DAgger (Ross, Gordon,
+Bagnell 2011): in half of the simulations the search selects the actions, in the other half the
+network, so that it is trained in states that its own errors lead to. The policy selects one of the
+base actions, as the mixtures of experts of Peng, Berseth, van de Panne (2016) do.
 
-Writes into OUTPUT/ID/seed_S the files of `examples/ppo.py`: `curve.json`, `policy.npz` (the best of the
-curve), `last.npz`, and `decisions.npz`, from which the same command continues. Needs
+Writes into OUTPUT/ID/seed_S the files of `examples/ppo.py`: `curve.json`, `policy.npz` (the best of
+the curve), `last.npz`, and `decisions.npz`, from which the same command continues. Needs
 `pip install 'trl_suite[train]'`.
 """
 
@@ -53,7 +53,8 @@ class Settings:
     evaluation_episodes: int = 32
 
 
-# A cycle of these characters is one step; after two steps a fall can be inevitable but not yet detected.
+# A cycle of these characters is one step; after two steps a fall can be inevitable but not yet
+# detected.
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_*': {'cycles': 4, 'samples': 2e3},
     'FSM_Hopper2D_*': {'cycles': 4, 'samples': 2e3},

@@ -1,7 +1,7 @@
 """Random actions through Shimmy, the wrapper for all environments of dm_control.
 
-For programs that use Shimmy to wrap dm_control. The suite's own Gymnasium interface, `trl_suite.gym`, also
-steps many simulations on threads, and reports how an episode ended. Needs
+For programs that use Shimmy to wrap dm_control. The suite's own Gymnasium interface,
+`trl_suite.gym`, also steps many simulations on threads, and reports how an episode ended. Needs
 `pip install 'trl_suite[shimmy]'`.
 """
 

@@ -7,10 +7,11 @@
 
 Each run is `examples/ppo.py` on one thread, or for gait environments (FSM_...)
 `examples/learn_gaits.py` or `examples/search_gaits.py`. Runs that start from the policy of another
-environment are run after it. Interrupted runs continue from their checkpoints in RUNS. Finished runs are
-evaluated and entered into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of
-an environment becomes `trained/ID.npz`. Runs that have been entered with the same settings are not
-repeated. Five gait environments are trained; another one has to be selected by its full id.
+environment are run after it. Interrupted runs continue from their checkpoints in RUNS. Finished
+runs are evaluated and entered into `trained/ID.json` (settings, learning curve, evaluation), and
+the best policy of an environment becomes `trained/ID.npz`. Runs that have been entered with the
+same settings are not repeated. Five gait environments are trained; another one has to be selected
+by its full id.
 """
 
 from __future__ import annotations

@@ -4,14 +4,15 @@
     python examples/tune_gait.py goat --evaluate --start climb0_020 --terrain steps --friction 0.6
     python examples/tune_gait.py goat --start climb0_050 --seed 1
 
-A search writes its best gait into `trl_suite/controllers/CHARACTER.json` as set 'tuned', with a record of
-the search, and makes it action 0. It uses CMA-ES (Hansen 2016, arXiv:1604.00772) over the parameters that
-an action sets, in units of the gait's search scale. The score of an episode is the share of the horizon
-without a fall * (0.5 + 0.5 exp(-0.5 (v - target)^2)) + 0.02 for each of up to 15 complete cycles. A
-candidate's score is the mean over noisy starts, which are the same for all candidates of a generation, with
-the coefficients of friction in `FRICTIONS` in turn. The first part of a search has a short horizon, the
-second a long one. Finally, the mean of the distribution and the best candidates of the last generations
-are compared on new starts. Needs `pip install 'trl_suite[tune]'`; evaluation does not.
+A search writes its best gait into `trl_suite/controllers/CHARACTER.json` as set 'tuned', with a
+record of the search, and makes it action 0. It uses CMA-ES (Hansen 2016, arXiv:1604.00772) over the
+parameters that an action sets, in units of the gait's search scale. The score of an episode is the
+share of the horizon without a fall * (0.5 + 0.5 exp(-0.5 (v - target)^2)) + 0.02 for each of up to
+15 complete cycles. A candidate's score is the mean over noisy starts, which are the same for all
+candidates of a generation, with the coefficients of friction in `FRICTIONS` in turn. The first part
+of a search has a short horizon, the second a long one. Finally, the mean of the distribution and
+the best candidates of the last generations are compared on new starts. Needs
+`pip install 'trl_suite[tune]'`; evaluation does not.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ class Runs:
       upright: whether the episode ended without a fall.
       time: duration, s.
       distance: distance travelled by the centre of mass, m.
-      cycles: number of complete cycles: forward, ended by the state machine, and longer than `CYCLE`.
+      cycles: number of complete cycles: forward, ended by the state machine, and longer than
+        `CYCLE`.
     """
 
     horizon: float
@@ -169,7 +171,7 @@ def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
 def measure(
     bench: Bench, vector: np.ndarray, frictions: Sequence[float], seed: int = EVALUATION_SEED
 ) -> Runs:
-    """Runs a gait in all simulations for the longer horizon, with the same starts for each friction."""
+    """Runs a gait in all simulations for the long horizon, with the same starts per friction."""
     rows = bench.environments.num_envs
     starts = rows // len(frictions)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
