@@ -299,7 +299,7 @@ class Trainer:
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
 
     def imitate(self, baseline: str, folder: pathlib.Path | None = None) -> None:
-        """Trains the policy to imitate a baseline (behavioural cloning; with several rounds DAgger).
+        """Trains the policy to imitate a baseline (behavioural cloning; in rounds: DAgger).
 
         Actions have the exploration noise of the policy, so that the data include recoveries.
 
