@@ -25,9 +25,7 @@ REFERENCE = 0.65  # m, the step length to which the parameters of `SHAPES` refer
 LIST, ROTATION, TOE_OUT = 0.07, 0.10, 0.08  # rad: pelvis dropped and turned, feet turned out
 LEAN, TORSO_LEAN, COUNTER = -0.05, -0.02, 1.0  # rad, rad, counter-turn of the torso per pelvis's
 CLEARANCE = 0.12  # m, by which the swing foot passes the stance foot
-SPARE = (
-    0.0025  # m, largest error of the stance foot; if the leg is shorter, the pelvis sinks
-)
+SPARE = 0.0025  # m, largest error of the stance foot; if the leg is shorter, the pelvis sinks
 PASSES = 4  # in which it does
 RATE = 120  # frames per second of a walk
 STEP_RATE = 60  # frames per second of a library
@@ -209,7 +207,7 @@ def _stance(p, start: Node, end: Node, u):
 
 
 def _travel(p, u):
-    """Returns the share of its path covered by the swing foot, which lifts first and lowers last."""
+    """Returns the share of the path covered by the swing foot, with the lift before and after."""
     w = np.clip((u - p['sto'] - 0.03) / (1 - p['sto'] - 0.07), 0, 1)
     return (p['p'] - 1) * figure3d.smooth(w) + (2 - p['p']) * (3 * w**2 - 2 * w**3)
 
