@@ -1,12 +1,13 @@
-"""Share of an environment's time that is spent in the physics engine, on one thread.
+"""Measures the share of an environment's time that is spent in the physics engine, on one thread.
 
     python benchmarks/engine_share.py [IDS ...] [--num-envs 1 64] [--seconds 5] [--json FILE]
 
 The addresses of MuJoCo's functions in `World.engine` are replaced by those of compiled functions
-that read a clock, call MuJoCo, and read the clock again (some 50 ns a call). What remains of the time
-is the environment's own: control, measuring, rewards, observations, resets and Python. Actions are
-random. A share of 1 is the speed of raw `mj_step` in the same states. For one environment resets are
-left out, as they are in `benchmarks/single_environment.py`; batches have them in.
+that read a clock, call MuJoCo, and read the clock again (about 50 ns per call). The remaining time
+is spent in the environment: control, measurements, rewards, observations, resets and Python.
+Actions are random. A share of 1 is the speed of raw `mj_step` in the same states. Resets are
+excluded for a single environment, as in `benchmarks/single_environment.py`, and included for vector
+environments.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ IDS = (
     'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_HLC_Soccer-v0',
 )  # fmt: skip
 MONOTONIC = 1
-WARM = 60  # steps that are not measured
+WARM = 60  # warm-up steps, not measured
 
 _spent = np.zeros(1)  # s, in MuJoCo
 _moment = np.zeros(4, np.int64)  # two timespecs
@@ -40,7 +41,7 @@ _signature = numba.types.void(numba.types.intp, numba.types.intp)
 
 
 def timed(function: int) -> Any:
-    """Returns a C function of (model, data) that calls another and adds up the time it takes."""
+    """Returns a C function of (model, data) that calls another and accumulates its time."""
     libc = ctypes.CDLL(None)
     clock = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_void_p)(('clock_gettime', libc))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(function)
@@ -62,7 +63,7 @@ def timed(function: int) -> Any:
 
 @numba.extending.intrinsic
 def numba_pointer(typing: Any, address: Any) -> Any:
-    """Turns an address into a pointer."""
+    """Converts an address to a pointer."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
@@ -71,7 +72,7 @@ def numba_pointer(typing: Any, address: Any) -> Any:
 
 
 def instrument(world: Any) -> None:
-    """Has a world's calls of MuJoCo timed."""
+    """Replaces a world's MuJoCo functions by timed ones."""
     world.timed = [timed(int(address)) for address in world.engine.functions]
     world.engine.functions[:] = [each.address for each in world.timed]
 
@@ -96,7 +97,7 @@ def single(id_: str, seconds: float) -> dict[str, float]:
 
 
 def batch(id_: str, num_envs: int, seconds: float) -> dict[str, float]:
-    """Measures a batch, resets included; and what a reset takes."""
+    """Measures a vector environment including resets, and the time per reset."""
     environments = VectorEnvironment(id_, num_envs, 1, seed=0)
     environments.reset()
     rng, size = np.random.default_rng(0), len(environments.action_map)

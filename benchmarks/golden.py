@@ -1,28 +1,29 @@
-"""Records what environments return, number by number, and compares it with what they return now.
+"""Records the outputs of environments, and compares records with current outputs bit by bit.
 
     python benchmarks/golden.py record FILE [--filter PATTERN]   writes FILE (.npz)
     python benchmarks/golden.py compare FILE [--filter PATTERN]  exit status 1 if anything differs
-    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  what the test expects
+    python benchmarks/golden.py store tests/golden.json [--filter PATTERN]  expected by the test
 
 Only the public interface is used, so that one version of the suite can record and another compare;
-PYTHONPATH chooses which. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'. Cases:
+PYTHONPATH selects the version. PATTERN selects cases by name, e.g. 'single/*Dog*' or 'option/'.
+Cases:
 
-    single/ID       a single environment: random actions, cut episodes, a state saved in the middle,
-                    restored at the end and continued ('repeats' tells whether it does)
-    batch/ID        the same of 3 simulations, whose actions are small, medium and large
-    option/ID/...   2 simulations with other options, or a combination that the catalogue lacks
-    own/ID          2 simulations with reward terms, observations and failures of a user's
-    use/ID/...      other ways to use a batch: autoreset, some rows only, threads, copies, dtypes
-    policy/ID       an episode of the shipped policy, or its beginning; 'return' is the sum of rewards
+    single/ID       a single environment: random actions, truncated episodes, a state saved in the
+                    middle, restored at the end and continued ('repeats': whether it is identical)
+    batch/ID        the same with 3 simulations, whose actions are small, medium and large
+    option/ID/...   2 simulations with other options, or a combination without an id
+    own/ID          2 simulations with custom reward terms, observations and failures
+    use/ID/...      other uses of a vector environment: autoreset, subsets, threads, copies, dtypes
+    policy/ID       an episode of the shipped policy, or its beginning; 'return': the sum of rewards
 
-Of each case and quantity the record has the SHA-256 of the bytes, and the numbers. A difference is
-told by the first step in which there is one (0 is the reset), its size there, and the largest.
-Trajectories are chaotic, so what follows the first difference says little. Three-dimensional
-characters are more so than others: when a ball joint's servo is at its limit, it depends on the last
-bit whether MuJoCo takes its force for limited, and one step later velocities differ by some rad/s.
+The record has the SHA-256 of the bytes, and the numbers, of each quantity of each case. A
+comparison reports the first step with a difference (0 is the reset), the difference there, and the
+largest. Trajectories are chaotic, so later differences mean little. This applies most to
+three-dimensional characters: when a ball joint's servo is at its limit, the last bit decides
+whether MuJoCo regards its force as limited, and one step later velocities differ by some rad/s.
 
-Recording or comparing everything takes about five minutes of one core. Where a step is a whole gait
-cycle or footstep there are fewer of them.
+Recording or comparing everything takes about five minutes on one core. Environments whose step is a
+whole gait cycle or footstep are run for fewer steps.
 """
 
 import argparse
@@ -44,15 +45,15 @@ from trl_suite.tasks import parts
 from trl_suite.vector import VectorEnvironment
 
 SEED = 5
-AFTER = 10  # steps that are repeated from a saved state
-SCALES = (0.1, 0.3, 1.0)  # of the actions of a batch's simulations
+AFTER = 10  # number of steps repeated from a saved state
+SCALES = (0.1, 0.3, 1.0)  # scale of the actions of the three simulations
 LONG_STEPS = (
     'FSM_',
     '_HLC_',
     '/gait',
     '/goal_navigation',
     '/soccer',
-)  # gait cycles and footsteps, to 0.5 s
+)  # steps of gait cycles and footsteps, of up to 0.5 s
 FAMILIES = (
     'PD_Biped2D_Gaps_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
     'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_LLC_Trail_Step-v0',
@@ -125,16 +126,18 @@ PARTS = {
     'observations': {'upright': (1, parts.upright), 'rates': (2, lambda t: parts.joint_rates(t)[:, :2])},
     'failures': {'low': lambda task: parts.height(task) < 0.4},
 }  # fmt: skip
-# What is stored as a test.
+# Settings of the stored test.
 STEPS, LONG = (0, 1, 5, 20), (0, 1, 2)
 TOLERANCE = 1e-6
-NUDGE = 1e-12  # changes of actions that must not matter, many times those of other processors
+NUDGE = (
+    1e-12  # action changes that must not matter, much larger than differences between processors
+)
 NUDGES = 8
 SEEDS = 100
 
 
 class Log:
-    """Numbers of each step by name."""
+    """Arrays with the quantities of each step, by name."""
 
     def __init__(self):
         self.found = {}
@@ -171,12 +174,12 @@ def is_long(name):
 
 
 def drawn(name, *shape):
-    """Actions in [-1, 1], other ones for every case."""
+    """Returns random actions in [-1, 1], which differ between cases."""
     return np.random.default_rng(zlib.crc32(name.encode())).uniform(-1, 1, shape)
 
 
 def repeats(first, again):
-    """Whether quantities are the same, by step."""
+    """Returns whether quantities are equal, by step."""
     same = {
         name: [np.array_equal(a, b, equal_nan=True) for a, b in zip(first[name], values, strict=False)]
         for name, values in again.items()
@@ -184,7 +187,7 @@ def repeats(first, again):
     return np.all(list(same.values()), axis=0).astype(float)
 
 
-# Cases: functions that return arrays by name, with a row for each step.
+# Cases: functions that return arrays by name, with one row per step.
 
 
 def single(name, id_):
@@ -255,7 +258,7 @@ def same_step(name, id_):
 
 
 def some_rows(name, id_):
-    """Steps and resets of some simulations, by number and by mask, with new seeds and without."""
+    """Steps and resets of some simulations, by index and by mask, with and without new seeds."""
     environments = VectorEnvironment(id_, 4, 1, SEED, autoreset='disabled', step_limit=8)
     log, size = Log(), len(environments.action_map)
     log.batch_reset(environments.reset(), environments)
@@ -273,7 +276,7 @@ def some_rows(name, id_):
 
 
 def threads(name, id_):
-    """More simulations than one thread takes."""
+    """More simulations than one thread steps at a time."""
     environments = VectorEnvironment(id_, 13, 2, list(range(13)), step_limit=6)
     log = Log()
     log.batch_reset(environments.reset(), environments)
@@ -284,7 +287,7 @@ def threads(name, id_):
 
 
 def copies(name, id_):
-    """Simulations that go on where those of another batch are."""
+    """Simulations that continue from the states of another vector environment."""
     first, second = (VectorEnvironment(id_, n, 1, n) for n in (3, 4))
     first.reset(), second.reset()
     actions, log = drawn(name, 10, 4, len(first.action_map)), Log()
@@ -298,7 +301,7 @@ def copies(name, id_):
 
 
 def halves(name, id_):
-    """Single precision, blocks, and a limit of time."""
+    """Single precision, observation blocks, and a step limit."""
     environments = VectorEnvironment(
         id_, 2, 1, SEED, dtype=np.float32, flat_observation=False, task_kwargs={'time_limit': 0.4}
     )
@@ -328,7 +331,7 @@ def policy(name, id_):
 
 
 def all_cases():
-    """Returns functions without arguments by name."""
+    """Returns all cases: functions without arguments by name."""
     listed = []
     for kind in (single, batch):
         listed += [(kind, f'{kind.__name__}/{id_}', id_) for id_ in suite.ALL_IDS]
@@ -382,7 +385,7 @@ def record(path, pattern):
 
 
 def told(expected, found):
-    """Returns how two arrays with a row for each step differ, in words."""
+    """Returns a description of the difference of two arrays with one row per step."""
     if expected.shape != found.shape:
         return f'shape {found.shape} instead of {expected.shape}'
     differ = ~((expected == found) | (np.isnan(expected) & np.isnan(found)))
@@ -399,7 +402,7 @@ def told(expected, found):
 
 
 def compare(path, pattern):
-    """Prints a line for each case; returns whether all that was recorded is the same."""
+    """Prints a line for each case; returns whether all recorded quantities are equal."""
     with np.load(path) as stored:
         text = json.loads(str(stored['golden']))
         if text['versions'] != versions():
@@ -416,7 +419,7 @@ def compare(path, pattern):
                 continue
             try:
                 found = asked[name]()
-            except Exception as error:  # told, so that the others are compared
+            except Exception as error:  # reported, so that the other cases are still compared
                 print(f'{name}: {type(error).__name__}: {error}', flush=True)
                 counts['failed'] += 1
                 continue
@@ -433,7 +436,7 @@ def compare(path, pattern):
     return not counts['different'] and not counts['failed']
 
 
-# What the test expects: numbers that hold on any processor.
+# Expected values of the test, which are valid on any processor.
 
 
 def summary(id_, seed, nudge=0.0, environment=None):
@@ -443,7 +446,7 @@ def summary(id_, seed, nudge=0.0, environment=None):
       id_: of the environment.
       seed: of the environment and of the actions.
       nudge: size of random changes of the actions.
-      environment: to be used again, of `summarised(id_)`.
+      environment: made by `summarised(id_)`, for repeated use.
     """
     environment = environment or summarised(id_)
     environment.random_state.seed(seed)
@@ -464,7 +467,7 @@ def summary(id_, seed, nudge=0.0, environment=None):
 
 
 class Controller:
-    """Holds the mean pose, in place of a network, whose products differ between processors."""
+    """Holds the mean pose; the results of a network would differ between processors."""
 
     nudge, draw = 0.0, None
 
@@ -477,16 +480,16 @@ CONTROLLER = Controller()
 
 
 def summarised(id_):
-    """Makes the environment of a summary."""
+    """Makes the environment for a summary."""
     options = {'controller': CONTROLLER} if '_HLC_' in id_ else {}
     return suite.make(id_, {'random': 0, **options})
 
 
 def store(path, pattern=''):
-    """Writes summaries; each has the steps up to which small changes of the actions do not matter.
+    """Writes summaries of the first steps, as far as small changes of the actions do not matter.
 
-    Of some seeds the first is taken with which that is all of them, or else most. With a pattern the
-    other environments keep what is stored.
+    Of some seeds, the first one with which this holds for all steps is used, or else the one with
+    the most steps. With a pattern the entries of other environments are kept.
     """
     file = pathlib.Path(path)
     stored = json.loads(file.read_text()) if pattern else {}
@@ -510,7 +513,7 @@ def store(path, pattern=''):
 
 
 def agreeing(expected, found):
-    """Returns the number of first steps of which two summaries are almost the same."""
+    """Returns the number of first steps in which two summaries agree within the tolerance."""
     near = [
         np.isclose(found[name], values, TOLERANCE / 100, TOLERANCE / 100)
         for name, values in expected.items()

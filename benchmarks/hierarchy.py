@@ -1,13 +1,13 @@
-"""What a high-level step costs against the footstep controller's own stepping; ratios of one run.
+"""Measures the cost of high-level steps relative to footstep tracking; ratios within one run.
 
     python benchmarks/hierarchy.py [--num_envs N] [--seconds S] [ID ...]
 
-Prints, on one thread, per 1/30 s of one simulation and resets included:
+Prints, on one thread, per 1/30 s of one simulation, including resets:
 
-- the footstep environment driven by the shipped controller: its time;
-- each high-level environment under small random actions: its time as a multiple of that.
+- the time of the footstep environment with the shipped controller;
+- the time of each high-level environment with small random actions, as a multiple of the first.
 
-What the physics takes of it, `benchmarks/engine_share.py` prints.
+`benchmarks/engine_share.py` measures the share of the physics.
 """
 
 import argparse
@@ -22,12 +22,12 @@ from trl_suite.registry import catalogue
 from trl_suite.tasks.navigation import hierarchical_rules
 from trl_suite.vector import VectorEnvironment
 
-HALF_RANGE = 0.1  # of the random plans about action 0, straight on
-WARM = 2  # steps; the first ones are cold
+HALF_RANGE = 0.1  # scale of the random plans around action 0, which is straight ahead
+WARM = 2  # warm-up steps
 
 
 def measured(environments, act, frames, seconds):
-    """Steps for some seconds; returns s per frame of a simulation."""
+    """Steps for some seconds; returns s per 1/30 s of one simulation."""
     observation = environments.reset()
     for _ in range(WARM):
         observation = environments.step(act(observation)).observation
@@ -39,7 +39,7 @@ def measured(environments, act, frames, seconds):
 
 
 def footsteps(num_envs, seconds):
-    """The footstep environment, driven by the shipped controller."""
+    """Measures the footstep environment with the shipped controller."""
     controller = footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
     environments = VectorEnvironment(hierarchical_rules.CONTROLLER, num_envs, 1, 0)
     return measured(
@@ -48,7 +48,7 @@ def footsteps(num_envs, seconds):
 
 
 def high_level(id_, num_envs, seconds):
-    """A high-level environment under random actions."""
+    """Measures a high-level environment with random actions."""
     environments, random = VectorEnvironment(id_, num_envs, 1, 0), np.random.default_rng(0)
     shape = (num_envs, len(environments.action_map))
     return measured(
@@ -70,7 +70,7 @@ def main():
         cost = high_level(id_, arguments.num_envs, arguments.seconds)
         print(f'{id_}: {cost / base:.2f} times as much', flush=True)
     again = footsteps(arguments.num_envs, arguments.seconds)
-    print(f'the first measurement again: {again / base:.2f} times as much')
+    print(f'first measurement repeated: {again / base:.2f} times as much')
 
 
 if __name__ == '__main__':

@@ -1,20 +1,22 @@
-"""Which physics rate each character needs: convergence towards the original's 1/3000 s.
+"""Determines the physics rate that each character needs, by convergence towards 1/3000 s.
 
     python benchmarks/physics_rate.py [--quick] [--json FILE] [--plot FILE]
 
-Contact makes trajectories part exponentially, so no two rates agree for long, however good they
-are. Hence many short episodes: the same start and the same actions at every rate, compared with
-1/3000 s start by start, as means with 95 % confidence intervals over starts. Three yardsticks at
-1/3000 s say what a deviation means:
-  perturbed: joints and pitch of the start moved by a normal 0.01 rad, e.g. a reset's noise.
-  soft: contacts and joint limits as soft as they are at the default rate. MuJoCo holds a
-    constraint's time constant at two time steps at least and `trl_suite.actuation` sets that of
-    joint limits there, so a coarser rate is a softer world as well as a coarser integration.
-  default, against soft: what the coarser integration alone contributes.
+1/3000 s is the time step of the original. With contact, trajectories diverge exponentially, so no
+two rates agree for long, however accurate they are. Many short episodes are therefore run with the
+same start and the same actions at every rate and compared with 1/3000 s start by start, as means
+with 95 % confidence intervals over starts. Three comparisons at 1/3000 s show the scale of a
+deviation:
+  perturbed: joints and pitch of the start are displaced by a normal 0.01 rad, like the noise of a
+    reset.
+  soft: contacts and joint limits are as soft as at the default rate. MuJoCo limits a constraint's
+    time constant to at least two time steps, and `trl_suite.actuation` sets that of joint limits to
+    this value, so a coarser rate has softer constraints as well as a coarser integration.
+  default, against soft: the effect of the coarser integration alone.
 Position and velocity control follow the clip open loop, torque and muscle control a smooth seeded
-sequence. Random full-range actions, on past falls, look for what diverges; in the air without
-actuators, damping, limits and contact, energy should stay as it is. Then solver settings at the
-default rate. The conclusion is in physics_rate.md.
+sequence. Random full-range actions, continued after falls, test for divergence; in the air without
+actuators, damping, limits and contact, energy should be conserved. Finally solver settings are
+compared at the default rate. The conclusion is in physics_rate.md.
 """
 
 import argparse
@@ -30,7 +32,7 @@ from trl_suite.tasks.imitation.planar_rules import SUBSTEPS as DEFAULT
 RATES = (100, 40, 20, 10, 8, 5, 4)  # physics steps per control step of 1/30 s, finest first
 CONTROL_RATE = 30  # Hz
 REFERENCE = RATES[0]
-STARTS = 32  # seeds 0 ... 31: a start phase, an action sequence, on terrain a strip each
+STARTS = 32  # seeds 0 ... 31: each has a start phase, an action sequence, and a terrain
 STEPS = 15  # control steps of a compared episode: 0.5 s
 AT = {'0.1 s': 3, '0.3 s': 9}  # where poses are compared, control steps
 REWARD_STEPS = 9  # over which rewards are compared
@@ -45,8 +47,8 @@ REACH = 0.6  # m to both sides of the root that must be clear of the ground ther
 RESAMPLES = 1000  # of the bootstrap
 ONE = np.zeros(1, int)  # the simulation of a single environment
 
-# What is compared: id for each character, actuation model and clip of the catalogue on flat
-# ground, and the hardest ground for each character that walks over terrain.
+# Compared environments: each character, actuation model and clip of the catalogue on flat ground,
+# and the most difficult terrain for each character that walks over terrain.
 GROUPS = {
     'biped2d position': 'PD_Biped2D_LLC_Imitate_Flat-v0',
     'biped2d position, run': 'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
@@ -84,11 +86,11 @@ SOLVERS = {
     'Euler': {'integrator': mujoco.mjtIntegrator.mjINT_EULER},
 }  # fmt: skip
 
-# A rate will do where all of these hold at it and at every finer one. They are a judgement; the
-# figures are there for another. Of intervals the end nearest to zero counts.
+# A rate is accepted if all of these hold at it and at every finer one. The bounds are a judgement.
+# Of an interval, the end nearest to zero is compared.
 ACCEPTED = {
     'diverged share': 0.0,
-    'joints 0.1 s / perturbed': 2.0,  # at 1 the rate does as much as 0.01 rad of noise at the start
+    'joints 0.1 s / perturbed': 2.0,  # 1 is the effect of 0.01 rad of noise at the start
     'reward difference': 0.02,
     'mean force difference': 0.05,  # of the weight
     'random limit violation': 0.15,  # rad, 99th percentile
@@ -121,7 +123,7 @@ class Subject:
         self.timed = 0
 
     def soften(self, timestep):
-        """Gives contacts and limits the time constants that they have at another time step."""
+        """Sets the time constants of contacts and limits to those at another time step."""
         self.model.geom_solref[:, 0] = np.maximum(self.model.geom_solref[:, 0], 2 * timestep)
         self.model.jnt_solref[:, 0] = np.maximum(self.model.jnt_solref[:, 0], 2 * timestep)
 
@@ -144,7 +146,7 @@ class Subject:
             mujoco.mj_forward(self.model, self.data)
 
     def step(self, action):
-        """As the environment does it, timed."""
+        """Steps as the environment does, with timing."""
         begin = time.process_time()
         self.task.apply_action(action[None], ONE)
         middle = time.process_time()
@@ -156,12 +158,12 @@ class Subject:
         self.timed += 1
 
     def watched_step(self, action):
-        """Looks at every substep; returns vertical contact forces / weight and depths (m)."""
+        """Measures every substep; returns vertical contact forces / weight and depths (m)."""
         forces, depths = np.empty(self.substeps), np.empty(self.substeps)
         self.task.apply_action(action[None], ONE)
         for i in range(self.substeps):
             self.task.world.step(1)
-            # Of all constraints only contacts act along the root's vertical slide.
+            # Contacts are the only constraints that act along the root's vertical slide.
             forces[i] = self.data.qfrc_constraint[self.z_dof]
             depths[i] = self.depth()
         self.task.finish_step(ONE)
@@ -184,13 +186,13 @@ class Subject:
         return np.abs(self.data.qvel[self.joint_dof]).max()
 
     def energy(self):
-        """Kinetic and potential energy over weight: the height that it would lift, m."""
+        """Kinetic and potential energy divided by weight: the equivalent height, m."""
         mujoco.mj_energyPos(self.model, self.data)
         mujoco.mj_energyVel(self.model, self.data)
         return self.data.energy.sum() / self.weight
 
     def action(self, seed, step):
-        """The fixed action: along the clip, or smooth and seeded."""
+        """Returns the fixed action: that of the clip, or of a smooth seeded sequence."""
         if self.task.actuation_model in ('position', 'velocity'):
             return self.task.clip_action(0)
         random = np.random.default_rng([seed, 2])
@@ -200,7 +202,7 @@ class Subject:
 
 
 def compared(subject, starts, noise=0.0):
-    """Runs the fixed actions from many starts; returns arrays, first axis starts."""
+    """Runs the fixed actions from many starts; returns arrays whose first axis is the start."""
     names = ('joints', 'root', 'reward', 'force', 'impulse', 'peak', 'depth', 'energy', 'speed')
     found = {name: [] for name in (*names, 'violation', 'begin')}
     for seed in range(starts):
@@ -228,7 +230,7 @@ def compared(subject, starts, noise=0.0):
 
 
 def flailed(subject, episodes):
-    """Random full-range actions, on past falls until divergence."""
+    """Runs random full-range actions, which continue after falls until divergence."""
     diverged, speeds, violations, depths = [], [], [], []
     for seed in range(episodes):
         subject.start(seed)
@@ -254,7 +256,7 @@ def flailed(subject, episodes):
 
 
 def passive_drift(subject, starts):
-    """Largest change of energy over weight in 0.5 s in the air without any dissipation, m."""
+    """Largest change of energy / weight in 0.5 s in the air without dissipation, m."""
     model = mujoco.MjModel.__copy__(subject.model)
     flags = mujoco.mjtDisableBit
     for flag in (flags.mjDSBL_CONTACT, flags.mjDSBL_ACTUATION, flags.mjDSBL_LIMIT):
@@ -285,7 +287,7 @@ def interval(values, statistic=np.mean):
 
 
 def against(found, reference):
-    """Deviations from a reference, start by start."""
+    """Returns deviations from a reference, start by start."""
     row = {}
     for name, step in AT.items():
         joints = found['joints'][:, step - 1] - reference['joints'][:, step - 1]
@@ -345,7 +347,7 @@ def group(id_, rates, starts, episodes):
 
 
 def chosen(rows, rates):
-    """The coarsest rate that will do."""
+    """Returns the coarsest accepted rate."""
     coarsest = rates[0]
     for substeps in rates:
         if rows[str(substeps)]['fails']:
@@ -355,7 +357,7 @@ def chosen(rows, rates):
 
 
 def beyond(value):
-    """What counts against a bound: of an interval, its end nearest to zero."""
+    """Returns the value compared with a bound: of an interval, its end nearest to zero."""
     if not isinstance(value, list):
         return value
     _, low, high = value
@@ -403,7 +405,7 @@ def report(figures):
             f'{name} x {scale:g}',
             lambda row, n=name, s=scale, d=digits: f'{s * np.ravel(row[n])[0]:.{d}f}',
         )
-    print('\ncoarsest rate that will do, and what fails at the others')
+    print('\ncoarsest accepted rate, and the bounds exceeded at the others')
     for name, rows in figures['groups'].items():
         fails = {f'1/{CONTROL_RATE * int(r)}': rows[r]['fails'] for r in rates if rows[r]['fails']}
         print(f'{name:36}1/{CONTROL_RATE * rows["chosen"]}', fails)
@@ -485,9 +487,9 @@ def plot(figures, file):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--quick', action='store_true', help='few starts, to see that it runs')
+    parser.add_argument('--quick', action='store_true', help='few starts, as a test of the program')
     parser.add_argument('--json', help='write the figures to this file')
-    parser.add_argument('--plot', help='draw the figures into this file')
+    parser.add_argument('--plot', help='plot the figures to this file')
     arguments = parser.parse_args()
     starts, episodes = (3, 2) if arguments.quick else (STARTS, RANDOM_EPISODES)
     figures = {

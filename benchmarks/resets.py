@@ -1,14 +1,15 @@
-"""What resets cost, and which parts of them: for some rows of a batch, on one thread.
+"""Measures the cost of resets and of their parts, for some simulations, on one thread.
 
     python benchmarks/resets.py [IDS ...] [--num-envs 256] [--resets 64] [--repeats 30] [--json FILE]
 
-Prints ms per reset, the least of the repeats in CPU time, since machines are shared. The parts are measured in a second run, since the
-clocks take time themselves; each is without the parts that it calls:
+Prints ms per reset: the smallest CPU time of the repeats, because machines are shared. The parts
+are measured in a second run, because reading the clocks takes time; the time of a part excludes the
+parts that it calls:
 
 * seeds: streams of random numbers for terrain and goals
-* drawing: what stands where, as arrays
-* start and goals: places that are clear, on a trail, or near
-* laying: windows of the ground for queries, geoms and their bounds
+* drawing: generation of terrain as arrays
+* start and goals: search for valid start and goal positions
+* laying: terrain windows for queries, geoms and their bounds
 * physics: the engine's reset and forward
 * rest: the character's pose, observations, Python
 """
@@ -47,11 +48,11 @@ PARTS = (
 
 
 class Clocks:
-    """Time spent in parts, each without the parts that it calls."""
+    """Accumulates the time spent in parts, each without the parts that it calls."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = collections.defaultdict(float)
-        self._inner = [0.0]  # s, of parts called by those that are open
+        self._inner = [0.0]  # s, spent in parts called by each active part
 
     def timed(self, part: str, function: Any) -> Any:
         @functools.wraps(function)
@@ -69,7 +70,7 @@ class Clocks:
 
 
 def measure(id_: str, num_envs: int, resets: int, repeats: int) -> dict[str, float]:
-    """Returns ms per reset, and of each part."""
+    """Returns ms per reset, in total and for each part."""
     environments = VectorEnvironment(id_, num_envs, 1, seed=0)
     environments.reset()
     rows = np.linspace(0, num_envs, resets, endpoint=False).astype(int)
@@ -106,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('ids', nargs='*', default=IDS)
     parser.add_argument('--num-envs', type=int, default=256)
-    parser.add_argument('--resets', type=int, default=64, help='how many rows begin anew')
+    parser.add_argument('--resets', type=int, default=64, help='number of simulations to reset')
     parser.add_argument('--repeats', type=int, default=30)
     parser.add_argument('--json', type=pathlib.Path, help='also write the figures to this file')
     arguments = parser.parse_args()

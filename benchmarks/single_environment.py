@@ -1,14 +1,15 @@
-"""How much of raw MuJoCo's speed a single environment keeps; ratios within one run.
+"""Measures the speed of a single environment relative to raw MuJoCo; ratios within one run.
 
     python benchmarks/single_environment.py [--steps N] [--json FILE]
 
-An environment is driven by an action sequence; every `step` call is timed, resets are not. Then the
-same model is put into the same start states and driven with the same controls by raw `mj_step`,
-with as many substeps. The ratio raw time / environment time is 1 if the environment costs nothing
-but physics. Two workloads: random actions (a character that flails in the air half of the time: the
-cheapest physics there is) and the action 0 (a character held in its mean pose until it has fallen,
-in contact throughout). dm_control's own suite walker is measured in the same way. Blocks of all
-cases alternate, so that a drifting machine does not tilt the ratios; medians over blocks.
+An environment is stepped with a sequence of actions; `step` calls are timed, resets are not. Then
+the same model is set to the same start states and stepped with the same controls by raw `mj_step`,
+with the same number of substeps. The ratio raw time / environment time is 1 if the environment has
+no overhead. Two workloads: random actions (the character is in the air half of the time, where
+physics is cheapest) and action 0 (the character holds its mean pose until it falls, always in
+contact). The walker of dm_control's suite is measured in the same way. Blocks of all cases
+alternate, so that changes of the machine's speed do not bias the ratios; printed are medians over
+blocks.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import time
 import mujoco
 import numpy as np
 
-from trl_suite import suite  # isort: skip  (before dm_control: it chooses how to render)
+from trl_suite import suite  # isort: skip  (before dm_control: it selects the rendering backend)
 from dm_control import suite as dm_suite
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -42,7 +43,7 @@ def block(environment, substeps, scale, random, steps):
             resets.append(time.perf_counter() - begin)
             state = np.empty(size)
             mujoco.mj_getState(model, data, state, STATE)
-            # A fresh model copy per episode: its terrain is part of what raw MuJoCo simulates.
+            # A new copy of the model per episode, because the terrain is part of the model.
             episodes.append((taken, state, mujoco.MjModel.__copy__(model)))
         action = scale * random.uniform(spec.minimum, spec.maximum, spec.shape)
         begin = time.perf_counter()
@@ -72,7 +73,7 @@ def measure(cases, blocks):
         for name, (environment, substeps, scale) in cases.items():
             random = np.random.default_rng(i)
             spent, raw, resets = block(environment, substeps, scale, random, BLOCK)
-            if i:  # the first block warms up
+            if i:  # the first block is a warm-up
                 found[name][0].append(raw / spent)
                 found[name][1].append(BLOCK / spent)
                 found[name][2].extend(resets)

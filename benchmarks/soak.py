@@ -1,9 +1,10 @@
-"""Runs the vector environment for long: memory must stay flat, every number finite.
+"""Runs vector environments for a long time: memory has to stay constant, and all numbers finite.
 
     python benchmarks/soak.py [--steps 2000000] [--num_envs 256] [--threads 1] [--seed 0]
 
-Goes over several environments in turn under random actions and prints, for each, control steps,
-episodes, divergences, largest |observation|, and resident memory at the first tenth and the end.
+Runs several environments one after the other with random actions and prints, for each, control
+steps, episodes, divergences, the largest |observation|, and the resident memory after the first
+tenth and at the end.
 """
 
 import argparse

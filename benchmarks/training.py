@@ -1,8 +1,9 @@
-"""What learning costs: samples per second of examples/ppo.py against random actions alone.
+"""Measures the cost of learning: samples per second of examples/ppo.py and of random actions.
 
     python benchmarks/training.py [--seconds S] [--threads N] [--torch-threads N]
 
-Both numbers come from one process with as many rows and threads, by turns; the ratio is what counts.
+Both rates are measured alternately in one process with the same number of simulations and threads;
+the ratio is the result.
 """
 
 import argparse
@@ -28,7 +29,7 @@ IDS = (
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--seconds', type=float, default=20.0, help='per environment and kind')
+    parser.add_argument('--seconds', type=float, default=20.0, help='per environment and rate')
     parser.add_argument('--threads', type=int, default=2, help='of the simulation')
     parser.add_argument('--torch-threads', type=int, default=1, help='of the networks')
     arguments = parser.parse_args()

@@ -1,19 +1,19 @@
-"""How fast the vector environment is against raw MuJoCo and its peers; ratios within one run.
+"""Measures vector environments relative to raw MuJoCo and other libraries; ratios within one run.
 
     python benchmarks/vector_environment.py [--seconds S] [--json FILE] [--plot FILE]
 
-Prints, under random actions, resets included:
+Prints, with random actions and including resets:
 
-- our vector environment by num_envs and threads: control steps per second; what one thread does of them,
-  us per simulation and control step; cost of a reset; and the speed-up that 16 and 64 cores would give, by
-  Amdahl's law from the part that one thread does;
-- memory per simulation: what fresh processes with 16 and with 1024 num_envs differ by;
-- MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and our single
-  environment;
-- the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
-  async) and EnvPool, each as a fraction of the raw `mj_step` rate of its own model with as many
-  physics steps, so that models of different cost compare. EnvPool 1.2.5 has MuJoCo 3.6.0 inside;
-  the wheels of 1.2.2 to 1.2.5 lack files without which they cannot be imported.
+- vector environments by number of simulations and threads: control steps per second; the serial
+  part, us per simulation and control step; the cost of a reset; and the projected speed-up on 16
+  and 64 cores, by Amdahl's law from the serial part;
+- memory per simulation, from the difference of new processes with 16 and with 1024 simulations;
+- MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and the
+  single environment;
+- installed libraries: dm_control's suite, Gymnasium's MuJoCo environments (single, sync, async) and
+  EnvPool, each as a fraction of the raw `mj_step` rate of its own model with the same number of
+  physics steps, so that models of different cost can be compared. EnvPool 1.2.5 contains MuJoCo
+  3.6.0; the wheels of 1.2.2 to 1.2.5 cannot be imported because files are missing.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def resident():
 
 
 def ours(id_, num_envs, threads, seconds):
-    """Our vector environment: rate, serial part, reset cost, projection; and the rate of MuJoCo alone."""
+    """Measures rate, serial part, reset cost and projection, and the rate of MuJoCo alone."""
     found = bench.vector(id_, num_envs, threads, seconds)
     result = {
         'control steps per second': round(found['control']),
@@ -57,7 +57,7 @@ def ours(id_, num_envs, threads, seconds):
 
 
 def footprint(id_, num_envs):
-    """Resident memory of this process once it has built, reset and stepped as many num_envs, bytes."""
+    """Resident memory of this process after making and stepping simulations, bytes."""
     environments, _ = warmed(id_, num_envs, max(THREADS))
     found = resident()
     environments.close()
@@ -65,7 +65,7 @@ def footprint(id_, num_envs):
 
 
 def memory(id_):
-    """Memory per simulation, bytes; processes of their own, where nothing was allocated and freed before."""
+    """Memory per simulation, bytes; measured in new processes, without earlier allocations."""
     sizes = []
     for num_envs in MEMORY_ROWS:
         spawn = multiprocessing.get_context('spawn')
@@ -75,7 +75,7 @@ def memory(id_):
 
 
 def single(id_, seconds):
-    """Our single environment, resets included; and raw mj_step of its model from its start."""
+    """Measures a single environment with resets, and raw mj_step of its model from its start."""
     found = bench.single(id_, seconds)
     return {
         'raw mj_step': found['mj_step'] / SUBSTEPS,
@@ -84,7 +84,7 @@ def single(id_, seconds):
 
 
 def peers(seconds):
-    """The installed peers, each as a fraction of raw mj_step of its own model."""
+    """Measures installed libraries, each as a fraction of raw mj_step of its own model."""
     found = {}
     from dm_control import suite as dm_suite
 
@@ -128,7 +128,7 @@ def peers(seconds):
 
 
 def envpool_humanoid(space, reference, seconds):
-    """EnvPool's humanoid, if it can be imported, as a fraction of a raw rate."""
+    """Measures EnvPool's humanoid, if it can be imported, as a fraction of a raw rate."""
     try:
         import envpool
     except (ImportError, OSError) as error:
@@ -146,7 +146,7 @@ def envpool_humanoid(space, reference, seconds):
 
 
 def plot(figures, path):
-    """Draws rate against simulations."""
+    """Plots rate against number of simulations."""
     import matplotlib
 
     matplotlib.use('Agg')
@@ -179,7 +179,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
     parser.add_argument('--json', help='also write the figures to this file')
-    parser.add_argument('--plot', help='also draw rate against simulations')
+    parser.add_argument('--plot', help='also plot rate against number of simulations')
     parser.add_argument('--num-envs', type=int, nargs='*', default=ROWS)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
@@ -189,7 +189,7 @@ def main():
         figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
         print(id_, figures['single'][id_])
         figures['memory per simulation, kB'][id_] = round(memory(id_) / 1e3)
-        print(f'  memory per simulation: {figures["memory per row, kB"][id_]} kB')
+        print(f'  memory per simulation: {figures["memory per simulation, kB"][id_]} kB')
         figures['ours'][id_], figures['engine alone'][id_] = {}, {}
         for threads in THREADS:
             for num_envs in arguments.num_envs:

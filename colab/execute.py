@@ -1,9 +1,9 @@
-"""Runs the notebooks from top to bottom, each in a fresh kernel, and stores them with their outputs.
+"""Runs the notebooks from top to bottom, each in a new kernel, and stores them with their outputs.
 
     python colab/execute.py             # all
     python colab/execute.py terrain     # one of them
 
-Needs `pip install -e '.[notebooks]'`. Nothing is stored of a notebook that fails or complains.
+Needs `pip install -e '.[notebooks]'`. A notebook that fails or warns is not stored.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from trl_suite.util import errors, files
 
 FOLDER = pathlib.Path(__file__).resolve().parent
 NAMES = tuple(sorted(path.stem for path in FOLDER.glob('*.ipynb')))
-SHORT = 'TRL_SUITE_SHORT'  # environment variable: notebooks that train take next to no samples
+SHORT = 'TRL_SUITE_SHORT'  # environment variable: notebooks that train use very few samples
 TIMEOUT = 3600  # s, of a cell
 
 
 def execute(path: pathlib.Path, short: bool = False) -> nbformat.NotebookNode:
-    """Returns a notebook as it is after a run, in a folder with nothing in it.
+    """Returns a notebook with its outputs after a run in an empty folder.
 
     Raises:
       nbclient.exceptions.CellExecutionError: a cell fails.
@@ -45,10 +45,10 @@ def execute(path: pathlib.Path, short: bool = False) -> nbformat.NotebookNode:
 
 
 def tidy(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """Leaves out what a reader has no use for: who ran it, and videos, which file viewers drop.
+    """Removes machine-specific metadata, and videos, which file viewers do not show.
 
     Raises:
-      ValueError: something was written to stderr, a warning say.
+      ValueError: something was written to stderr, for example a warning.
     """
     notebook.metadata = nbformat.from_dict(
         {

@@ -1,10 +1,10 @@
-"""Writes the reference pages from the catalogue and the code, and makes their pictures.
+"""Writes the reference pages from the catalogue and the code, and renders their pictures.
 
     python docs/generate.py [--overwrite] [--filter PATTERN] [--pages] [--check]
 
-Pages are written anew; of pictures only those that are missing, or that show a policy that has been
-replaced, unless --overwrite. Needs `pip install 'trl_suite[video]'`. With --check nothing is written; it
-fails if a page is not as it would be.
+All pages are written. Pictures are rendered if they are missing or show a policy that has been
+replaced; --overwrite renders all. Needs `pip install 'trl_suite[video]'`. With --check nothing is
+written, and the exit status is 1 if a page is out of date.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 FAMILIES = {
-    'imitation': 'Imitation: a clip is tracked on flat ground, or in three dimensions',
-    'plaid': 'PLAiD: a clip is tracked over terrain',
-    'terrainrl': 'TerrainRL: an action sets the gait of one whole cycle',
-    'deeploco': 'DeepLoco: planned footsteps, and plans of them',
+    'imitation': 'Imitation: tracking a clip on flat ground, or in three dimensions',
+    'plaid': 'PLAiD: tracking a clip over terrain',
+    'terrainrl': 'TerrainRL: gaits whose parameters an action sets for one cycle',
+    'deeploco': 'DeepLoco: tracking and planning footsteps',
 }
 NAMES = (  # parts of ids
     ('`FSM`', 'a finite state machine drives the joints; an action sets its parameters'),
@@ -42,32 +42,32 @@ NAMES = (  # parts of ids
         '`PD`, `Vel`, `Torque`, `MTU`',
         'actuation: position (proportional-derivative control), velocity, torque, muscle (muscle-tendon units)',
     ),
-    ('`Imitate`, `LLC_Imitate`', 'a clip is tracked; LLC: low-level controller'),
-    ('`LLC_…_Step`', 'planned footsteps are followed'),
-    ('`HLC`', 'high-level controller: footsteps are planned, above a low-level controller'),
-    ('`Hard`', 'the same tasks without hierarchy: joints are driven'),
+    ('`Imitate`, `LLC_Imitate`', 'imitation: a clip is tracked; LLC: low-level controller'),
+    ('`LLC_…_Step`', 'footstep tracking'),
+    ('`HLC`', 'high-level controller: plans footsteps for a low-level controller'),
+    ('`Hard`', 'the same tasks without hierarchy: the policy controls the joints'),
     ('`FULL`', 'the three-dimensional biped with arms and head'),
     (
         '`…_Terrain-v0` of a biped, dog or raptor',
-        'PLAiD: the ground is seen; without it blind, or flat',
+        'PLAiD: the ground is observed; without this part, it is flat or not observed',
     ),
     ('PLAiD', 'progressive learning and integration via distillation (Berseth et al. 2018)'),
     ('simbicon', 'a biped and its gait after SIMBICON (Yin, Loken, van de Panne 2007)'),
 )
-WITHOUT = {  # a shipped policy
-    'scripted': 'a policy written by hand (`--policy scripted`)',
-    'clip': 'the clip itself, whose poses are the targets, without feedback (`--policy clip`)',
-    'zero': 'action 0 throughout, which for a gait is the default one (`--policy zero`)',
+WITHOUT = {  # policies shown for environments without a shipped policy
+    'scripted': 'the hand-written policy (`--policy scripted`)',
+    'clip': 'the clip as joint targets, without feedback (`--policy clip`)',
+    'zero': 'action 0 in every step, which is the default gait (`--policy zero`)',
 }
 README = '../README.md'
-# What encloses the tables in the README that are written here.
+# Comments around the tables of the README that this program writes.
 SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
 SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
 MACHINE = (  # of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
-# Unit of terrain parameters that are no lengths in m, by a part of the name.
+# Units of terrain parameters other than lengths in m, by a part of the name.
 UNITS = {
     'LerpPow': '1, exponent', 'Speed': 'm/s', 'Density': '1/m²', 'Count': '1, number',
     'NumObstacles': '1, number', 'NumStrips': '1, number', 'NumSlices': '1, number',
@@ -76,7 +76,7 @@ UNITS = {
 ON_ROLLING = re.compile('var2d_slopes_(.*)')
 FEATURES = {
     'gaps': 'Gaps', 'walls': 'Walls', 'steps': 'Steps', 'mixed': 'Gaps, walls and steps',
-    'narrow_gaps': 'Clusters of gaps with stepping stones between',
+    'narrow_gaps': 'Clusters of gaps with stepping stones between them',
 }  # fmt: skip
 
 
@@ -85,7 +85,7 @@ def pages() -> dict[str, str]:
     found = {'README.md': home()}
     environments: dict[Any, Any] = {}
     for spec in catalogue.SPECS:
-        # What differs by its ground only is compiled once.
+        # Environments that differ only in terrain are built once.
         key = (
             spec.task_type,
             spec.character,
@@ -137,11 +137,11 @@ def links(folder: str, names: Iterable[str]) -> str:
 def home() -> str:
     return page(
         'trl_suite',
-        'Terrain RL Simulator (Berseth, Peng, van de Panne 2018) on MuJoCo: locomotion over random '
-        'terrain, in the manner of `dm_control.suite`.',
+        'The Terrain RL Simulator (Berseth, Peng, van de Panne 2018) on MuJoCo: locomotion over random '
+        'terrain, in the style of `dm_control.suite`.',
         '![Six environments of the suite](pictures/suite.jpg)',
         table(
-            ('reference, made from the code', ''),
+            ('reference, generated from the code', ''),
             (
                 ('[Environments](environments/README.md)', f'{len(catalogue.SPECS)}, one page each'),
                 ('[Characters](characters/README.md)', f'{len(characters.CHARACTERS)}, with their joints'),
@@ -151,17 +151,17 @@ def home() -> str:
         table(
             ('guide', ''),
             (
-                ('[Guide](guide.md)', 'commands, combinations, footstep plans, pictures, training'),
-                ('[Notebooks](../colab/README.md)', 'with pictures: first steps, training, and most of what follows'),
-                ('[Make your own](make_your_own.md)', 'characters, terrains, tasks'),
-                ('[Make your own: clips](make_your_own_clips.md)', 'from motion files'),
+                ('[Guide](guide.md)', 'commands, combinations, footstep plans, rendering, training'),
+                ('[Notebooks](../colab/README.md)', 'first steps, training, and most of the topics below, with pictures'),
+                ('[Make your own](make_your_own.md)', 'custom characters, terrains and tasks'),
+                ('[Make your own: clips](make_your_own_clips.md)', 'custom clips from motion files'),
                 ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
                 ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
-                ('[What has been learnt](results.md)', 'the shipped policies, measured'),
-                ('[Beside the papers](findings.md)', 'what they found, and what was found here'),
-                ('[Differences from the original](differences.md)', 'and why'),
-                ('[Speed](speed.md)', 'against raw MuJoCo and other libraries'),
-                ('[The physics rate](../benchmarks/physics_rate.md)', 'how fine time must be'),
+                ('[Results](results.md)', 'evaluation of the shipped policies'),
+                ('[Comparison with the papers](findings.md)', 'claims of the papers, and results obtained here'),
+                ('[Differences from the original](differences.md)', 'with reasons'),
+                ('[Speed](speed.md)', 'compared with raw MuJoCo and other libraries'),
+                ('[The physics rate](../benchmarks/physics_rate.md)', 'the choice of the time step'),
             ),
         ),
     )  # fmt: skip
@@ -173,7 +173,7 @@ def home() -> str:
 def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
     also = (f'{spec.domain}/{spec.task}', *spec.aliases)
     facts = (
-        ('also', ', '.join(f'`{name}`' for name in also)),
+        ('other names', ', '.join(f'`{name}`' for name in also)),
         ('tags', ', '.join(sorted(spec.tags))),
         ('character', links('characters', [spec.character])),
         ('terrain', links('terrains', [spec.terrain])),
@@ -183,7 +183,7 @@ def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
     for title, parts in describe.parts(spec, environment):
         text = f'## {describe.escape(title)}\n\n{describe.markdown(parts)}'
         if title.startswith('Terrain'):
-            draws = f'{gallery.TERRAIN_DRAWS} draws of {spec.terrain}'
+            draws = f'{gallery.TERRAIN_DRAWS} samples of {spec.terrain}'
             text += f'\n\n{picture(draws, gallery.terrain_path(spec.terrain))}'
         (about if title.startswith(('Character', 'Links')) else rules).append(text)
     return page(
@@ -206,22 +206,22 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
     drawn = task_type(spec).description.legend
     name, _ = acting.best(environment, spec.id)
     who = WITHOUT.get(name)
-    said = f'No policy is shipped for it yet; this is {who}' if who else 'The shipped policy'
+    said = f'No policy is shipped yet; shown is {who}' if who else 'The shipped policy'
     return (
         f'{picture("Film strip", gallery.strip_path(spec.id))}\n\n'
-        f'*{said}: {begin:g} to {end:g} s of an episode, or until it ends.{drawn}*'
+        f'*{said}: {begin:g} to {end:g} s of an episode, or to its end.{drawn}*'
     )
 
 
 def begun(settings: Mapping[str, Any]) -> str:
-    """What a run began with."""
+    """Returns how the policy of a run was initialised."""
     start = settings['start']
     if start in catalogue.BY_ID:
         return f'[{start}]({start}.md)'
-    copied = f'imitated for {settings["cloned"] / 1e6:.2g} million plans'
+    copied = f'for {settings["cloned"] / 1e6:.2g} million plans'
     if start == 'expert':
-        return f'what an expert with a map would do (`examples/expert.py`), {copied}'
-    return f'what `--policy {start}` does, {copied}'
+        return f'imitation of an expert with a map (`examples/expert.py`) {copied}'
+    return f'imitation of `--policy {start}` {copied}'
 
 
 def learnt(spec: catalogue.EnvSpec) -> str:
@@ -234,25 +234,25 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
     if searched:
-        trained = f'{samples:g} decisions, each of which tries all base actions'
+        trained = f'{samples:g} decisions, each of which simulates all base actions'
         after = f'{taken:g} decisions'
     if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
-        after += ', at the end of imitation'
+        after += ', at the end of the imitation'
     seeds = len(found['runs'])
     facts = (
         ('return', f'{result["normalized_return"]:.1%} of the maximum {result["step_limit"]}'),
-        ('episodes that lasted to the step limit', f'{result["completion_rate"]:.0%} of {result["episodes"]}'),
+        ('episodes that reached the step limit', f'{result["completion_rate"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
-        *([('policy taken after', after)] if taken < 0.99 * samples else []),
-        *([('began with', begun(run['settings']))] if run['settings'].get('start') else []),
-        ('on', run['machine']),
+        *([('policy saved after', after)] if taken < 0.99 * samples else []),
+        *([('initial policy', begun(run['settings']))] if run['settings'].get('start') else []),
+        ('machine', run['machine']),
     )  # fmt: skip
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''
     return (
         f'## The shipped policy\n\n{table(("", ""), facts)}\n\n'
         f'{picture("Learning curve", gallery.curve_path(spec.id))}\n\n'
-        f'*While it learnt, without noise{more}. All policies: [What has been learnt](../results.md).*'
+        f'*Return during training, without noise{more}. All policies: [Results](../results.md).*'
     )
 
 
@@ -268,15 +268,15 @@ def environment_index() -> str:
             )
             for spec in specs
         ]  # fmt: skip
-        header = ('environment', 'what', 'character', 'terrain', 'policy')
+        header = ('environment', 'task', 'character', 'terrain', 'policy')
         parts += [f'## {title}', picture(domain, f'families/{domain}.jpg'), table(header, cells)]
     return page(
         'Environments',
         f'{len(catalogue.SPECS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
         f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
-        'character, actuation, terrain or tag, and `trl-suite info ID` prints what a page says. Their '
-        'names are those of the original, misspelt where it is.',
-        table(('in a name', 'means'), NAMES),
+        'character, actuation, terrain or tag, and `trl-suite info ID` prints the content of a page. The ids '
+        'are those of the original, including its misspellings.',
+        table(('part of an id', 'meaning'), NAMES),
         *parts,
     )
 
@@ -297,23 +297,23 @@ def character_page(name: str) -> str:
         picture(name, gallery.character_path(name)),
         f'{common.figures(figure)}. '
         + (
-            'Its root is free in three dimensions.'
+            'Its root moves freely in three dimensions.'
             if spec.spatial
             else 'It moves in the x-z plane.'
         ),
         '## Links and joints',
         describe.markdown_table(joints),
-        'Limits are those of torque; kp and kd are the gains of position control (of velocity control '
-        'kd), before actuation models split the damping.',
+        'Limits are torque limits; kp and kd are the gains of position control (velocity control uses '
+        'kd), before the actuation model splits the damping between servo and joint.',
         table(
             ('', ''),
             (
                 ('end effectors', ', '.join(spec.end_effectors)),
-                ('a fall is the ground under', ', '.join(spec.fall_links)),
-                ('clip of its own', spec.clip or 'none'),
+                ('links whose ground contact is a fall', ', '.join(spec.fall_links)),
+                ('default clip', spec.clip or 'none'),
             ),
         ),
-        f'## Environments\n\n{links("environments", used) or "None; it is for `suite.build`."}',
+        f'## Environments\n\n{links("environments", used) or "None; use it with `suite.build`."}',
     )
 
 
@@ -327,11 +327,11 @@ def character_index() -> str:
     ]  # fmt: skip
     return page(
         'Characters',
-        f'Any of them goes with any terrain of as many dimensions and with position, velocity and torque '
-        f'control; {", ".join(MUSCLES)} with muscles too: `suite.build`. Who has no clip needs '
-        "`task='walk'`, or a clip of yours. For a character of your own see "
+        '`suite.build` combines a character with any terrain of the same dimension and with position, '
+        f'velocity or torque control; {", ".join(MUSCLES)} also have muscles. A character without a clip '
+        "needs `task='walk'` or a custom clip. For custom characters see "
         '[Make your own](../make_your_own.md).',
-        table(('character', '', 'what', 'environments'), cells),
+        table(('character', '', 'description', 'environments'), cells),
     )
 
 
@@ -352,22 +352,22 @@ def terrain_page(name: str) -> str:
     ]  # fmt: skip
     length = gallery.terrain_length(ground)
     shown = (
-        'from above; arrows are starts'
+        'from above; arrows mark start positions'
         if ground.spatial
-        else 'from the side; the dotted line is the start'
+        else 'from the side; the dotted line marks the start'
     )
     parameters = table(('parameter', 'unit', *titles, 'default of the type'), cells)
-    blended = 'Sets are blended by the task option `blend`, 0 to {}; the picture shows set 0.'
+    blended = 'The task option `terrain_level`, 0 to {}, interpolates between sets; the picture shows set 0.'
     used = [spec.id for spec in catalogue.SPECS if spec.terrain == name]
     size = f'{length:g} m on a side' if ground.spatial else f'{length:g} m'
     return page(
         name,
         f'Type `{ground.type}`: {meaning(ground)}',
-        picture(f'Draws of {name}', gallery.terrain_path(name)),
-        f'*{gallery.TERRAIN_DRAWS} draws of {size}, {shown}.*',
+        picture(f'Samples of {name}', gallery.terrain_path(name)),
+        f'*{gallery.TERRAIN_DRAWS} random samples of {size}, {shown}.*',
         f'## Parameters\n\n{parameters if cells else "None."}',
         blended.format(len(sets) - 1) if len(sets) > 1 else '',
-        f'## Environments\n\n{links("environments", used) or "None; it is for `suite.build`."}',
+        f'## Environments\n\n{links("environments", used) or "None; use it with `suite.build`."}',
     )  # fmt: skip
 
 
@@ -376,7 +376,7 @@ def generator(ground: terrain.Terrain) -> Any:
 
 
 def meaning(ground: terrain.Terrain) -> str:
-    """What ground of a type is like: the first line of its generator."""
+    """Returns the description of a terrain type: the first line of its generator's docstring."""
     said = (generator(ground).function.__doc__ or '').partition('\n')[0]
     if said:
         return said
@@ -405,12 +405,12 @@ def terrain_index() -> str:
             )
             for name, ground in names.items()
         ]  # fmt: skip
-        header = ('preset', 'type', 'what', 'parameter sets', 'environments')
+        header = ('preset', 'type', 'description', 'parameter sets', 'environments')
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Terrains',
-        'Ground is drawn anew every episode. `trl-suite terrain NAME` plots draws of a preset or of a '
-        'file of parameters; a terrain from a function, an image or a mesh: '
+        'Terrain is generated anew in every episode. `trl-suite terrain NAME` plots random samples of a '
+        'preset or of a parameter file. For terrain from a function, an image or a mesh see '
         '[Make your own](../make_your_own.md).',
         *parts,
     )
@@ -428,7 +428,7 @@ def speeds() -> dict[str, Any]:
 
 
 def readme() -> str:
-    """README.md with its tables."""
+    """Returns README.md with its tables."""
     text = (DOCS / README).read_text(encoding='utf-8')
     for (start, end), written in ((SOLVED, solved()), (SPEED, speed())):
         before, _, rest = text.partition(start)
@@ -437,7 +437,7 @@ def readme() -> str:
 
 
 def solved() -> str:
-    """How well the shipped policies do, by family."""
+    """Returns the scores of the shipped policies by family."""
     cells = []
     for domain in FAMILIES:
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
@@ -450,7 +450,7 @@ def solved() -> str:
             name: statistics.median(each[name] for each in found)
             for name in ('normalized_return', 'completion_rate', 'distance')
         }
-        # A gait has no reward that ends with a limit: what counts is how far it comes.
+        # Gaits are scored by distance; their return has no fixed maximum.
         gaits = all(task_type(spec).score == 'distance' for spec in specs)
         cells.append((
             f'`{domain}`', f'{len(found)} of {len(specs)}',
@@ -458,16 +458,16 @@ def solved() -> str:
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
-        'The median over the shipped policies of a family, each run without noise for 50 '
-        'episodes: the return over its maximum, the share of episodes that lasted to the end, and '
-        'the mean distance.'
+        'Medians over the shipped policies of each family, each evaluated without noise in 50 '
+        'episodes: the return divided by its maximum, the share of episodes that lasted to the end, '
+        'and the mean distance.'
     )
     header = ('family', 'trained', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
 
 
 def speed() -> str:
-    """The rates of a few environments."""
+    """Returns the table of the README with the rates of some environments."""
     found, cells = speeds(), []
     for id, alone in found['single'].items():
         own, raw = found['ours'][id], found['engine alone'][id]
@@ -479,12 +479,15 @@ def speed() -> str:
             f'{own[one]["reset, ms per simulation"]:.2f} ms',
             f'{found["memory per simulation, kB"][id]} kB',
         ))  # fmt: skip
-    header = ('', 'one', '256, one thread', '256, two threads', 'a reset', 'memory of each')
+    header = (
+        '', 'one simulation', '256, one thread', '256, two threads', 'reset', 'memory per simulation',
+    )  # fmt: skip
     said = (
-        'Control steps per second (of 10 physics steps) under random actions, resets with new terrain '
-        'included if there are 256; in brackets the share of what raw MuJoCo does with the same model, '
-        '`mj_step` for one, MuJoCo on the same threads for 256 (above 1: without resets bodies lie on the ground, '
-        f'where steps cost more). By `python benchmarks/vector_environment.py`, on {MACHINE}.'
+        'Control steps per second (of 10 physics steps each) with random actions; with 256 simulations, '
+        'resets with new terrain are included. In brackets: the ratio to raw MuJoCo with the same model, '
+        '`mj_step` for one simulation and MuJoCo on the same threads for 256 (it can be above 1, because '
+        'without resets the characters lie on the ground, where physics steps cost more). Measured by '
+        f'`python benchmarks/vector_environment.py` on {MACHINE}.'
     )
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
 
@@ -514,33 +517,37 @@ def speed_page() -> str:
     ]
     return page(
         'Speed',
-        f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random; a '
-        'control step is 10 physics steps; simulations step together. `trl-suite bench '
-        'ID` measures your machine.',
-        '## One environment',
-        table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per simulation of many'), single),
-        '## Many at once',
-        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, simulations '
-        'and threads; it may be above 1, as without resets bodies lie on the ground, where steps cost '
-        'more. *Serial* is what one thread does of a control step while the others wait, in us per simulation; '
-        '*resets* is their share of the time.',
-        table(('environment', '', 'control steps per s', 'ratio', 'serial', 'a reset, ms', 'resets'), cells),
+        f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random, and a '
+        'control step is 10 physics steps. `trl-suite bench ID` measures the rates of your machine.',
+        '## Single environment',
+        table(
+            ('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per simulation of a vector environment'),
+            single,
+        ),
+        '## Vector environment',
+        'Resets with new terrain are included. *Ratio* is relative to MuJoCo alone with the same models, '
+        'number of simulations and threads; it can be above 1, because without resets the characters lie on '
+        'the ground, where physics steps cost more. *Serial* is the part of a control step that runs on one '
+        'thread while the others wait, in us per simulation; *resets* is the share of time spent in resets.',
+        table(('environment', '', 'control steps per s', 'ratio', 'serial', 'reset, ms', 'resets'), cells),
         '![Rates by simulations and threads](../benchmarks/vector_environment.png)',
         '## More cores',
-        "A projection, not a measurement: how many times one core's rate 1024 simulations would reach, by "
-        "Amdahl's law from what one thread does alone (*serial* above). Memory and caches that cores share "
-        'are left out. `trl-suite bench ID` prints the same of your machine.',
+        'A projection, not a measurement: the rate of 1024 simulations as a multiple of the rate on one core, '
+        "by Amdahl's law from the serial part (*serial* above). Shared memory bandwidth and caches are "
+        'neglected. `trl-suite bench ID` prints the projection for your machine.',
         table(('environment', '16 cores', '64 cores'), projected),
         '## Other libraries',
-        'In the same run, as a share of the `mj_step` rate of their own models; none of them has terrain.',
-        table(('', 'share'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
-        'All figures: [vector_environment.json](../benchmarks/vector_environment.json). What learning '
-        'costs, and high-level steps, `benchmarks/training.py` and `benchmarks/hierarchy.py` print.',
+        'Measured in the same run, as a ratio to raw `mj_step` with their own models; none of them has '
+        'terrain.',
+        table(('', 'ratio'), ((name, f'{share:.2f}') for name, share in found['peers'].items())),
+        'All figures: [vector_environment.json](../benchmarks/vector_environment.json). '
+        '`benchmarks/training.py` measures the cost of training, and `benchmarks/hierarchy.py` that of '
+        'high-level steps.',
     )  # fmt: skip
 
 
 def stale(found: dict[str, str]) -> Iterator[str]:
-    """Yields pages that are not as they would be, or should not be."""
+    """Yields the paths of pages that are out of date, missing, or obsolete."""
     for path, text in found.items():
         file = DOCS / path
         if not file.exists() or file.read_text(encoding='utf-8') != text:
@@ -549,7 +556,7 @@ def stale(found: dict[str, str]) -> Iterator[str]:
 
 
 def gone(found: dict[str, str]) -> list[str]:
-    """Returns pages of what there is no more."""
+    """Returns the paths of pages whose subject no longer exists."""
     there = [p.relative_to(DOCS) for name in ('environments', 'characters', 'terrains')
              for p in (DOCS / name).glob('*.md')]  # fmt: skip
     return [path.as_posix() for path in there if path.as_posix() not in found]
@@ -557,17 +564,19 @@ def gone(found: dict[str, str]) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--overwrite', action='store_true', help='render existing pictures again')
     parser.add_argument(
-        '--overwrite', action='store_true', help='make pictures that are there, too'
+        '--filter', default='*', metavar='PATTERN', help='render only matching pictures, e.g. an id'
     )
-    parser.add_argument('--filter', default='*', metavar='PATTERN', help='of pictures, as an id')
-    parser.add_argument('--pages', action='store_true', help='make no pictures')
-    parser.add_argument('--check', action='store_true', help='only tell whether pages are fresh')
+    parser.add_argument('--pages', action='store_true', help='write pages only, no pictures')
+    parser.add_argument(
+        '--check', action='store_true', help='write nothing; fail if a page is out of date'
+    )
     arguments = parser.parse_args()
     found = pages()
     old = list(stale(found))
     if arguments.check:
-        print('\n'.join(f'docs/{path} is not fresh; run docs/generate.py' for path in old))
+        print('\n'.join(f'docs/{path} is out of date; run docs/generate.py' for path in old))
         return int(bool(old))
     for path in gone(found):
         (DOCS / path).unlink()
@@ -582,7 +591,7 @@ def main() -> int:
     written, failed = gallery.make(DOCS / 'pictures', arguments.filter, arguments.overwrite)
     for name, error in failed.items():
         print(f'{name}: {error}', file=sys.stderr)
-    print(f'{len(written)} pictures made')
+    print(f'{len(written)} pictures written')
     return int(bool(failed))
 
 

@@ -1,4 +1,4 @@
-"""What mkdocs.yml has no words for: pages link to files beside docs/, which the site has inside."""
+"""MkDocs hooks: the site includes the files outside docs/ to which pages link."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BESIDE = ('examples', 'benchmarks', 'colab')
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the files of the folders beside docs/."""
+    """Adds the files of the folders in `BESIDE`, which are next to docs/."""
     from mkdocs.structure.files import File
 
     for name in BESIDE:
@@ -22,5 +22,5 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Turns links out of docs/ into links inside the site."""
+    """Replaces links to files outside docs/ by links inside the site."""
     return re.sub(rf'\]\(\.\./({"|".join(BESIDE)})/', r'](\1/', markdown)

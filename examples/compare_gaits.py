@@ -1,11 +1,11 @@
-"""Compares trained gait policies with the default gait, on the same ground.
+"""Compares trained gait policies with the default gait, on the same terrain.
 
     python examples/compare_gaits.py                          # all of them, from trained/
     python examples/compare_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --policy policy.npz
 
-Prints how far either gets before it falls: of a policy that ships as `trained/ID.json` has it, in the
-same episodes. Writes what it found of the default gaits of these into `trained/default_gaits.json`:
-ID -> evaluation.
+Prints the distance before a fall of both. The results of a shipped policy are read from
+`trained/ID.json`; the default gait runs in the same episodes, and its evaluation is written to
+`trained/default_gaits.json`: ID -> evaluation.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Compares policies trained on terrain with those of flat ground, on the same terrain.
+"""Compares policies trained on terrain with policies trained on flat ground, on the same terrain.
 
     python examples/compare_transfer.py                  # all that are trained and not yet compared
     python examples/compare_transfer.py PD_Dog2D_Gaps_Terrain-v0
 
-Prints how far either gets, and writes into `trained/transfer.json`: ID -> evaluation of the policy of
-flat ground, whose episodes are those of the evaluation in `trained/ID.json`.
+Prints the distances of both, and writes `trained/transfer.json`: ID -> evaluation of the policy of
+flat ground, in the same episodes as the evaluation in `trained/ID.json`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from trl_suite.util.program import begin_script
 
 
 def flat_ground(spec: catalogue.EnvSpec) -> str:
-    """Id of the environment with the same observations on flat ground."""
+    """Returns the id of the environment with the same observation on flat ground."""
     figure = '_'.join(spec.id.split('_')[:2])
     return f'{figure}_Flat_Terrain-v0' if 'blind' not in spec.tags else f'{figure}_Flat-v0'
 

@@ -1,11 +1,12 @@
-"""Learns one terrain after the other, and measures what is forgotten and what helps.
+"""Trains on one terrain after the other, and measures forgetting and transfer.
 
     python examples/continual_learning.py plaid_biped --budget 2e5
     python examples/continual_learning.py plaid_dog --budget 1e6 --threads 2 --output runs
 
-Writes OUTPUT/SEQUENCE_sS.json; the same command goes on from its last stage. The learner is the one of
-ppo.py, which goes on in the next environment with all that it has: no cure for forgetting, but the
-yardstick for cures. Needs `pip install 'trl_suite[train]'`.
+Writes OUTPUT/SEQUENCE_sS.json; the same command continues after the last complete stage. The
+learner is that of ppo.py, which keeps its networks, observation scales and optimiser from one
+environment to the next. It does nothing against forgetting and serves as a baseline. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from trl_suite.util.program import begin_script
 
 
 class FineTuning:
-    """PPO that goes on with policy, value, scales and optimiser wherever it is put."""
+    """PPO that keeps policy, value, scales and optimiser from one environment to the next."""
 
     def __init__(self, environment, settings, seed=0, threads=0):
         self.settings, self.seed, self.threads = settings, seed, threads
@@ -33,7 +34,7 @@ class FineTuning:
         trainer.environment = environment
         trainer.begin_stage()
         trainer.spec = trainer.environments.spec
-        # The number of samples tells one stage from the next.
+        # The number of samples differs between stages, and so do the seeds.
         seeds = sequences.train_seeds(self.settings.num_envs, (self.seed, trainer.samples))
         trainer.environments.seed(seeds)
         trainer.observation = trainer.environments.reset()

@@ -1,12 +1,12 @@
-"""How well a footstep controller walks where it is told: plans, pushes, slopes, bumps, belts.
+"""Evaluates footstep tracking of a footstep controller: plans, pushes, slopes, bumps, belts.
 
     python examples/evaluate_footsteps.py                           # the reference policy
     python examples/evaluate_footsteps.py mine.npz --filter general straight --json mine.json
 
-For every condition, over episodes with the seeds of `evaluation.evaluate`: the share that lasts to
-the end, the mean reward per step (0 after a fall), the distance from planned to actual landing
-places (mean and 90th percentile over all steps of all episodes), and the mean error of the heading
-at these moments.
+Prints for every condition, over episodes with the seeds of `evaluation.evaluate`: the share of
+episodes that last to the end, the mean reward per step (0 after a fall), the distance from planned
+to actual footsteps (mean and 90th percentile over all footsteps of all episodes), and the mean
+heading error at landing.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def ramp(slope: float) -> dict[str, Any]:
     return {'Type': 'var3d_ramp', 'Params': [{'Slope': slope}]}
 
 
-# Options of the task; `terrain` and `along` (start ahead, not anywhere) are of the row.
+# Task options; `terrain` replaces that of the environment's spec.
 CONDITIONS: dict[str, dict[str, Any]] = {
     'straight': {'plans': STEADY},
     'straight, 0.3 m': {'plans': {**STEADY, 'length': (0.3, 0.3)}},
@@ -77,7 +77,7 @@ def row_for(id_: str, terrain: Any) -> EnvSpec:
 def run(
     spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
 ) -> dict[str, Any]:
-    """Runs one episode in every row; returns what became of them."""
+    """Runs one episode in every simulation; returns survival, reward and tracking errors."""
     steps = round(seconds * 30)
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     environments = VectorEnvironment(
@@ -99,7 +99,7 @@ def run(
         full[ended & runs] = step.truncated[ended & runs]
         runs &= ~ended
         observation = step.observation
-        if ended.any() and runs.any():  # every row must go on
+        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
             observation = environments.reset(ended)
     environments.close()
     errors, turns = np.concatenate(landing), np.concatenate(heading)

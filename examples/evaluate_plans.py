@@ -1,14 +1,14 @@
-"""How well goals are reached: with footsteps planned, by hand and as learnt, and without hierarchy.
+"""Evaluates navigation tasks: scripted and learnt footstep planning, and control without hierarchy.
 
     python examples/evaluate_plans.py                                      # all, both policies
     python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
 
-Measures what the DeepLoco paper reports, over whole episodes (200 s) with the seeds of
-`evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares that do not
-fall, at all and in the first minute, speed towards the goal, goals per minute (in soccer none are
-counted), distance along a trail, the share of time with the ball at its goal, and falls per
-kilometre. Rows without hierarchy have no scripted policy, and episodes as long as the others. Writes
-into trained/plans.json what it has measured.
+Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds
+of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
+without a fall, in total and in the first minute, speed towards the goal, goals per minute (not in
+soccer), distance along a trail, the share of time with the ball at its goal, and falls per
+kilometre. Environments without hierarchy have no scripted policy; their episodes are as long as the
+others. Writes the results to trained/plans.json.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
 POLICIES = ('scripted', 'reference')
-TAGS = ('hierarchical', 'flat_control')  # of the rows with goals
-SECONDS = 200.0  # of a whole episode without hierarchy
+TAGS = ('hierarchical', 'flat_control')  # of the environments with goals
+SECONDS = 200.0  # of an episode without hierarchy
 SEGMENT = 2.0  # m; of a trail
 MINUTE = 60.0  # s
 
 
 def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarray:
-    """Distance of places (n, 2) from the beginnings of their trails, (n,) m; 0 where is none."""
+    """Returns the distances of positions (n, 2) along their trails, (n,) m; 0 without a trail."""
     found = np.zeros(len(place))
     for env_id, ground in enumerate(environments.task.arena.grounds):
         if ground.layout.trail is not None:
@@ -49,7 +49,7 @@ def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarr
 
 
 def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed: int) -> dict:
-    """Runs one episode in every row; returns what became of them."""
+    """Runs one episode in every simulation; returns the measured quantities."""
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     own = 'hierarchical' in catalogue.BY_ID[id_].tags
     limit = -1 if own else round(SECONDS / CONTROL_TIMESTEP)
@@ -88,7 +88,7 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
         fell |= step.terminated & runs
         runs &= ~ended
         observation, before = step.observation, after
-        if ended.any() and runs.any():  # every row must go on
+        if ended.any() and runs.any():  # ended simulations have to be reset before the next step
             observation = environments.reset(ended)
             before = places()
     environments.close()

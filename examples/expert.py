@@ -1,9 +1,9 @@
-"""An expert for those who learn to plan footsteps: it has a map, and knows how boxes will move.
+"""An expert for footstep planning, with a map of the terrain and the velocities of moving boxes.
 
-What a policy has to make out in coarse maps from its own eyes the expert looks up: heights every
-0.125 m on all sides, and velocities. It finds the way to the goal that is short and keeps its
-distance from everything that is no level ground, and steps along it. In training a policy is shown
-what the expert would do (learning by cheating, Chen et al. 2019, arXiv:1912.12294); it is no
+While a policy observes coarse maps of the ground ahead, the expert uses privileged information:
+heights every 0.125 m on all sides, and velocities. It finds a short path to the goal that keeps a
+distance from all ground that is not level, and plans footsteps along it. In training a policy
+imitates the expert (learning by cheating, Chen et al. 2019, arXiv:1912.12294); the expert is not a
 baseline.
 """
 
@@ -22,20 +22,24 @@ from trl_suite.tasks.navigation.scripted import CAUTIOUS
 from trl_suite.terrain.spatial.layout import Trail
 from trl_suite.vector import VectorEnvironment
 
-REACH, FINE, COARSE = 5.0, 0.125, 2  # m to each side; m between heights; heights between two places
-LEVEL = 0.12  # m; what differs less from the ground at the goal is level
-DISTANCE = 0.7  # m; a way that is nearer to something counts as longer than it is,
-PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through something by so many
-DETOUR = 1.02  # a place is gone straight to if that costs no more times what the way there does
-AHEAD = 4.0  # step lengths; the same on a trail
-PACE = 1.0  # m/s; how fast the expert comes along where boxes move
-BEND, CLOSE = 0.35, 0.3  # rad, m; a sharper bend and what is closer are taken with small steps
-LOOKS = 33  # places on a straight line
-BEYOND = 1.5  # times the distance: what lies outside of the map is guessed to take
+REACH, FINE, COARSE = (
+    5.0,
+    0.125,
+    2,
+)  # half the map's side, m; height spacing, m; node spacing, heights
+LEVEL = 0.12  # m; largest height difference to the goal of level ground
+DISTANCE = 0.7  # m; distance from obstacles below which a path costs more
+PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
+DETOUR = 1.02  # a straight line may cost this many times as much as the path that it replaces
+AHEAD = 4.0  # step lengths; distance of the next point on a trail
+PACE = 1.0  # m/s; assumed walking speed among moving boxes
+BEND, CLOSE = 0.35, 0.3  # rad, m; small steps for sharper turns or closer obstacles
+LOOKS = 33  # points on a straight line at which the cost is sampled
+BEYOND = 1.5  # assumed cost per m outside the map
 
 
 class Map:
-    """Places on a square about somebody, and ways between neighbours."""
+    """A square grid of nodes around the walker, with edges between neighbours."""
 
     def __init__(self) -> None:
         axis = np.arange(-REACH, REACH + FINE / 2, FINE)
@@ -55,13 +59,15 @@ class Map:
         self.rim = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
 
     def aim(self, cost: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The farthest place on the cheapest way to a goal that may be gone straight to, (2,) m.
+        """Returns the farthest node of the cheapest path that a straight line can reach, (2,) m.
 
-        From place to place the way turns by 45 degrees, which nobody should follow step by step.
+        Grid paths turn by multiples of 45 degrees; a straight line to a far node avoids these
+        turns.
 
         Args:
-          cost: of the places, per m.
-          goal: off the middle, (2,) m; beyond the rim it is guessed how far it is from there.
+          cost: of the nodes, per m.
+          goal: of the path, relative to the centre, (2,) m; if it is outside the map, the cost of
+            the last part is estimated.
         """
         n = len(self.places)
         if np.abs(goal).max() < REACH:
@@ -91,7 +97,11 @@ class Map:
 
 
 def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) -> np.ndarray:
-    """Where a trail's middle is so far ahead towards a goal, (2,) m off a place, or else the goal."""
+    """Returns the point of a trail `ahead` m closer to a goal, relative to `place`, (2,) m.
+
+    The point is on the centre line.
+    If the goal is nearer than `ahead`, the point is the one nearest to the goal.
+    """
     length = np.linalg.norm(trail.end - trail.start, axis=1)
     way = (trail.end - trail.start) / length[:, None]
     begin = np.append(0.0, np.cumsum(length))
@@ -108,22 +118,22 @@ def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) ->
 
 
 def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
-    """Makes an expert: like the values of `evaluation.BASELINES`.
+    """Makes an expert policy, like the functions in `evaluation.BASELINES`.
 
     Raises:
-      ValueError: a task whose steps are no plans, or whose way is that of a ball.
+      ValueError: the actions of the task are not footstep plans, or the task has a ball.
     """
     task = environments.task
     if not isinstance(task, HierarchicalNavigation) or task.ball or task.interface != 'plan':
         raise ValueError(
-            f'the expert knows no way for the task {type(task).__name__}; it does for high-level '
-            "tasks with the interface 'plan' and without a ball"
+            f'the expert does not support the task {type(task).__name__}; expected: a high-level task '
+            "with the interface 'plan' and without a ball"
         )
     map_, arena = Map(), task.arena
     moves = arena.surroundings.capacity.movers > 0
 
     def level(env_id: int, place: np.ndarray) -> np.ndarray:
-        """How far every place is from what is not level, m."""
+        """Returns the distance of every node from ground that is not level, m."""
         x, y = np.moveaxis(place + map_.fine, -1, 0).reshape(2, 1, -1)
         height = arena.height(x, y, np.array([env_id])).reshape(map_.fine.shape[:2])
         free = np.abs(height - task.goal[env_id, 2]) < LEVEL
@@ -132,7 +142,7 @@ def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray
         return FINE * ndimage.distance_transform_edt(free)[::COARSE, ::COARSE].ravel()
 
     def apart(env_id: int, place: np.ndarray) -> np.ndarray:
-        """How far every place is from moving boxes when the expert may be there, m."""
+        """Returns the distance of every node from moving boxes at the time of arrival there, m."""
         s = arena.surroundings
         velocity = (s.direction[env_id] * s.speed[env_id])[:, None] * s.axis[env_id]
         centre = s.centres()[env_id] - place

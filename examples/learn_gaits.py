@@ -1,18 +1,20 @@
-"""Learns which base action of a gait to take when, with Q-learning, in one file, on the CPU.
+"""Learns with Q-learning to select a base action of a gait in every cycle, in one file, on the CPU.
 
     python examples/learn_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1 --threads 1
     python examples/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs
 
-The value of each base action in each state is learnt from a replay of transitions (Mnih et al. 2015)
-with returns of several steps, the smaller of two networks' estimates (Fujimoto et al. 2018) and
-averaged target networks. The networks see the ground through 1-D convolutions, relative to the root,
-as those of Peng, Berseth, van de Panne (2016) do. After a fall most simulations go back a few cycles
-and try again, so that what decides between falling and not is seen often.
+The value of each base action is learnt from a replay buffer (Mnih et al. 2015) with multi-step
+returns, the smaller of two networks' estimates (Fujimoto et al. 2018) and averaged target networks.
+The networks process ground heights relative to the root with 1-D convolutions, as those of Peng,
+Berseth, van de Panne (2016) do. After a fall most simulations return to a state a few cycles
+earlier and continue with other actions, so that the replay contains many states in which the action
+decides about a fall.
 
-Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it had
-never stopped, and with a larger `--samples` for longer), `curve.json` (settings, learning curve),
-`last.npz` (the averaged network so far), and at the end `policy.npz`, after a last phase in which the
-learning rate falls while nothing new is collected. Needs `pip install 'trl_suite[train]'`.
+Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
+identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
+curve), `last.npz` (the current averaged network), and at the end `policy.npz`, after a final phase
+in which the learning rate falls and no samples are collected. Needs
+`pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
@@ -42,37 +44,42 @@ from trl_suite.vector import VectorEnvironment
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a run depends on besides environment and seed."""
+    """Settings of a run, besides environment and seed."""
 
     samples: float = 2e5  # cycles
     num_envs: int = 64
     expert_cycles: float = (
-        8e3  # first cycles, driven by the shipped policy, or by random base actions
+        8e3  # first cycles, with actions of the shipped policy, or else random base actions
     )
-    expert_epsilon: float = 0.15  # share of random actions in them
-    begin: float = 2e3  # cycles before learning begins; they set the scales of the observation
-    epsilon: float = 0.08  # share of random actions after them
+    expert_epsilon: float = 0.15  # share of random actions in these cycles
+    begin: float = 2e3  # cycles before learning begins; they determine the observation scales
+    epsilon: float = 0.08  # share of random actions after `expert_cycles`
     greedy: float = 0.25  # share of simulations without random actions and without retries
-    retry: float = 0.8  # probability that a simulation that fell goes back
-    retries: int = 4  # at one place at most
-    back: tuple[int, int] = (1, 3)  # cycles before the last one, at least and at most
+    retry: float = 0.8  # probability that a simulation returns to an earlier state after a fall
+    retries: int = 4  # largest number of retries in a row
+    back: tuple[int, int] = (
+        1,
+        3,
+    )  # smallest and largest number of cycles to return before the last one
     retry_epsilon: float = 0.3  # share of random actions in the first cycles of a retry
     retry_cycles: int = 2
     gamma: float = 0.95  # per cycle
-    steps: int = 3  # of the returns
-    alive: float = 0.5  # reward for a cycle without a fall, beside the environment's
-    capacity: float = 5e5  # transitions in the replay
+    steps: int = 3  # of multi-step returns
+    alive: float = 0.5  # reward for a cycle without a fall, added to the environment's
+    capacity: float = 5e5  # transitions in the replay buffer
     minibatch: int = 256
     updates: int = 16  # per cycle of all simulations
     learning_rate: float = 3e-4
     weight_decay: float = 1e-2
-    polyak: float = 0.005  # share of the new weights in the targets
-    final_updates: int = 5000  # in which the learning rate falls to `final_rate`
+    polyak: float = 0.005  # weight of the new weights in the target networks
+    final_updates: int = 5000  # updates in which the learning rate falls to `final_rate`
     final_rate: float = 1e-5
-    view: float = 6.5  # m ahead that the network sees
-    relief: float = 0.8  # m above or below the usual height under the root that it tells apart
+    view: float = 6.5  # m; distance of the farthest ground height in the input
+    relief: float = (
+        0.8  # m; heights relative to the root are clipped at this deviation from the mean
+    )
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
-    ground_units: int = 128  # that the convolutions end in
+    ground_units: int = 128  # units of the layer after the convolutions
     hidden: tuple[int, ...] = (256, 128)
     write_every: float = 4096  # cycles
     evaluate_every: float = 16384  # cycles
@@ -83,12 +90,12 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Hopper2D_*': {'relief': 2.0},
     'FSM_Goat2D_*': {'relief': 1.6},
 }
-CLIP = 5.0  # bound of what the networks see, in standard deviations
+CLIP = 5.0  # bound of the networks' inputs, in standard deviations
 _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
     'past', 'chains',
 )  # fmt: skip
-# Settings that a run may go on with others of.
+# Settings that may change when a run is continued.
 _CHANGEABLE = (
     'samples', 'final_updates', 'final_rate', 'write_every', 'evaluate_every', 'evaluation_episodes',
 )  # fmt: skip
@@ -101,10 +108,10 @@ def settings_for(id_: str, **changes: Any) -> Settings:
 
 
 class Network(nn.Module):
-    """Values of all actions; the first `line` inputs are ground heights.
+    """A network for the values of all actions; the first `line` inputs are ground heights.
 
-    Every layer but the last is followed by a rectifier; the sums of fully connected ones are brought
-    to mean 0 and deviation 1 before it (Ba et al. 2016), which keeps Q-learning stable.
+    Every layer but the last is followed by a ReLU, and fully connected layers by layer
+    normalisation before it (Ba et al. 2016), which stabilises Q-learning.
     """
 
     def __init__(self, line: int, others: int, actions: int, settings: Settings) -> None:
@@ -130,13 +137,13 @@ class Network(nn.Module):
 
 
 class Replay:
-    """Transitions over several steps; the oldest make room for new ones."""
+    """A replay buffer of multi-step transitions; new ones replace the oldest."""
 
     def __init__(self, capacity: int, size: int) -> None:
         self.before, self.after = np.zeros((2, capacity, size), np.float16)
         self.action = np.zeros(capacity, np.int64)
         self.reward, self.discount = np.zeros((2, capacity), np.float32)
-        self.count = 0  # of all that were ever put in
+        self.count = 0  # number of all transitions added so far
 
     def __len__(self) -> int:
         return min(self.count, len(self.action))
@@ -144,19 +151,19 @@ class Replay:
     def add(
         self, before: np.ndarray, action: int, reward: float, discount: float, after: np.ndarray
     ) -> None:
-        """Puts in a transition, with discount 0 where it ends in a fall."""
+        """Adds a transition; its discount is 0 if it ends in a fall."""
         i = self.count % len(self.action)
         self.before[i], self.after[i] = before, after
         self.action[i], self.reward[i], self.discount[i] = action, reward, discount
         self.count += 1
 
     def get_state(self) -> dict[str, Any]:
-        """Returns what has been put in."""
+        """Returns the contents."""
         arrays = {name: value[: len(self)] for name, value in vars(self).items() if name != 'count'}
         return {**arrays, 'count': self.count}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_state` of a replay of the same capacity returned."""
+        """Restores the state returned by `get_state` of a buffer of the same capacity."""
         self.count = state['count']
         for name, value in vars(self).items():
             if name != 'count':
@@ -164,7 +171,7 @@ class Replay:
 
 
 class Learner:
-    """One run: the simulations, the networks, and where it has got to."""
+    """One run: the simulations, the networks and the progress."""
 
     def __init__(self, id_: str, seed: int, settings: Settings, threads: int) -> None:
         torch.manual_seed(seed)
@@ -181,7 +188,8 @@ class Learner:
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
         self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]
-        # Heights come relative to the ground under the root, and above a gap that is its floor.
+        # Observed heights are relative to the ground under the root, which above a gap is its
+        # floor.
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
         others = len(self.columns) - self.line
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
@@ -199,30 +207,30 @@ class Learner:
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.curve: list[dict[str, Any]] = []
         self.observation = environments.reset()
-        # Of each row: states before the last cycles, and what has not all gone into the replay.
+        # Of each simulation: states before the last cycles, and transitions not yet in the replay.
         self.past: list[collections.deque] = [
             collections.deque(maxlen=s.back[1] + 1) for _ in range(n)
         ]
         self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
-        # How often each row went back at this place, and the cycles since.
+        # Of each simulation: retries in a row, and cycles since the last one.
         self.tried = np.zeros((2, n), int)
 
     def seen(self, observation: np.ndarray) -> torch.Tensor:
-        """What the networks see of columns of observations."""
+        """Returns the networks' inputs for columns of observations."""
         x = observation.astype(np.float32)
         x[:, : self.line] -= x[:, [self.origin]]
         x = np.clip((x - self.mean) / self.std, -CLIP, CLIP)
         return torch.from_numpy(x.astype(np.float32))
 
     def set_scales(self) -> None:
-        """Sets mean and deviation of what the networks see from the replay."""
+        """Sets mean and standard deviation of the networks' inputs from the replay."""
         x = self.replay.before[: len(self.replay)].astype(np.float64)
         line = x[:, : self.line] - x[:, [self.origin]]
         self.mean, self.std = x.mean(0), np.maximum(x.std(0), ppo.LEAST_STD)
         self.mean[: self.line], self.std[: self.line] = line.mean(), self.settings.relief / CLIP
 
     def act(self) -> np.ndarray:
-        """Chooses an action for each row, (n,)."""
+        """Selects an action for each simulation, (n,)."""
         s, n = self.settings, self.settings.num_envs
         epsilon = np.full(n, s.epsilon)
         by_expert = self.samples < s.expert_cycles
@@ -245,12 +253,12 @@ class Learner:
 
     @property
     def greedy(self) -> np.ndarray:
-        """Which rows the network alone drives, (n,) bool."""
+        """Mask of the simulations without random actions, (n,) bool."""
         n = self.settings.num_envs
         return np.arange(n) < self.settings.greedy * n
 
     def collect(self) -> None:
-        """Runs one cycle in every row, and puts what came of it into the replay."""
+        """Runs one cycle in every simulation, and adds the transitions to the replay."""
         s, environments = self.settings, self.environments
         action, before = self.act(), self.observation[:, self.columns].astype(np.float16)
         for i, past in enumerate(self.past):
@@ -279,7 +287,7 @@ class Learner:
         self.observation = environments.task.observation.copy()
 
     def go_back(self, env_id: int) -> bool:
-        """Puts a row that fell where it was some cycles ago; returns whether it did."""
+        """Restores the state some cycles before a fall; returns whether it did."""
         s, past = self.settings, self.past[env_id]
         back = int(self.random.integers(s.back[0], s.back[1] + 1))
         if self.random.random() >= s.retry or self.greedy[env_id]:
@@ -293,12 +301,12 @@ class Learner:
         return True
 
     def learn(self) -> None:
-        """Updates both networks once, and the targets."""
+        """Updates both networks once, and the target networks."""
         s, replay = self.settings, self.replay
         picked = self.random.integers(len(replay), size=s.minibatch)
         before, after = self.seen(replay.before[picked]), self.seen(replay.after[picked])
         action = torch.from_numpy(replay.action[picked])[:, None]
-        scale = 1 - s.gamma  # so that values are of the size of a cycle's reward
+        scale = 1 - s.gamma  # scales values to the size of a cycle's reward
         with torch.no_grad():
             following = torch.minimum(*(target(after) for target in self.targets)).amax(1)
             reward, discount = (
@@ -320,7 +328,7 @@ class Learner:
         self.loss += (float(loss.detach()) - self.loss) / min(self.updates, 1000)
 
     def advance(self) -> None:
-        """Collects one cycle of every row, and learns."""
+        """Collects one cycle of every simulation, and updates the networks."""
         begin, before, s = time.process_time(), self.samples, self.settings
         self.collect()
         middle = time.process_time()
@@ -333,7 +341,7 @@ class Learner:
         self.seconds['learning'] += time.process_time() - middle
 
     def finish(self) -> None:
-        """Updates the networks with a falling learning rate, without collecting."""
+        """Updates the networks with a falling learning rate, without new samples."""
         s = self.settings
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
             self.optimizer, s.final_updates, s.final_rate
@@ -345,7 +353,7 @@ class Learner:
         self.seconds['learning'] += time.process_time() - begin
 
     def exported(self) -> policies.Policy:
-        """The first of the averaged networks, without PyTorch."""
+        """Returns the first target network as a policy without PyTorch."""
 
         def arrays(parts: nn.ModuleList, axes: tuple[int, ...]) -> dict[str, Any]:
             return {
@@ -381,7 +389,7 @@ class Learner:
         )  # fmt: skip
 
     def evaluate(self) -> dict[str, Any]:
-        """Puts a point on the curve, and returns it."""
+        """Evaluates the policy, and returns the new point of the curve."""
         s, begin = self.settings, time.process_time()
         result = evaluation.evaluate(
             self.environments.spec, self.exported(), s.evaluation_episodes, ppo.EVALUATION_SEED,
@@ -419,7 +427,7 @@ class Learner:
             part.write_text(json.dumps(record, indent=1))
 
     def restore(self, folder: pathlib.Path) -> None:
-        """Goes on where `save` was called."""
+        """Restores the run from the files that `save` wrote."""
         state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
         if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
@@ -443,8 +451,8 @@ def train(
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
     Raises:
-      ValueError: the checkpoint is damaged, or of other settings; only how long it learns, how it ends
-        and how often it writes and evaluates may have changed.
+      ValueError: the checkpoint is damaged, or has other settings; only those in `_CHANGEABLE` may
+        differ.
       RuntimeError: another process trains in the folder.
     """
     with checkpoints.only_run(folder):

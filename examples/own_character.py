@@ -1,4 +1,4 @@
-"""Your own character from an MJCF or URDF file, trotting blindly; without a file, a table."""
+"""A custom character from an MJCF or URDF file with an open-loop trot; without a file, a table."""
 
 import argparse
 import pathlib
@@ -18,7 +18,9 @@ parser.add_argument('file', nargs='?', type=pathlib.Path)
 parser.add_argument('--feet', nargs='+', default=FEET)
 parser.add_argument('--fall', nargs='+', default=['trunk'])
 parser.add_argument('--terrain', help='level ground by default')
-parser.add_argument('--spatial', action=argparse.BooleanOptionalAction)  # else as the root moves
+parser.add_argument(
+    '--spatial', action=argparse.BooleanOptionalAction
+)  # by default from the root joints
 parser.add_argument('--seed', type=int, default=1)
 parser.add_argument('--output', type=pathlib.Path, default='own_character.png')
 args = parser.parse_args()
@@ -33,7 +35,7 @@ if args.file is None:
     args.file.write_text(f'<robot name="table">{"".join(parts)}</robot>')
 links = {'end_effectors': args.feet, 'fall_links': args.fall}
 spec = characters.from_file(args.file, **links, spatial=args.spatial)
-print(*spec.notes, sep='\n')  # what was assumed
+print(*spec.notes, sep='\n')  # defaults that were used
 env = suite.build(spec, terrain=args.terrain, task='walk', task_kwargs={'random': args.seed})
 i = np.arange(len(env.action_map))
 bend, trot = 0.2 - 0.6 * (i % 2), np.pi * ((i // 2 + i // 4) % 2 - i % 2 / 2)

@@ -1,10 +1,10 @@
-"""Makes a motion of yours into a clip, says what is wrong with it, and lets a character track it.
+"""Converts a motion file to a clip, checks it, and runs a character with it.
 
     python examples/own_clip.py walk.bvh --character biped2d_full --strip walk.png
     python examples/own_clip.py 02_01.amc --skeleton 02.asf --character biped3d_full_mocap
 
-Reads BVH, CMU's AMC, and the JSON of TerrainRL and DeepMimic. Where joints have unusual names, give
-`retarget` a map. BVH needs `pip install 'trl_suite[clips,video]'`.
+Reads BVH, CMU's AMC, and the JSON of TerrainRL and DeepMimic. For other joint names, pass a map to
+`retarget`. BVH needs `pip install 'trl_suite[clips,video]'`.
 """
 
 import argparse
@@ -19,13 +19,13 @@ def main(arguments=None):
     parser.add_argument('file')
     parser.add_argument('--skeleton', help='the .asf of an .amc')
     parser.add_argument('--character', default='biped2d_full')
-    parser.add_argument('--strip', help='a .png: following the clip blindly, clip as a ghost')
+    parser.add_argument('--strip', help='a .png: open-loop tracking, with the clip as a ghost')
     chosen = parser.parse_args(arguments)
 
     motion = retargeting.read(chosen.file, chosen.character, chosen.skeleton)
     clip = retargeting.retarget(motion, chosen.character)
     if not clip.loop:
-        clip = retargeting.cycle(clip)  # the two moments that are most alike
+        clip = retargeting.cycle(clip)  # between the two most similar poses
     print(clip_check.check(clip, chosen.character))
     clip.save('clip.npz')
 

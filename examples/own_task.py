@@ -1,4 +1,4 @@
-"""Your own task: a reward term, an observation block and a failure beside those of another task."""
+"""A custom task: adds a reward term, an observation block and a failure to an existing task."""
 
 import argparse
 import pathlib
@@ -18,13 +18,13 @@ parser.add_argument('id', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0')
 parser.add_argument('--seed', type=int, default=1)
 parser.add_argument('--output', type=pathlib.Path, default='own_task.png')
 args = parser.parse_args()
-mine = {  # functions of the task; each returns a row per simulation
+mine = {  # functions of the task; arrays with one entry per simulation
     'rewards': {'fast': (0.5, lambda task: np.clip(parts.speed(task) / 2, 0, 1))},
     'observations': {'speed': (1, parts.speed)},
     'failures': {'low': lambda task: parts.height(task) < 0.5},
 }
 env = suite.make(args.id, task_kwargs={'random': args.seed, **mine})
-trained = suite.reference_policy(args.id)  # which knows nothing of the added block
+trained = suite.reference_policy(args.id)  # does not use the added block
 terms, time_step = [], env.reset()
 while not time_step.last() and len(terms) < 100:
     seen = {name: time_step.observation[name] for name in env.task.task.blocks}

@@ -1,4 +1,4 @@
-"""Your own terrain from a height image or a mesh, a walker on it; without a file, a crater."""
+"""A custom terrain from a height image or a mesh, with a walker; without a file, a crater."""
 
 import argparse
 import pathlib
@@ -12,8 +12,8 @@ from trl_suite.util.program import begin_script
 begin_script()
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument('file', nargs='?', type=pathlib.Path)
-parser.add_argument('--spacing', type=float, default=0.2, help='of pixels or points, m')
-parser.add_argument('--height', type=float, default=1.5, help='of white in an image, m')
+parser.add_argument('--spacing', type=float, default=0.2, help='distance of pixels or points, m')
+parser.add_argument('--height', type=float, default=1.5, help='height of white pixels, m')
 parser.add_argument('--seed', type=int, default=1)
 parser.add_argument('--output', type=pathlib.Path, default='own_terrain.png')
 args = parser.parse_args()
@@ -30,7 +30,7 @@ ground = terrain.SpatialGround(mine, args.seed)
 terrain.save_mesh(ground, args.output.with_suffix('.glb'), low=-12, high=12)
 print(f'{ground.height(0, 0):.2f} m at the origin, {ground.height(6, 0):.2f} m 6 m ahead')
 env = suite.build('biped3d_mocap', None, mine, 'footsteps', task_kwargs={'random': args.seed})
-policy = suite.reference_policy('PD_Biped3D_LLC_General_Step-v0')  # sees nothing of the ground
+policy = suite.reference_policy('PD_Biped3D_LLC_General_Step-v0')  # does not observe the ground
 time_step, frames = env.reset(), []
 for step in range(121):
     if step % 40 == 0:

@@ -3,13 +3,13 @@
     python examples/ppo.py PD_Biped2D_LLC_Imitate_Flat-v0 --seed 1
     python examples/ppo.py PD_Dog2D_Gaps_Terrain-v0 --samples 4e6 --threads 2 --output runs
 
-Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it
-had never stopped), `curve.json` (settings, learning curve), `policy.npz` (the policy that scored
-best in the evaluations of the curve, for `trl_suite.policies`), `stage_N.npz` at the end of every
+Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
+identical results), `curve.json` (settings, learning curve), `policy.npz` (the policy with the best
+score in the evaluations of the curve, for `trl_suite.policies`), `stage_N.npz` at the end of every
 curriculum stage but the last, and at the end `last.npz`.
 
 PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
-Implementation Details of PPO); the settings of each environment stand in `ppo_settings.py`. Needs
+Implementation Details of PPO); the settings of each environment are in `ppo_settings.py`. Needs
 `pip install 'trl_suite[train]'`.
 """
 
@@ -42,20 +42,21 @@ from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 TEACHERS = {**evaluation.BASELINES, 'expert': expert}
-EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
+EVALUATION_SEED = 2**31  # used neither for training nor for published results
 OBSERVATION_CLIP = 10.0  # in standard deviations
-MAPS = ('terrain', 'surface')  # blocks of an observation
-LEAST_STD = 0.01  # of an observation; what hardly varies is not blown up
+MAPS = ('terrain', 'surface')  # observation blocks with maps of the ground
+LEAST_STD = 0.01  # lower bound, so that nearly constant observations are not amplified
 CLONING_RATE = 1e-3
-NEW_COUNT = 2e4  # observations that the scale of what a first policy did not see counts as
+NEW_COUNT = 2e4  # sample count of the scales of inputs that the initial policy does not have
 
 
 class Scales:
     """Running mean and standard deviation of observations.
 
-    The phase stays as it is, and all numbers of a map of the ground share one scale: their shape is
-    what counts, and where the ground is flat nothing is blown up. With a bound they are clipped there
-    and become shares of it, by `gain`, which an exported policy has in its weights.
+    The phase is not scaled. All elements of a map of the ground share one scale, which preserves
+    its shape and does not amplify noise on flat ground. With `map_bound`, maps are clipped at this
+    bound and divided by it; exported policies include `gain`, the factor for this, in their
+    weights.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Scales:
         return [self.blocks[name] for name in MAPS if name in self.blocks]
 
     def update(self, batch: np.ndarray) -> None:
-        """Takes in observations (n, size)."""
+        """Updates mean and deviation with observations (n, size)."""
         weight = len(batch) / (self.count + len(batch))
         self.count += len(batch)
         mean, square = batch.mean(0), (batch**2).mean(0)
@@ -123,13 +124,13 @@ def advantages(
     """Generalised advantage estimation (Schulman et al. 2016, arXiv:1506.02438).
 
     Args:
-      reward: of each step, (time, rows), like all arrays.
+      reward: of each step; all arrays are (time, simulations).
       value: estimated before the step.
-      following: estimated after it: of the state in which a truncated episode was cut, 0 after a
+      following: estimated after the step; of the final state for a truncated episode, 0 after a
         failure.
       ended: whether the episode ended with the step.
       gamma: discount per step.
-      lambda_: share of the longer estimates.
+      lambda_: weight of longer estimates.
     """
     result, running = np.empty_like(reward), np.zeros(reward.shape[1])
     for t in reversed(range(len(reward))):
@@ -142,7 +143,7 @@ def advantages(
 def visible(
     blocks: dict[str, slice], inputs: int, view: tuple[float, float] | None
 ) -> np.ndarray | None:
-    """Which of so many columns of an observation are no part of a map of the ground, or near enough."""
+    """Returns the columns of an observation without elements of maps that are too far away."""
     maps = [name for name in MAPS if name in blocks]
     if view is None or not maps:
         return None
@@ -158,7 +159,7 @@ def visible(
 
 
 def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
-    """The policy whose weights and scales are the means of others', as the last one is otherwise."""
+    """Returns the last policy with the mean weights and scales of all policies."""
     means: dict[str, Any] = {
         name: np.mean([getattr(part, name) for part in parts], axis=0)
         for name in ('mean', 'std', 'log_std')
@@ -170,7 +171,7 @@ def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
 
 
 class Trainer:
-    """One run: the simulations, the networks, and where it has got to."""
+    """One run: the simulations, the networks and the progress."""
 
     def __init__(
         self, environment: str | EnvSpec, seed: int, settings: Settings, threads: int
@@ -219,18 +220,20 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
         self.curve: list[dict[str, Any]] = []
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
-        self.recent = np.zeros(3)  # return, steps and number of the episodes ended lately
+        self.recent = np.zeros(
+            3
+        )  # sums of returns and steps, and number, of recently ended episodes
 
     @property
     def stage(self) -> int:
-        """How many curriculum stages have begun."""
+        """Number of curriculum stages that have begun."""
         s = self.settings
         return sum(self.samples >= share * s.samples for share, _ in s.stages)
 
     def begin_stage(self) -> None:
-        """Makes the simulations of the present curriculum stage, all at their start."""
+        """Makes and resets the simulations of the current curriculum stage."""
         s, self.current = self.settings, self.stage
-        self.best = -np.inf  # who has not had all curriculum stages does not ship
+        self.best = -np.inf  # only policies of the last curriculum stage are shipped
         seed: int | list[int] = self.seed
         if self.current > 1:
             sequence = np.random.SeedSequence((self.seed, self.current))
@@ -245,15 +248,15 @@ class Trainer:
         self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
 
     def begin_with(self, other: policies.Policy) -> None:
-        """Takes over weights, scales and noise of a policy, block by block of the observation."""
+        """Copies weights, scales and noise of a policy, by observation blocks."""
         acts, scales = self.environments.action_map, self.scales
         same = (other.actions, other.quantity) == (tuple(acts.names), acts.quantity)
         if not same:
-            raise ValueError(f'{self.spec.id} does not act as {other.id} does')
+            raise ValueError(f'{self.spec.id} has other actions than {other.id}')
         hidden = tuple(len(bias) for bias in other.biases[:-1])
         if hidden != self.settings.hidden:
             raise ValueError(f'hidden: {self.settings.hidden}, but {other.id} has {hidden}')
-        column = np.full(len(scales.mean), -1)  # of the other's observation
+        column = np.full(len(scales.mean), -1)  # indices in the other policy's observation
         offset = 0
         for name, size in other.blocks:
             part = self.environments.blocks.get(name, slice(0))
@@ -269,11 +272,13 @@ class Trainer:
                 )
         offset += 0 if others is None else others.size
         seen = np.arange(offset) if other.columns is None else other.columns
-        entry = np.full(offset + 1, -1)  # of the other's network; the last one is for -1
+        entry = np.full(
+            offset + 1, -1
+        )  # indices in the other network's input; the last one is for -1
         entry[seen[other.std > LEAST_STD]] = np.flatnonzero(other.std > LEAST_STD)
         entry = entry[column]
         bounded = scales.maps if scales.map_std else []
-        for part in bounded:  # what was clipped elsewhere means other things
+        for part in bounded:  # inputs with another bound are not compatible
             same_std = np.isclose(other.std[entry[part]], scales.map_std)
             entry[part] = np.where(same_std, entry[part], -1)
         known = entry >= 0
@@ -296,13 +301,13 @@ class Trainer:
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
 
     def imitate(self, baseline: str, folder: pathlib.Path | None = None) -> None:
-        """Has the policy do what a baseline does, as far as it sees why (behavioural cloning).
+        """Trains the policy to imitate a baseline (behavioural cloning; in rounds: DAgger).
 
-        Who walks is disturbed as the policy will be, so that the baseline shows how to come back.
+        Actions have the exploration noise of the policy, so that the data include recoveries.
 
         Args:
           baseline: one of `TEACHERS`.
-          folder: where it is evaluated between two rounds; None: it is not.
+          folder: for evaluations between rounds; None for no evaluations.
         """
         s, environments = self.settings, self.environments
         teacher = TEACHERS[baseline](environments)
@@ -331,7 +336,7 @@ class Trainer:
                 self.evaluate(folder, 0.0)
 
     def fit(self, seen: np.ndarray, labels: np.ndarray) -> None:
-        """Has the policy answer observations (n, k) by actions (n, a)."""
+        """Fits the policy to actions (n, a) for observations (n, k)."""
         inputs = self.scales(seen)
         targets = torch.from_numpy(labels.astype(np.float32))
         optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
@@ -344,14 +349,16 @@ class Trainer:
                 optimizer.step()
 
     def collect(self) -> dict[str, torch.Tensor]:
-        """Steps all rows `horizon` times; returns the samples, flattened."""
+        """Steps all simulations `horizon` times; returns the samples, flattened."""
         s, environments = self.settings, self.environments
         shape = (s.horizon, s.num_envs)
         observations = np.empty((s.horizon + 1, s.num_envs, len(self.scales.mean)))
         noise = self.random.standard_normal((*shape, len(self.log_std)), np.float32)
         means, actions = np.empty_like(noise), np.empty_like(noise)
         reward, ended, failed = np.empty(shape), np.empty(shape, bool), np.empty(shape, bool)
-        cut: list[tuple[int, np.ndarray, np.ndarray]] = []  # what truncation left unseen
+        cut: list[
+            tuple[int, np.ndarray, np.ndarray]
+        ] = []  # final observations of truncated episodes
         std = self.log_std.exp().detach().numpy()
         for t in range(s.horizon):
             observations[t], left = self.seen(self.observation)
@@ -385,7 +392,7 @@ class Trainer:
                 following[t, env_ids] = self.value(self.scales(last))[:, 0].numpy()
         following[failed] = 0.0
         advantage = advantages(reward, values[:-1], following, ended, s.gamma, s.lambda_)
-        self.scales.update(flat[: -s.num_envs])  # seen only after this update
+        self.scales.update(flat[: -s.num_envs])  # takes effect after this update
         log_probability = -(noise**2 / 2).sum(-1) - np.log(std).sum()
         return {
             'observation': inputs[: -s.num_envs],
@@ -396,7 +403,7 @@ class Trainer:
         }
 
     def seen(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Observations as the policy sees them, and which of them are reflected."""
+        """Returns the policy's inputs before scaling, and which of them are mirrored."""
         left = np.zeros(len(observation), bool)
         if self.mirror is not None:
             observation, left = self.mirror.canonical(observation)
@@ -405,7 +412,7 @@ class Trainer:
         return observation, left
 
     def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
-        """Rows whose reward terms have been too low for too long."""
+        """Mask of simulations with a smoothed reward term below its bound, (n,) bool."""
         s, result = self.settings, np.zeros(self.settings.num_envs, bool)
         forget = self.environments.control_timestep / s.patience
         for name, least in s.least_share.items():
@@ -463,7 +470,7 @@ class Trainer:
         return divergence
 
     def exported(self) -> policies.Policy:
-        """The policy of now, without PyTorch."""
+        """Returns the current policy without PyTorch."""
         averaged = self.average is not None and self.average.n_averaged > 0
         network_ = self.average.module if averaged else self.policy
         layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
@@ -549,7 +556,7 @@ class Trainer:
             part.write_text(json.dumps(curve, indent=1))
 
     def restore(self, folder: pathlib.Path) -> None:
-        """Goes on where `save` was called."""
+        """Restores the run from the files that `save` wrote."""
         state = checkpoints.load(folder / 'checkpoint.pt')
         if state['settings'] != dataclasses.asdict(self.settings):
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
@@ -586,7 +593,7 @@ def train(
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
     Raises:
-      ValueError: the checkpoint is damaged, or of other settings.
+      ValueError: the checkpoint is damaged, or has other settings.
       RuntimeError: another process trains in the folder.
     """
     with checkpoints.only_run(folder):
@@ -596,7 +603,7 @@ def train(
 def _train(
     id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int, progress: bool
 ) -> list[dict[str, Any]]:
-    torch.set_num_threads(1)  # for networks so small a second one costs more than it brings
+    torch.set_num_threads(1)  # a second thread slows down networks of this size
     trainer = Trainer(id_, seed, settings, threads)
     if (folder / 'checkpoint.pt').exists():
         trainer.restore(folder)
@@ -645,14 +652,14 @@ def _train(
 def command_line(
     description: str, sample: str
 ) -> tuple[str, int, dict[str, Any], pathlib.Path, int]:
-    """What a program that trains is asked for.
+    """Parses the command line of a training program.
 
     Args:
       description: of the program.
       sample: what its samples are.
 
     Returns:
-      Id, seed, settings that are not the default, folder and threads.
+      Id, seed, settings other than the defaults, folder and threads.
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument('id', metavar='ID', help="id of an environment, or 'domain/task'")

@@ -1,6 +1,6 @@
-"""What `ppo.py` trains with: the settings of each environment, and the curriculum stages that come before it.
+"""The settings with which `ppo.py` trains each environment, including curriculum stages.
 
-Rows of `OVERRIDES` say what differs from the defaults of `Settings`.
+`OVERRIDES` holds the differences from the defaults of `Settings`.
 """
 
 from __future__ import annotations
@@ -19,74 +19,78 @@ CLOSER = 2 / 3  # times the spacing of obstacles
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a run depends on besides environment and seed."""
+    """Settings of a run, besides environment and seed."""
 
-    samples: float = 1e6  # control steps in all, of all rows
+    samples: float = 1e6  # control steps in total, of all simulations
     num_envs: int = 64
-    horizon: int = 32  # control steps of each row between two updates
+    horizon: int = 32  # control steps of each simulation between two updates
     epochs: int = 5
     minibatch: int = 512
     learning_rate: float = 3e-4
-    last_learning_rate: float = 5e-5  # falls linearly
-    gamma: float = 0.95  # 0.67 s at 30 Hz
+    last_learning_rate: float = 5e-5  # reached by a linear decrease
+    gamma: float = 0.95  # a time constant of 0.67 s at 30 Hz
     lambda_: float = 0.95
     clip: float = 0.2
-    kl_per_action: float = 0.004  # an update stops at this mean divergence times the actions
-    value_goes_on: bool = False  # whether the value is learnt on when an update has stopped
+    kl_per_action: float = (
+        0.004  # an update stops at this mean divergence times the number of actions
+    )
+    value_goes_on: bool = False  # whether the value network is trained after an update has stopped
     hidden: tuple[int, ...] = (256, 256)
     initial_std: float = 0.2  # of actions in [-1, 1]
-    bound_cost: float = 0.1  # times the squared excess of a mean action over 1
+    bound_cost: float = 0.1  # coefficient of the squared excess of a mean action over 1
     gradient_norm: float = 0.5
-    # What is evaluated and ships has the mean of the weights over about so many samples, the later
-    # ones counting more (Polyak averaging); 0: the weights of now.
+    # Evaluated and shipped policies have an exponential moving average of the weights over about
+    # this number of samples (Polyak averaging); 0: the current weights.
     averaged: float = 0.0
-    # And what ships at last is the mean over so many ends of stages, the last ones (stochastic
-    # weight averaging, Izmailov et al. 2018, arXiv:1803.05407): one policy that can do what each of
-    # them has stressed.
+    # The final policy has the mean weights at the ends of this number of last curriculum stages
+    # (stochastic weight averaging, Izmailov et al. 2018, arXiv:1803.05407), which combines the
+    # skills that different stages emphasise.
     stages_averaged: int = 1
-    # In training an episode also ends when a reward term, as share of its maximum and smoothed over
-    # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
-    # local optimum. Evaluations are without it.
+    # Lower bounds of reward terms, as shares of their maxima: in training an episode also ends when
+    # a term, smoothed over `patience` seconds, falls below its bound. For fast gaits, where
+    # standing still is a local optimum. Not used in evaluations.
     least_share: dict[str, float] = dataclasses.field(default_factory=dict)
     patience: float = 0.3
-    # See left stance as right stance in a mirror; for walkers in three dimensions.
+    # Mirror observations and actions in left stance; for walkers in three dimensions.
     mirrored: bool = False
-    # What the network sees of a map of the terrain: how far ahead and to each side, m; None: all.
+    # Part of a terrain map that is an input: distance ahead and to each side, m; None: all.
     view: tuple[float, float] | None = None
-    # Where it clips a map, m and m/s, whose numbers it sees as shares of that; 0: they are scaled by
-    # their deviation. A step of 0.15 m is not to drown among hills of 5 m.
+    # Bound at which maps are clipped, and by which they are divided, m or m/s; 0: scaled by their
+    # standard deviation. With a bound a step of 0.15 m remains visible among hills of 5 m.
     map_bound: float = 0.0
-    # Blocks of the observation that begin with bearing and distance of a place, which the network
-    # then sees in a straight line, too (see `trl_suite.policies.placed`).
+    # Observation blocks that begin with bearing and distance of a point, whose Cartesian
+    # coordinates are added to the inputs (see `trl_suite.policies.placed`).
     places: tuple[str, ...] = ()
-    # Curriculum stages: from which share of the samples on, with which options of the task; and on which
-    # `terrain`, if another. Evaluations have those of the environment.
+    # Curriculum stages: the share of the samples at which each begins, and its task options,
+    # including `terrain`. Evaluations use the options of the environment.
     stages: tuple[tuple[float, dict[str, Any]], ...] = ()
-    # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
-    # weights, its scales and its noise. What it did not observe begins without influence. Or with
-    # one of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
+    # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with
+    # its weights, scales and noise; the weights of inputs that it does not have are 0. Or from one
+    # of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
     start: str = ''
-    # As how many observations its scales count: few, and they soon fit the new environment, where its
-    # weights may no longer fit them.
+    # Sample count of the scales of the initial policy. With a small count they adapt quickly to the
+    # new environment, but the initial weights may then no longer fit the scales.
     start_count: float = 2e4
     cloned: float = 1e4
-    # In how many rounds: after the first one the policy walks, and the baseline only says what it
-    # would do there (DAgger, Ross et al. 2011, arXiv:1011.0686).
+    # Rounds of imitation. After the first round the policy selects the actions, and the baseline
+    # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
-    cloning_epochs: int = 30  # of each round, over all that was shown so far
-    value_first: float = 2e4  # control steps in which such a run learns only the value
+    cloning_epochs: int = 30  # of each round, over all labels so far
+    value_first: float = (
+        2e4  # first control steps after `start`, in which only the value is trained
+    )
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
 
 
 def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
-    """Curriculum stages of equal length on a terrain that comes ever closer to a preset, and at last on it.
+    """Returns curriculum stages of equal length on terrain that approaches a preset.
 
     Args:
-      preset: of the terrain.
-      low: what is different at height 0.
-      heights: from 0 to less than 1, the preset.
+      preset: name of the terrain, which is that of the last stage.
+      low: parameters that differ at terrain level 0.
+      heights: terrain levels of the stages, from 0 to less than 1, which is the preset.
     """
     preset_ = terrain.load(preset)
     full = dict(preset_.parameter_sets[0])
@@ -95,7 +99,7 @@ def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tupl
 
 
 def crowded(preset: str) -> tuple[Any, ...]:
-    """Curriculum stages on walls only and on all obstacles, closer together than in a mixed preset, and on that."""
+    """Returns stages on closer walls, on closer obstacles of a mixed preset, and on the preset."""
     mixed = terrain.load(preset)
     near = {
         name: CLOSER * value if 'Spacing' in name else value
@@ -109,20 +113,21 @@ def crowded(preset: str) -> tuple[Any, ...]:
 
 
 def evenly(stages: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
-    """Curriculum stages of equal length, one after the other."""
+    """Returns curriculum stages of equal length."""
     return tuple((i / len(stages), options) for i, options in enumerate(stages))
 
 
-# What differs from the defaults, by the pattern of an id; a later row wins.
-RUNS = {'least_share': {'com': 0.37}}  # about 1 m/s off the clip's speed
+# Differences from the defaults.
+RUNS = {'least_share': {'com': 0.37}}  # a speed error of about 1 m/s
 RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
-# Footsteps: an even walk first, then all lengths, widths and plans as a high-level controller makes
-# them, then sharp turns and pushes. The reward pays for accuracy more than when it is evaluated, and
-# a foot that lands far from its place ends the episode: who trails the plan learns nothing from it.
-# Then it does not, and who is pushed may leave the plan to keep standing; then it must come back, from
-# so far away that the reward has to reach there, and be accurate again. At last a foot that lands far
-# away ends the episode but for two seconds after a push or a sharp turn: without that it drifts off
-# the plan. Who plans from the root also stops, and turns about: that comes last.
+# Footsteps: an even walk first, then all step lengths and widths and plans like those of a
+# high-level controller, then sharp turns and pushes. The reward weighs accuracy more than in
+# evaluations, and a large landing error ends the episode, because samples far behind the plan are
+# not useful. In the next stages it does not, and the walker may leave the plan to keep its balance
+# after a push. Then it has to return to the plan, with a reward that extends far enough for that,
+# and to be accurate again. Later a large landing error ends the episode except in the two seconds
+# after a push or a sharp turn; otherwise the walker drifts off the plan. The last stages contain
+# stopping and turning about, which high-level controllers need.
 WALKER = 37e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 STAGES = (
@@ -205,7 +210,8 @@ STAGES = (
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
 )  # fmt: skip
-# Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
+# Running: the environment's plan first, then other lengths and gentle turns, then plans from the
+# root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
 RUN_STAGES = (
     (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'max_landing_error': 0.8}),
@@ -224,12 +230,13 @@ RUN_STAGES = (
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),)
-STEPS_ON = {  # on other grounds and plans; gently, or what the walker can is lost
+STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
     **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
-# In the plane: the row's own plan, then all lengths, ever more accurately. The reward alone would have
-# it walk a quarter of a metre ahead of the plan, as the reference's longer steps do.
+# In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward
+# alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its
+# longer steps does.
 PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
 PLANAR_STAGES = (
     (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
@@ -240,14 +247,14 @@ PLANAR_STEPS = {
     'samples': 0.8e6, 'gamma': 0.97, 'stages': PLANAR_STAGES, 'start': 'PD_Biped2D_Flat-v0',
 }  # fmt: skip
 RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'stages': RUN_STAGES, **RUNS}
-PLANS = {  # a step is a whole footstep: few of them
+PLANS = {  # a step is a whole footstep, so there are few samples
     'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
     'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('goal',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
-# Updates stop after a few steps, too few to learn a value by.
+# Policy updates stop after a few steps, too few to train the value network.
 BETTER_VALUED = {'value_goes_on': True, 'learning_rate': 1e-4}
-# Shown the way by somebody who has a map, again and again from where it goes astray; then by itself.
+# Imitation of an expert with a map, by DAgger; then PPO.
 GUIDED = {
     **BETTER_VALUED, 'samples': 2e5, 'start': 'expert', 'cloned': 1.2e5, 'clonings': 6,
     'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
@@ -255,35 +262,36 @@ GUIDED = {
 }  # fmt: skip
 MOVING = {**GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8}  # m/s
 BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
-# A goal so large that a kicked ball comes to rest in it, and then ever smaller.
+# A goal so large that a kicked ball comes to rest in it, then smaller goals.
 DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
     'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
     'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
-CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
+CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
     'initial_std': 0.1, 'least_share': {}, 'evaluate_every': 5e3,
 }  # fmt: skip
-# Who walks over walls of 0.25 m falls at three of four that are up to 0.4 m high.
+# A policy trained on walls of 0.25 m falls at three of four walls of up to 0.4 m.
 LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
-# Where they meet few obstacles, each of them another: more of them in every update, and looked at from
-# further ahead.
+# Few and varied obstacles: more simulations per update, and a longer time constant of the return.
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
-# Who has so long to live treads on the spot in front of a wall, unless that ends the episode.
+# With this discount a policy learns to step in place in front of a wall, unless that ends the
+# episode.
 CROWDED = {
     'gamma': 0.98, 'stages': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
     'patience': 1.0,
 }  # fmt: skip
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
-# What planning footsteps does without: the walk is there, where to go with it is learnt.
+# The same tasks without footstep planning: starts from the walk, and learns navigation.
 JOURNEYS = {
     'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
     'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6, 'value_goes_on': True, 'map_bound': 0.3,
     'learning_rate': 2e-4,
 }  # fmt: skip
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
+# By the pattern of an id; later entries have precedence.
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('*', {'samples': 0.8e6}),
     ('*_Biped2D_*Flat-v0', {'samples': 0.5e6}),
@@ -295,7 +303,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_*_Terrain-v0', {'samples': 2e6}),
     ('PD_Biped2D_Flat_Terrain-v0', {'samples': 0.8e6}),
     *((f'PD_{name}_[!F]*_Terrain-v0', RUNS_UNEVENLY) for name in ('Raptor2D', 'Dog2D')),
-    # From flat ground to all others.
+    # From flat ground to all other terrains.
     ('PD_Biped2D_Incline-v0', {'start': 'PD_Biped2D_Flat-v0', **ENOUGH}),
     *(
         row
@@ -309,14 +317,14 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         )
     ),
     ('PD_Biped2D_LLC_Flat_Step-v0', PLANAR_STEPS),
-    # From one kind of obstacle to a mix of them, and on to that on slopes.
+    # From one kind of obstacle to mixed terrain, and from there to mixed terrain on slopes.
     *(
         (f'PD_{name}_{to}_Terrain-v0', {'samples': n, 'start': f'PD_{name}_{start}_Terrain-v0'})
         for name, n in (('Biped2D', 4e6), ('Dog2D', 2e6), ('Raptor2D', 2e6))
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
-    # Walls are met rarely, and each has to be met in every phase of the stride: it goes on improving.
+    # Walls are rare, and have to be met in every phase of the stride: returns rise for a long time.
     ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, 'samples': 6e6, 'averaged': 3e5, 'enough': np.inf}),
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
     ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
@@ -324,7 +332,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
-    # In three dimensions the planar noise fells the body before it has learnt anything.
+    # With the noise of the planar environments the 3D biped falls before it learns.
     ('*_Biped3D_*', {'initial_std': 0.15, 'mirrored': True, 'kl_per_action': 0.0045}),
     *((f'PD_Biped3D_Imitate-{name}-v0', WALKS_ON) for name in ROUGH),
     ('PD_Biped3D_Imitate-*_Terrain-v0', {**WALKS_ON, 'samples': 1.6e6, 'view': (2.5, 1.0)}),
@@ -334,7 +342,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
-    # Its observation is mirrored.
+    # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
@@ -345,12 +353,12 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
     ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
-    ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # noise makes it tread on the spot
+    ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
 )
 
 
 def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
-    """What rows say of an environment; a later row wins."""
+    """Returns the values of all entries that match an id; later entries have precedence."""
     values: dict[str, Any] = {}
     for pattern, row in rows:
         if fnmatch.fnmatchcase(id_, pattern):
@@ -359,5 +367,5 @@ def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, 
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
-    """The settings of an environment."""
+    """Returns the settings of an environment."""
     return Settings(**{**matching(id_, OVERRIDES), **changes})

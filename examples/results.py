@@ -1,4 +1,4 @@
-"""Writes docs/results.md and docs/learning_curves.png from what is in trained/.
+"""Writes docs/results.md and docs/learning_curves.png from the files in trained/.
 
     python examples/results.py [--check]
 
@@ -27,37 +27,37 @@ MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 
 MILESTONES = (0.5, 0.8, 0.9)  # of the maximum return
 PANELS = {'hierarchical': 'plans', 'flat_control': 'without hierarchy'}  # else by character
 LONGEST = 20  # longest to shortest run of a panel above which its axis of samples is logarithmic
-PLANS = (  # tag, title, words
+PLANS = (  # tag, title, text
     (
         'hierarchical',
         '## Planning footsteps',
-        'By `examples/evaluate_plans.py`: whole episodes of 200 s, seed 0, by the scripted policy '
-        'and the reference policy. Reward is normalised and cumulative: a fall ends it; speed is '
-        'towards the goal (soccer: of the ball), m/s; along the trail, m, median; with the ball at '
-        'its goal, share of the time. In 2017: the reward that the DeepLoco paper reports for its trained '
-        'policies, in another simulator, as we remember it (not checked).',
+        'Measured by `examples/evaluate_plans.py` in whole episodes of 200 s, seed 0, with the scripted '
+        'and the reference policy. *Reward*: normalised cumulative reward, 0 after a fall. *Speed*: '
+        'towards the goal (soccer: of the ball), m/s. *Trail*: median distance along the trail, m. *Ball '
+        'at goal*: share of the time. *2017*: the reward reported in the DeepLoco paper for its trained '
+        'policies, in another simulator (quoted from memory, not checked).',
     ),
     (
         'flat_control',
         '## The same tasks without hierarchy',
-        'By the same program, in episodes as long, though these policies were trained in episodes of '
-        '8.5 s. Their reward is another, for it is also for walking as the clip does; goals are '
-        'reached within 0.5 m instead of 1 m, and on the trail they are one segment of 2 m ahead '
-        'instead of up to ten; in soccer, speed is towards the ball.',
+        'Measured by the same program in episodes of the same length, although these policies were '
+        'trained in episodes of 8.5 s. Their reward differs: it includes imitation of the clip. Goals '
+        'are reached within 0.5 m instead of 1 m, and on the trail they are one segment of 2 m ahead '
+        'instead of up to ten segments; in soccer, speed is towards the ball.',
     ),
 )
 PLAN_COLUMNS = (
     'environment', 'policy', 'episodes', 'reward', '2017', 'no fall in 60 s', 'no fall', 'speed',
-    'goals a minute', 'trail', 'ball at goal', 'falls per km',
+    'goals per minute', 'trail', 'ball at goal', 'falls per km',
 )  # fmt: skip
-PUBLISHED_REWARDS = {  # share of the maximum; Peng et al. 2017, from memory
+PUBLISHED_REWARDS = {  # share of the maximum; Peng et al. 2017, quoted from memory
     'PD_Biped3D_HLC_Soccer-v0': 0.77,
     'PD_Biped3D_HLC_LargeBlocks-v0': 0.70,
     'PD_Biped3D_HLC_DynamicsObstacles-v0': 0.18,
     'PD_Biped3D_HLC_Forest-v0': 0.56,
     'PD_Biped3D_HLC_PathFollowing-v0': 0.55,
 }
-PUBLISHED_DISTANCES = {  # m, mean; Peng, Berseth, van de Panne 2016, from memory
+PUBLISHED_DISTANCES = {  # m, mean; Peng, Berseth, van de Panne 2016, quoted from memory
     'FSM_Dog2D_Terrain_Mixed-v0': 2094,
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': 1364,
     'FSM_Raptor2D_Terrain_Mixed-v0': 1111,
@@ -65,7 +65,7 @@ PUBLISHED_DISTANCES = {  # m, mean; Peng, Berseth, van de Panne 2016, from memor
 
 
 def load() -> dict[str, dict[str, Any]]:
-    """What is known of every environment that has been trained, in the catalogue's order."""
+    """Returns the contents of `trained/ID.json` by id, in the catalogue's order."""
     folder = resources.directory('trained')
     paths = {id_: folder / f'{id_}.json' for id_ in catalogue.BY_ID}
     return {id_: json.loads(p.read_text()) for id_, p in paths.items() if p.exists()}
@@ -76,7 +76,7 @@ def million(samples: float) -> str:
 
 
 def reached(run: dict[str, Any], fraction: float) -> float | None:
-    """Samples after which an evaluation of the curve first reached a fraction of the maximum."""
+    """Returns the samples after which an evaluation first reached a fraction of the maximum."""
     return next((p['samples'] for p in run['curve'] if p['normalized_return'] >= fraction), None)
 
 
@@ -130,7 +130,7 @@ def comparison_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
-    """Trained gaits beside default gaits, on the same ground."""
+    """Returns lines that compare trained with default gaits, on the same terrain."""
     path = resources.directory('trained') / 'default_gaits.json'
     stored = json.loads(path.read_text()) if path.exists() else {}
     rows = []
@@ -185,7 +185,7 @@ def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def plan_rows(tag: str) -> list[list[str]]:
-    """What `examples/evaluate_plans.py` found, in the rows with a tag."""
+    """Returns the results of `examples/evaluate_plans.py` for the environments with a tag."""
     path = resources.directory('trained') / 'plans.json'
     if not path.exists():
         return []
@@ -209,29 +209,29 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     machines = ', '.join(sorted({run['machine'].partition(';')[0] for run in runs}))
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
-        '# What has been learnt',
-        f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is made '
-        f'by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
-        'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` where a '
-        'gait acts, with the settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
-        'shipped: `suite.reference_policy(id)`. What the papers found: [beside the papers](findings.md).',
-        f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
-        'neither training nor the choice of a policy along its curve had seen, so that numbers here are not '
-        'those of the curves. (The best of several seeds is the best in these same episodes; each of '
-        'them is under *Actuation models*.) Return is a fraction of its '
-        'maximum; an episode that ends in a fall earns nothing more. *Complete* is the share of '
-        'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
-        'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
-        'the run began with, whose samples are not counted again; or what it was shown at first: '
-        '`scripted`, the rules written by hand, or `expert`, the plans of [one who has a map]'
-        '(../examples/expert.py), whose samples are counted; the page of an environment says whether its policy '
-        'was taken while it was shown, or after. '
-        f'Machine: {machines}; one thread per '
-        'run, up to five runs and other work side by side, so that minutes say little.',
-        '## Every environment with a policy, but for gaits',
+        '# Results',
+        f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is '
+        f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
+        'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` for gait '
+        'environments, with the settings in its JSON file; `examples/train_all.py` repeats them. Of '
+        'several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
+        '[comparison with the papers](findings.md).',
+        f'Every policy was evaluated without noise in {", ".join(map(str, episodes))} episodes that were '
+        'used neither for training nor for the selection of a policy during training; the results '
+        'therefore differ from the learning curves. (Of several seeds, the best one was selected in these '
+        'episodes; all seeds are listed under *Actuation models*.) *Return* is divided by its maximum; the '
+        'reward is 0 after a fall. *Complete* is the share of episodes that lasted to the end (256 steps; '
+        'high-level environments 200 s), *distance* the mean in m, *minutes* the wall time of the run. '
+        '*Initial policy*: the policy from which training started, whose samples are not included; or the '
+        'policy that was imitated first, whose samples are included: `scripted` is the hand-written '
+        'policy, `expert` an [expert with a map](../examples/expert.py). The page of an environment says '
+        'whether its policy was saved at the end of the imitation, or later. '
+        f'Machine: {machines}; one thread per run, with up to five runs and other work at the same time, '
+        'so that wall times are only a rough guide.',
+        '## Environments with a policy, except gaits',
         table(
             ('environment', 'return, 95 %', 'complete', 'distance', 'samples', 'minutes', 'seed',
-             'begins with'),
+             'initial policy'),
             (
                 environment_row(id_, entry)
                 for id_, entry in entries.items()
@@ -241,8 +241,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '![Learning curves](learning_curves.png)',
         'Learning curves, evaluated without noise; faint: other seeds.',
         '## Actuation models',
-        'Mean over seeds; the milestones are the samples after which the noiseless policy first '
-        'reached 0.5, 0.8 and 0.9 of the maximum, over the seeds that did (evaluated every 0.1 M).',
+        'Means over seeds. The last columns are the samples after which the policy without noise first '
+        'reached 0.5, 0.8 and 0.9 of the maximum, averaged over the seeds that did (evaluated every '
+        '0.1 M samples).',
         table(
             ('character, actuation', 'seeds', 'return', 'each', 'complete', 'to 0.5', 'to 0.8',
              'to 0.9'),
@@ -254,11 +255,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         parts += [
             '## Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
-            'default gait, in the same episodes, which 256 cycles cut; *to the first fall*: mean of '
-            f'{train_all.FALL_EPISODES} episodes that only {train_all.FALL_STEPS} cycles cut, with its '
-            '95 % interval. A decision is a cycle: of `examples/search_gaits.py` one whose base actions '
-            'were all tried, of `examples/learn_gaits.py` one that was taken. In 2016: the mean that the paper of Peng, Berseth and van de Panne reports for '
-            'some 10 million cycles, in another simulator, as we remember it (not checked).',
+            'default gait, in the same episodes, which are truncated after 256 cycles. *To the first '
+            f'fall*: mean of {train_all.FALL_EPISODES} episodes that are truncated only after '
+            f'{train_all.FALL_STEPS} cycles, with its 95 % interval. *Decisions*: with '
+            '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
+            '`examples/learn_gaits.py`, simulated cycles. *2016*: the mean reported by Peng, Berseth and '
+            'van de Panne for about 10 million cycles, in another simulator (quoted from memory, not '
+            'checked).',
             table(
                 (
                     'environment',
@@ -278,12 +281,12 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     rows = footstep_rows()
     if rows:
         parts += [
-            '## Where the feet are told to go',
-            'The footstep controller by `examples/evaluate_footsteps.py`: episodes of 20 s, seed 0; '
-            'landing error in m, mean and 90th percentile, and mean error of the heading in rad when '
-            'a foot lands. *General*: as the environment draws plans, with sharp turns; *made from the root*: '
-            'each laid out from root and heading, as by the policies that plan; *pushes*: of the torso, '
-            'for 0.2 s every 3 s; *belts*: strips 2 m wide, 1 m apart.',
+            '## Footstep tracking',
+            'The footstep controller, measured by `examples/evaluate_footsteps.py` in episodes of 20 s, '
+            'seed 0: landing error in m, mean and 90th percentile, and mean heading error in rad when '
+            'a foot lands. *General*: the plans of the environment, with sharp turns; *made from the root*: '
+            'each plan is relative to root and heading, as in the high-level environments; *pushes*: forces '
+            'on the torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
             table(
                 ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
             ),
@@ -296,7 +299,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Does training on terrain help?',
-            'Against the policy that was trained on flat ground with the same observations.',
+            'Comparison with the policy that was trained on flat ground with the same observation.',
             table(
                 ('environment', 'distance, own', 'flat policy', 'ratio', 'complete, own',
                  'flat policy'),
@@ -315,7 +318,7 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
     panels: dict[tuple[str, str], list[str]] = {}
     for id_ in entries:
         spec = catalogue.BY_ID[id_]
-        if spec.actuation != 'gait':  # whose return says little
+        if spec.actuation != 'gait':  # gaits are scored by distance
             name = next((name for tag, name in PANELS.items() if tag in spec.tags), spec.character)
             panels.setdefault((spec.domain, name), []).append(id_)
     columns = 3
@@ -355,12 +358,14 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--check', action='store_true', help='only tell whether the page is fresh')
+    parser.add_argument(
+        '--check', action='store_true', help='write nothing; fail if the page is out of date'
+    )
     arguments = parser.parse_args()
     entries = load()
     text, path = page(entries), DOCS / 'results.md'
     if arguments.check:
-        sys.exit(0 if path.exists() and path.read_text() == text else f'{path} is not fresh')
+        sys.exit(0 if path.exists() and path.read_text() == text else f'{path} is out of date')
     path.write_text(text)
     plot(entries, DOCS / 'learning_curves.png')
     print(path)

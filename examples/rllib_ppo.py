@@ -1,9 +1,10 @@
-"""Trains a policy with RLlib's PPO: runners, processes of their own, step many simulations each.
+"""Trains a policy with RLlib's PPO: each runner is a process that steps many simulations.
 
-This is how the suite goes beyond one machine. With the same packages on all, run `ray start --head`
-on one and on the others the command that it prints; this program, run on the first, finds them, and
-`--runners` may be as many as they have cores. Runner i has the seed s + i, so each meets ground of its
-own. An episode has at most 256 steps of reward at most 1. Needs `pip install 'trl_suite[rllib]'`.
+This also works on several machines: install the same packages on all, run `ray start --head` on
+one, and the command that it prints on the others. This program, run on the first machine, uses all
+of them, and `--runners` may be the total number of their cores. Runner i has the seed s + i, so
+runners have different terrain. An episode has at most 256 steps of reward at most 1. Needs
+`pip install 'trl_suite[rllib]'`.
 """
 
 import argparse
@@ -16,12 +17,14 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 from trl_suite.util.program import begin_script
 
-STEPS = 32  # of every simulation between updates
-NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad; RLlib's 1 fells any walker
+STEPS = 32  # steps of every simulation between updates
+NOISE = (
+    0.2  # standard deviation of the first actions, about 0.3 rad; with RLlib's 1 all walkers fall
+)
 
 
 def configuration(id_, runners=2, num_envs=32, seed=0):
-    """PPO with as many runners as given, each of which steps `num_envs` simulations on one core."""
+    """Returns PPO whose runners step `num_envs` simulations on one core each."""
 
     def less_noise(algorithm, **_):
         algorithm.learner_group.foreach_learner(
@@ -55,7 +58,7 @@ def configuration(id_, runners=2, num_envs=32, seed=0):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--environment', default='PD_Biped2D_Flat-v0', help='id')
-    parser.add_argument('--runners', type=int, default=2, help='at most as many as cores')
+    parser.add_argument('--runners', type=int, default=2, help='at most the number of cores')
     parser.add_argument('--updates', type=int, default=50)
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()

@@ -1,16 +1,16 @@
-"""Teaches a gait's policy which base action to take when, by trying them all.
+"""Trains a policy to select a base action of a gait in every cycle, by search and imitation.
 
     python examples/search_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --seed 1
 
-Before each cycle every base action of the gait runs in a copy of the simulation, and what the network
-would do goes on from there: rollouts improve a policy (Tesauro, Galperin 1996). The network learns
-to tell from the observation what the search found, as in DAgger (Ross, Gordon, Bagnell 2011): in half
-of the simulations the search drives on, in the other half the network does, which so learns where its
-own mistakes lead. What comes out chooses one of the base actions, as the mixtures of experts of Peng,
-Berseth, van de Panne (2016) do.
+Before each cycle every base action of the gait is simulated in a copy of the simulation, followed
+by cycles with actions of the network: rollouts improve a policy (Tesauro, Galperin 1996). The
+network learns to predict the result of the search from the observation, as in DAgger (Ross, Gordon,
+Bagnell 2011): in half of the simulations the search selects the actions, in the other half the
+network, so that it is trained in states that its own errors lead to. The policy selects one of the
+base actions, as the mixtures of experts of Peng, Berseth, van de Panne (2016) do.
 
-Writes into OUTPUT/ID/seed_S what `examples/ppo.py` writes there: `curve.json`, `policy.npz` (the best
-of the curve), `last.npz`, and `decisions.npz`, from which the same command goes on. Needs
+Writes into OUTPUT/ID/seed_S the files of `examples/ppo.py`: `curve.json`, `policy.npz` (the best of
+the curve), `last.npz`, and `decisions.npz`, from which the same command continues. Needs
 `pip install 'trl_suite[train]'`.
 """
 
@@ -39,23 +39,24 @@ from trl_suite.vector import VectorEnvironment
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a run depends on besides environment and seed."""
+    """Settings of a run, besides environment and seed."""
 
-    samples: float = 4e3  # decisions that the search makes, one per cycle
-    num_envs: int = 16  # half of them driven by the search, half by the network
-    cycles: int = 2  # that the search looks ahead; all but the first as the network would
-    alive: float = 2.0  # worth of not having fallen by then, in rewards of a cycle
-    view: float = 5.0  # m ahead that the network sees
+    samples: float = 4e3  # decisions of the search, one per cycle
+    num_envs: int = 16  # the search selects the actions in half of them, the network in the others
+    cycles: int = 2  # search depth; actions after the first cycle are those of the network
+    alive: float = 2.0  # bonus for the absence of a fall, in rewards of a cycle
+    view: float = 5.0  # m; distance of the farthest ground height in the input
     hidden: tuple[int, ...] = (256, 128)
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
-    epochs: int = 40  # each time over all decisions
+    epochs: int = 40  # of every fit, over all decisions
     minibatch: int = 256
     evaluate_every: float = 1e3  # decisions
     evaluation_episodes: int = 32
 
 
-# A cycle of theirs is one step; two steps ahead they are still up when they cannot be saved any more.
+# A cycle of these characters is one step; after two steps a fall can be inevitable but not yet
+# detected.
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_*': {'cycles': 4, 'samples': 2e3},
     'FSM_Hopper2D_*': {'cycles': 4, 'samples': 2e3},
@@ -69,7 +70,7 @@ def settings_for(id_: str, **changes: Any) -> Settings:
 
 
 class Search:
-    """Finds out what each base action leads to."""
+    """Simulates every base action from the same state."""
 
     def __init__(self, id_: str, settings: Settings, threads: int) -> None:
         environments = VectorEnvironment(id_, 1, 1, 0)
@@ -77,7 +78,7 @@ class Search:
         environments.close()
         choices = np.clip(parameters.action(parameters.base_actions), -1, 1)
         default = np.zeros((1, choices.shape[1]))
-        # The default gait first: where all do as well, it stays.
+        # The default gait comes first and is selected in a tie.
         self.choices = np.unique(np.concatenate([default, choices]), axis=0)
         self.choices = self.choices[np.argsort(np.abs(self.choices).sum(1), kind='stable')]
         self.settings = settings
@@ -88,14 +89,14 @@ class Search:
     def __call__(
         self, environments: VectorEnvironment, network: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Returns the worth of each choice in each of the environments' rows.
+        """Returns the value of each choice in each simulation.
 
         Args:
-          environments: stand before a cycle.
-          network: observations (m, k) -> numbers of choices (m,), in the cycles after the first.
+          environments: at the beginning of a cycle.
+          network: observations (m, k) -> indices of choices (m,), for the cycles after the first.
 
         Returns:
-          (n, choices): rewards until the last cycle, and `alive` of who has not fallen by then.
+          (n, choices): the sum of rewards over the cycles, plus `alive` without a fall.
         """
         n, count, copies = environments.num_envs, len(self.choices), self.copies
         copies.copy_from(environments, np.repeat(np.arange(n), count).tolist(), range(n * count))
@@ -113,7 +114,7 @@ class Search:
 
 
 def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
-    """Which columns of an observation are no ground, or not too far ahead."""
+    """Returns the columns of an observation without ground heights beyond `view`."""
     ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
     seen = np.ones(max(part.stop for part in blocks.values()), bool)
     seen[blocks['terrain']] = ahead <= view
@@ -121,7 +122,7 @@ def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
 
 
 class Learner:
-    """A network that tells what the search would find."""
+    """A network that predicts the values found by the search."""
 
     def __init__(self, environments: VectorEnvironment, choices: np.ndarray, settings: Settings):
         self.settings, self.choices, self.environments = settings, choices, environments
@@ -133,13 +134,13 @@ class Learner:
     def fit(
         self, observations: np.ndarray, worth: np.ndarray, random: np.random.Generator
     ) -> float:
-        """Learns all decisions anew; returns the mean squared error of the last epoch."""
+        """Fits a new network to all decisions; returns the mean squared error of the last epoch."""
         s = self.settings
         size = observations.shape[1]
         self.scales = ppo.Scales(self.environments.blocks, size, self.scales.columns)
         self.scales.update(observations)
         inputs = self.scales(observations)
-        # How much better than the others each choice is: an action's advantage.
+        # The advantage of each choice over their mean.
         aims = torch.from_numpy(worth - worth.mean(1, keepdims=True)).float()
         aims /= aims.std() + 1e-8
         self.network = ppo.network((inputs.shape[1], *s.hidden, len(self.choices)), 0.01)
@@ -162,12 +163,12 @@ class Learner:
         return total
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Returns the number of the choice for each observation, (n,)."""
+        """Returns the index of the choice for each observation, (n,)."""
         with torch.no_grad():
             return self.network(self.scales(observation)).argmax(1).numpy()
 
     def exported(self, samples: int, seed: int) -> policies.Policy:
-        """The policy of now, without PyTorch."""
+        """Returns the current policy without PyTorch."""
         environments, columns = self.environments, self.scales.columns
         layers = [layer for layer in self.network if isinstance(layer, torch.nn.Linear)]
         return policies.Policy(
@@ -265,7 +266,7 @@ def _train(
             }
             point |= {'samples': len(found), 'loss': loss, 'seconds': dict(seconds)}
             point['median_distance'] = float(np.median(result['distances']))
-            point['searched'] = searched  # m; distances of the episodes that the search has ended
+            point['searched'] = searched  # m; distances of the episodes that ended under the search
             searched = []
             curve.append(point)
             if point['normalized_return'] > best:
@@ -285,7 +286,7 @@ def _train(
 
 
 def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarray, list]:
-    """Decisions that have been made, and the curve so far.
+    """Loads the decisions and the curve so far.
 
     Raises:
       ValueError: they are damaged, or were made with other settings.

@@ -1,7 +1,7 @@
 """Random actions through Shimmy, the wrapper for all environments of dm_control.
 
-For programs that wrap dm_control's own suite in the same way. `trl_suite.gym` is the suite's own
-interface: it also steps many on threads, and says how an episode ended. Needs
+For programs that use Shimmy to wrap dm_control. The suite's own Gymnasium interface,
+`trl_suite.gym`, also steps many simulations on threads, and reports how an episode ended. Needs
 `pip install 'trl_suite[shimmy]'`.
 """
 
@@ -13,13 +13,13 @@ from trl_suite.util.program import begin_script
 
 
 def main() -> None:
-    # One vector: Gymnasium sorts the keys of a dict of blocks, and would flatten it in that order.
+    # One vector, because Gymnasium would sort the keys of a dict of blocks before flattening it.
     environment = suite.build(
         'raptor', 'muscle', 'slopes_mixed', environment_kwargs={'flat_observation': True}
     )
     env = DmControlCompatibilityV0(environment, 'rgb_array', {'camera_id': 'raptor/side'})
     env = gymnasium.wrappers.FlattenObservation(env)
-    env.reset(seed=1)  # the episode of task_kwargs={'random': 1}
+    env.reset(seed=1)  # the same episode as with task_kwargs={'random': 1}
     env.action_space.seed(1)
     total, ended = 0.0, False
     while not ended:

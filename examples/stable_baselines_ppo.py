@@ -1,7 +1,7 @@
 """Trains a policy with Stable-Baselines3's PPO on threads of simulations.
 
-Prints the mean return of the episodes that ended in every 20 000 steps; an episode has at most 256
-steps of reward at most 1. Needs `pip install 'trl_suite[sb3]'`.
+Prints after every 20 000 steps the mean return of the episodes that ended; an episode has at most
+256 steps of reward at most 1. Needs `pip install 'trl_suite[sb3]'`.
 """
 
 import argparse

@@ -20,14 +20,18 @@ from torchrl.objectives.value import GAE
 import trl_suite.gym  # noqa: F401, registers the environments
 from trl_suite.util.program import begin_script
 
-STEPS, EPOCHS, BATCH = 32, 5, 512  # of each row between updates; over them; steps in a minibatch
+STEPS, EPOCHS, BATCH = (
+    32,
+    5,
+    512,
+)  # steps of each simulation between updates; epochs; minibatch size
 NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad
 
 
 def train(id_, num_envs=64, samples=100_000, seed=0):
     """Yields the number of steps and the mean return after every update."""
     torch.manual_seed(seed)
-    # TorchRL itself says which num_envs begin anew: 'Disabled'.
+    # 'Disabled', because TorchRL resets simulations that have ended.
     environment = GymWrapper(
         gymnasium.make_vec(f'trl_suite/{id_}', num_envs=num_envs, autoreset_mode='Disabled')
     )
@@ -43,7 +47,7 @@ def train(id_, num_envs=64, samples=100_000, seed=0):
         in_keys=['loc', 'scale'], distribution_class=IndependentNormal, return_log_prob=True,
     )  # fmt: skip
     critic = ValueOperator(MLP(out_features=1, activation_class=nn.Tanh, **layers))
-    critic(actor(environment.reset()))  # gives the layers their sizes
+    critic(actor(environment.reset()))  # initialises the lazy layers
     advantage = GAE(gamma=0.95, lmbda=0.95, value_network=critic, average_gae=True)
     loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
@@ -73,7 +77,7 @@ if __name__ == '__main__':
     parser.add_argument('--environment', default='PD_Biped2D_Flat-v0', help='id or alias')
     parser.add_argument('--num-envs', type=int, default=64, help='simulations at once')
     parser.add_argument(
-        '--samples', type=int, default=100_000, help='steps of all num_envs together'
+        '--samples', type=int, default=100_000, help='steps of all simulations in total'
     )
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()

@@ -1,16 +1,17 @@
-"""Trains the reference policies of the suite: every row of the catalogue, some with three seeds.
+"""Trains the reference policies of all environments, some with three seeds.
 
-    python examples/train_all.py                       # all that is missing, two runs side by side
+    python examples/train_all.py                       # all missing runs, two at a time
     python examples/train_all.py --filter '*Dog2D*' --jobs 8
     python examples/train_all.py --filter PD_Dog2D_Gaps_Terrain-v0 --overwrite
     python examples/train_all.py --filter FSM_Goat2D_Terrain_Cliffs-v0
 
-Each run is `examples/ppo.py` on one thread, of rows that gaits drive `examples/learn_gaits.py` or
-`examples/search_gaits.py`; those that begin with the policy of another environment come after it.
-Stopped runs go on from their checkpoints in RUNS; finished ones are evaluated and entered into
-`trained/ID.json` (settings, learning curve, evaluation); the best policy of an environment becomes `trained/ID.npz`. What has been entered with
-the same settings is not trained again. Of the rows that gaits drive (FSM_...) five are trained; any
-other has to be named in full.
+Each run is `examples/ppo.py` on one thread, or for gait environments (FSM_...)
+`examples/learn_gaits.py` or `examples/search_gaits.py`. Runs that start from the policy of another
+environment are run after it. Interrupted runs continue from their checkpoints in RUNS. Finished
+runs are evaluated and entered into `trained/ID.json` (settings, learning curve, evaluation), and
+the best policy of an environment becomes `trained/ID.npz`. Runs that have been entered with the
+same settings are not repeated. Five gait environments are trained; another one has to be selected
+by its full id.
 """
 
 from __future__ import annotations
@@ -58,12 +59,12 @@ LEARNT = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0')  # not 
 
 
 def compared(spec: catalogue.EnvSpec) -> bool:
-    """Whether an environment is one of those that compare actuation models."""
+    """Returns whether an environment is part of the comparison of actuation models."""
     return spec.domain == 'imitation' and 'planar' in spec.tags and '_Run_' not in spec.id
 
 
 def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
-    """Which runs there are: first one of each environment, then the repetitions."""
+    """Returns the runs to do: one per environment first, then further seeds."""
     ids = [
         id_
         for id_, spec in catalogue.BY_ID.items()
@@ -78,43 +79,43 @@ def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tup
 
 
 def shipped(entry: dict[str, Any]) -> dict[str, Any]:
-    """The run of `trained/ID.json` whose policy is in `trained/ID.npz`."""
+    """Returns the run of `trained/ID.json` whose policy is in `trained/ID.npz`."""
     return next(run for run in entry['runs'] if run['seed'] == entry['shipped'])
 
 
 def program(id_: str) -> ModuleType:
-    """The program that trains an environment."""
+    """Returns the program that trains an environment."""
     if catalogue.BY_ID[id_].actuation != 'gait':
         return ppo
     return learn_gaits if id_ in LEARNT else search_gaits
 
 
 def depth(id_: str) -> int:
-    """How many environments a policy has learnt in before it comes to this one."""
+    """Returns the number of environments in which the initial policy was trained before."""
     start = ppo_settings.settings_for(id_).start
     return 1 + depth(start) if start in catalogue.BY_ID else 0
 
 
 def entries(id_: str) -> list[dict[str, Any]]:
-    """The runs that have been entered for an environment."""
+    """Returns the runs that have been entered for an environment."""
     path = resources.directory('trained') / f'{id_}.json'
     if not path.exists():
         return []
     runs = json.loads(path.read_text())['runs']
     default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
-    for run in runs:  # later settings were at their defaults, those that went made no change
+    for run in runs:  # settings added later have their defaults, removed ones are dropped
         own = run['settings']
         run['settings'] = {name: own.get(name, value) for name, value in default.items()}
     return runs
 
 
 def settings(id_: str) -> dict[str, Any]:
-    """Settings as JSON gives them back."""
+    """Returns the settings of an environment as read from JSON."""
     return json.loads(json.dumps(dataclasses.asdict(program(id_).settings_for(id_))))
 
 
 def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
-    """Trains in a process of its own; returns the folder of the run."""
+    """Trains in a separate process; returns the folder of the run."""
     script = pathlib.Path(program(id_).__file__ or '')
     command = [sys.executable, script, id_, f'--seed={seed}', '--threads=1', f'--output={runs}']
     folder = runs / id_ / f'seed_{seed}'
@@ -125,10 +126,12 @@ def train(id_: str, seed: int, runs: pathlib.Path) -> pathlib.Path:
 
 
 def trimmed(policy: policies.Policy) -> policies.Policy:
-    """The same policy in a small file: weights are rounded to half precision, and inputs that were
-    always 0, as the place where the standing foot lands, are left out.
+    """Returns the policy for a small file.
+
+    Weights are rounded to half precision, and inputs that are always 0 are removed, for example the
+    footstep of the stance foot.
     """
-    if policy.convolution is not None:  # inputs have their places
+    if policy.convolution is not None:  # the inputs of a convolution cannot be removed
         line = policy.convolution
         line = dataclasses.replace(line, weights=_rounded(line.weights))
         return dataclasses.replace(policy, convolution=line, weights=_rounded(policy.weights))
@@ -146,9 +149,9 @@ def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
 
 
 def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
-    """Evaluates a finished run and writes it beside the others of its environment."""
+    """Evaluates a finished run and enters it into the file of its environment."""
     curve = json.loads((folder / 'curve.json').read_text())
-    # After curriculum stages the last policy is the one that has learnt what the environment does not ask for.
+    # With curriculum stages the last policy is used, because the curve does not measure all skills.
     name = 'last' if curve['settings'].get('stages') else 'policy'
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     found = evaluation.evaluate(id_, policy, EPISODES, SEED, num_threads=1)
@@ -171,13 +174,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--filter', default='*', metavar='PATTERN', help='of ids')
     parser.add_argument('--seeds', type=int, nargs='+', default=COMPARED_SEEDS, help='only these')
-    parser.add_argument('--jobs', type=int, default=2, help='runs side by side')
+    parser.add_argument('--jobs', type=int, default=2, help='number of runs at a time')
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument('--overwrite', action='store_true', help='train anew what has been entered')
+    parser.add_argument(
+        '--overwrite', action='store_true', help='repeat runs that have been entered'
+    )
     parser.add_argument(
         '--machine',
         default=f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}',
-        help='what to call this machine in the results',
+        help='description of this machine in the results',
     )
     arguments = parser.parse_args()
     todo = []
@@ -200,7 +205,7 @@ def main() -> None:
         tqdm.tqdm(total=len(todo), unit='run') as bar,
     ):
         running: dict[concurrent.futures.Future, tuple[str, int]] = {}
-        for job in todo:  # each waits only for what was submitted earlier
+        for job in todo:  # each waits only for runs that were submitted before
             start = ppo_settings.settings_for(job[0]).start
             before = [future for future, (id_, _) in running.items() if id_ == start]
             running[pool.submit(work, *job, before)] = job

@@ -1,17 +1,18 @@
-"""Searches the gait that is a character's action 0, or measures how gaits do.
+"""Searches for a character's default gait (action 0), or evaluates gaits.
 
     python examples/tune_gait.py --evaluate                 # of all characters, on flat ground
     python examples/tune_gait.py goat --evaluate --start climb0_020 --terrain steps --friction 0.6
     python examples/tune_gait.py goat --start climb0_050 --seed 1
 
-A search writes the gait that it found into `trl_suite/controllers/CHARACTER.json` as set 'tuned',
-with a record of the search, and makes it action 0. It is CMA-ES (Hansen 2016, arXiv:1604.00772) over
-the parameters that an action sets, in units of the gait's search scale. A gait's score in an episode
-is the share of the horizon that it stays up * (0.5 + 0.5 exp(-0.5 (v - target)^2)) + 0.02 for each
-cycle, of up to 15, that was one; it counts with the mean over noisy starts, the same ones for all
-candidates of a generation, on slippery, ordinary and rough ground in turn. A first horizon is short,
-the second one long; last, the distribution's mean and the best candidates of late generations meet on
-new starts. Needs `pip install 'trl_suite[tune]'`; measuring does not.
+A search writes its best gait into `trl_suite/controllers/CHARACTER.json` as set 'tuned', with a
+record of the search, and makes it action 0. It uses CMA-ES (Hansen 2016, arXiv:1604.00772) over the
+parameters that an action sets, in units of the gait's search scale. The score of an episode is the
+share of the horizon without a fall * (0.5 + 0.5 exp(-0.5 (v - target)^2)) + 0.02 for each of up to
+15 complete cycles. A candidate's score is the mean over noisy starts, which are the same for all
+candidates of a generation, with the coefficients of friction in `FRICTIONS` in turn. The first part
+of a search has a short horizon, the second a long one. Finally, the mean of the distribution and
+the best candidates of the last generations are compared on new starts. Needs
+`pip install 'trl_suite[tune]'`; evaluation does not.
 """
 
 from __future__ import annotations
@@ -40,25 +41,26 @@ from trl_suite.vector import VectorEnvironment
 
 START_NOISE = 0.01  # rad, of the joints; see `GaitTask`
 HORIZONS = (6.0, 20.0)  # s, of the two parts of a search
-FRICTIONS = (0.81, 0.6, 1.0)  # of the starts of a candidate, in turn; the suite's own first
+FRICTIONS = (0.81, 0.6, 1.0)  # of the starts of a candidate, in turn; the suite's friction first
 EPISODES, EVALUATION_SEED = 20, 0  # of published figures
-FINAL_SEED = 2**31  # from which the finalists' starts are drawn, with the seed of the search
-FINALISTS = 7  # the best of so many last generations, and the mean of the distribution
-CYCLE, MOST_CYCLES, BONUS = 0.1, 15, 0.02  # s, of the shortest; how many count; what each is worth
-REACH = 1000.0  # search scales from the action_offset that an action may be; it never is
+FINAL_SEED = 2**31  # combined with the seed of the search for the finalists' starts
+FINALISTS = 7  # the best of this number of last generations, and the mean of the distribution
+CYCLE, MOST_CYCLES, BONUS = 0.1, 15, 0.02  # shortest duration, s; largest number; bonus for each
+REACH = 1000.0  # action scale in search scales, so large that no action is clipped
 DIGITS = 6
 
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """What became of n episodes; arrays of n rows.
+    """The results of n episodes; arrays (n,).
 
     Attributes:
-      horizon: s that each was to last.
-      upright: whether it did.
-      time: s that it lasted.
-      distance: m that the centre of mass has travelled.
-      cycles: how many were proper: forward, ended by the state machine, and not at once.
+      horizon: intended duration, s.
+      upright: whether the episode ended without a fall.
+      time: duration, s.
+      distance: distance travelled by the centre of mass, m.
+      cycles: number of complete cycles: forward, ended by the state machine, and longer than
+        `CYCLE`.
     """
 
     horizon: float
@@ -79,34 +81,34 @@ class Runs:
 
 
 class Bench:
-    """Episodes of one character, each with a gait, a noisy start and a friction of its own."""
+    """Episodes of one character, each with its own gait, noisy start and friction."""
 
     def __init__(
         self,
         character: str,
-        env_ids: int,
+        num_envs: int,
         action_offset: np.ndarray,
         terrain: str = 'flat',
         substeps: int = SUBSTEPS,
         threads: int = 1,
     ) -> None:
-        """Compiles the model and makes so many rows of it.
+        """Compiles the model and makes the simulations.
 
         Args:
           character: one with a gait.
-          env_ids: number of episodes side by side.
-          action_offset: parameters that are run without any rounding, (P,); others may lie about them.
-          terrain: what ground all run on.
+          num_envs: number of simulations.
+          action_offset: parameters at action 0, (P,), which are used without rounding.
+          terrain: of all simulations.
           substeps: physics steps per control step.
-          threads: that step the physics.
+          threads: number of threads that step the physics.
         """
         spec = EnvSpec(
             id=f'{character}/gait/{terrain}/tuning', domain='custom', task='tuning',
-            character=character, actuation='gait', terrain=terrain, rules='gait',
+            character=character, actuation='gait', terrain=terrain, task_type='gait',
             options=MappingProxyType({'start_noise': START_NOISE, 'substeps': substeps}),
             description='Gaits are measured.',
         )  # fmt: skip
-        self.environments = VectorEnvironment(spec, env_ids, threads, seed=0)
+        self.environments = VectorEnvironment(spec, num_envs, threads, seed=0)
         task = self.environments.task
         assert isinstance(task, GaitTask)
         self.task, self.gait = task, task.gait.parameters
@@ -119,10 +121,10 @@ class Bench:
     def run(
         self, vectors: np.ndarray, seeds: np.ndarray, horizon: float, friction: np.ndarray
     ) -> Runs:
-        """Runs every row until it falls or the horizon is over.
+        """Runs every simulation until a fall or the end of the horizon.
 
         Args:
-          vectors: parameters of the gait of each row, (n, P).
+          vectors: gait parameters of each simulation, (n, P).
           seeds: of the starts, (n,).
           horizon: s.
           friction: coefficient of sliding friction of ground and character, (n,).
@@ -156,7 +158,7 @@ class Bench:
 
 
 def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
-    """The parameters of a set by name, a base action by number, or action 0."""
+    """Returns the parameters of a set by name, of a base action by number, or of action 0."""
     if start is None:
         return gait.action_offset
     if start.isdecimal() and int(start) < len(gait.base_actions):
@@ -170,7 +172,7 @@ def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
 def measure(
     bench: Bench, vector: np.ndarray, frictions: Sequence[float], seed: int = EVALUATION_SEED
 ) -> Runs:
-    """Runs a gait on all rows for the longer horizon, from the same starts for each friction."""
+    """Runs a gait in all simulations for the long horizon, with the same starts per friction."""
     rows = bench.environments.num_envs
     starts = rows // len(frictions)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
@@ -183,7 +185,7 @@ def measure(
 
 
 def record(runs: Runs, target: float) -> dict[str, Any]:
-    """The figures that are published of a gait."""
+    """Returns the published figures of a gait."""
     speed = runs.speed
     return {
         'upright': f'{int(runs.upright.sum())}/{len(speed)}',
@@ -216,7 +218,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
-    """Returns the gait that was found, and a record of the search."""
+    """Returns the best gait, and a record of the search."""
     import cma
 
     (character,) = arguments.characters
@@ -300,7 +302,7 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def write(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Path:
-    """Enters a gait as set 'tuned' and as action 0; the rest of the file stays as it is."""
+    """Enters a gait as set 'tuned' and as action 0; the rest of the file is unchanged."""
     path = pathlib.Path(parameters.__file__).parent / f'{character}.json'
     text = path.read_text()
     data = json.loads(text)
@@ -327,21 +329,35 @@ def write(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Pa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('characters', nargs='*', metavar='character', help=', '.join(available()))
-    parser.add_argument('--evaluate', action='store_true', help='measure; search and write nothing')
-    parser.add_argument('--start', help='a set by name, or a base action by number; else action 0')
+    parser.add_argument(
+        '--evaluate', action='store_true', help='evaluate without a search; write nothing'
+    )
+    parser.add_argument(
+        '--start', help='name of a set, or number of a base action; default: action 0'
+    )
     parser.add_argument('--friction', type=float, nargs='+', help='of ground and character')
-    parser.add_argument('--substeps', type=int, default=SUBSTEPS, help='physics, of 1/600 s')
+    parser.add_argument(
+        '--substeps', type=int, default=SUBSTEPS, help='physics steps per control step of 1/600 s'
+    )
     parser.add_argument('--threads', type=int, default=1)
     measuring = parser.add_argument_group('measuring')
     measuring.add_argument('--terrain', nargs='+', default=['flat'])
     measuring.add_argument('--episodes', type=int, default=EPISODES)
     searching = parser.add_argument_group('searching')
     searching.add_argument('--seed', type=int, default=1)
-    searching.add_argument('--sd', type=float, default=0.35, help='in search scales, at first')
-    searching.add_argument('--population', type=int, default=16)
-    searching.add_argument('--starts', type=int, default=3, help='noisy ones for each candidate')
     searching.add_argument(
-        '--generations', type=int, nargs=2, default=[25, 10], help='for 6 s and for 20 s'
+        '--sd', type=float, default=0.35, help='initial standard deviation, in search scales'
+    )
+    searching.add_argument('--population', type=int, default=16)
+    searching.add_argument(
+        '--starts', type=int, default=3, help='number of noisy starts for each candidate'
+    )
+    searching.add_argument(
+        '--generations',
+        type=int,
+        nargs=2,
+        default=[25, 10],
+        help='numbers of generations for 6 s and for 20 s',
     )
     searching.add_argument(
         '--separable', action=argparse.BooleanOptionalAction, default=True,
@@ -358,7 +374,7 @@ def main() -> None:
         return evaluate(arguments)
     arguments.friction = arguments.friction or FRICTIONS
     if len(arguments.characters) != 1:
-        parser.error('a search is of one character')
+        parser.error('a search requires exactly one character')
     vector, log = search(arguments)
     print(json.dumps(log))
     print(write(arguments.characters[0], vector, log))

@@ -173,7 +173,7 @@ class GuideTest(parameterized.TestCase):
     )
     def test_ways_that_it_does_not_know(self, id_, options):
         environments = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
-        with self.assertRaisesRegex(ValueError, 'the expert knows no way for the task'):
+        with self.assertRaisesRegex(ValueError, 'the expert does not support the task'):
             expert.expert(environments)
 
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')

@@ -1,4 +1,4 @@
-"""Measures clips in space on their characters with MuJoCo: seam, limits, ground, feet, dynamics."""
+"""Measures three-dimensional clips with MuJoCo: seam, limits, ground, feet, dynamics."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def measure(clip: motion.Clip, character: str, samples: int = checks.SAMPLES) ->
 
 @dataclasses.dataclass(frozen=True)
 class Forces:
-    """What the ground would have to do, from inverse dynamics; arrays over samples.
+    """The ground reaction from inverse dynamics; arrays over samples.
 
     Attributes:
       force: on the body over its weight, (n, 3).
@@ -205,7 +205,7 @@ class Forces:
 
     @property
     def friction(self) -> np.ndarray:
-        """Horizontal over vertical force where there is a vertical one, (n,)."""
+        """Ratio of horizontal to vertical force where the vertical force is not 0, (n,)."""
         loaded = self.force[self.force[:, 2] > 0.1]
         return np.hypot(loaded[:, 0], loaded[:, 1]) / loaded[:, 2]
 

@@ -1,9 +1,9 @@
-"""The dog's bound: its gait machine recorded in MuJoCo, then the feet set down without sliding.
+"""The dog's bound: a recording of its gait state machine in MuJoCo, corrected for sliding feet.
 
-The gait machine is the original's, with its default figures: four states, stable PD control,
-gravity compensation through the feet on the ground, and forces pushed into the ground. The cycle
-is the median of many; the recording overruns two joint limits and slips a little, so each leg is
-then solved again for a foot that rolls without slipping, within the limits.
+The state machine is that of the original, with its default parameters: four states, stable PD
+control, gravity compensation through the feet on the ground, and forces on the body. The clip is
+the recorded cycle that closes best. The recording exceeds two joint limits and slips slightly, so
+each leg is solved again for a foot that rolls without slipping, within the limits.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ TAIL = JOINTS[8:12]
 
 
 class Recorder:
-    """The dog on a plane under its gait machine; `step` advances one control step."""
+    """The dog on a plane, driven by its gait state machine; `step` advances one control step."""
 
     def __init__(self) -> None:
         self.model = model = figure.model('dog', ground=True)
@@ -198,9 +198,9 @@ def record() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def cycle(poses: np.ndarray, contacts: np.ndarray, starts: np.ndarray):
-    """Returns the cycle that closes best, closed: the seam gap is spread evenly over it.
+    """Returns the cycle that closes best; its end is adjusted to its start evenly over the cycle.
 
-    The bound alternates long and short cycles, and a mean of unlike contacts touches nowhere.
+    Long and short cycles alternate, and the mean of cycles with different contacts has no contacts.
 
     Returns:
       Poses (PHASES, 3 + joints) with x relative to a steady advance, contacts (PHASES, 2), the
@@ -255,14 +255,14 @@ def set_down(joint: np.ndarray, pitch: np.ndarray, on: np.ndarray, advance: floa
     standing = np.stack([x - x.mean() + path[at, 0].mean(), -sole[at, lowest, 1]], axis=1)
     result = path.copy()
     result[at] = standing
-    # Before and after, the change fades, and does so at a rate that lets the foot arrive at rest.
+    # Before and after, the change fades such that the foot lands at rest.
     u = np.arange(1, BLEND + 1)[:, None] / BLEND
     for edge, inner, way in ((0, 1, -1), (-1, -2, 1)):
         near = at[edge] + way * np.arange(1, BLEND + 1)
         change = standing[edge] - path[at[edge]]
         rate = standing[edge] - standing[inner] - (path[near[0]] - path[at[edge]])
         result[near] += (change * (1 + 2 * u) + BLEND * rate * u) * (1 - u) ** 2
-    # The stance may reach over the seam: gather what belongs to each phase.
+    # The stance may extend over the seam, so changes are collected by phase.
     changed = (result - path).reshape(3, n, 2)
     return joint + changed.sum(axis=0)
 
@@ -313,15 +313,16 @@ def clip() -> Clip:
     phase = np.arange(PHASES + 1) / PHASES
     poses[:, 0] += advance * phase[:-1]
     tail = [3 + JOINTS.index(name) for name in TAIL]
-    # The tail touches nothing in simulation and dips into the ground: let it swing about its
-    # working posture instead of the recorded mean, which hangs lower.
+    # The tail has no contacts in simulation and dips into the ground; it swings about its working
+    # posture instead of the recorded mean, which is lower.
     poses[:, tail] += TARGET[tail[0] - 3 : tail[-1] - 2] - poses[:, tail].mean(axis=0)
     for leg, foot in ((HIND, 0), (FRONT, 1)):
         joint, pitch = make.joints(poses)
         index = 1 + JOINTS.index(leg[-1])
         on = stance(touching[:, foot])
         path = set_down(joint[:, index], pitch[:, index], on, advance)
-        # Firm from the blend before the stance to the one after it, easing off as long again.
+        # Full weight from the blend before the stance to the one after it, then fading over that
+        # length.
         n, middle = PHASES, (on[0] + on[-1]) / 2
         away = np.abs((np.arange(n) - middle + n / 2) % n - n / 2) - len(on) / 2
         grip = np.clip(2 - away / BLEND, 0, 1) ** 4

@@ -1,4 +1,4 @@
-"""A figure in space read from xml/: rotations, kinematics of the tree, and inverse kinematics.
+"""A 3D figure read from xml/: rotations, kinematics of the tree, and inverse kinematics.
 
 Rotations are matrices, arrays (..., 3, 3). A ball joint's angles are pitch about (0, -1, 0), yaw
 about z and roll about x, in rad, with R = P(pitch) Y(yaw) X(roll); pelvis and torso are prescribed
@@ -41,8 +41,8 @@ JOINTS: Mapping[str, Mapping[str, int]] = {  # name -> columns, in link order
     'biped3d_mocap_run': LEGS,
     'biped3d_full_mocap': LEGS | ARMS,
 }
-# Limits of pitch, yaw and roll by the last part of the joint's name, rad. The files of xml/ know
-# only the cone about a ball joint that holds them.
+# Limits of pitch, yaw and roll by the last part of the joint's name, rad. The files of xml/ contain
+# only the cone of a ball joint that includes them.
 LIMITS: Mapping[str, tuple[float, float, float]] = {
     'torso': (1.0, 1.0, 0.5),
     'hip': (2.57, 1.0, 1.2),
@@ -204,13 +204,13 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
-    """What the generators find: arrays over n samples.
+    """Results of the generators: arrays over n samples.
 
     Attributes:
       root: position, m, (n, 3).
       pelvis: its rotation, (n, 3, 3).
       joints: rotations (n, 3, 3) in the parent's frame, and angles (n,) rad of hinges; others 0.
-      reach: what right and left leg are asked for, as a share of their length, (n, 2).
+      reach: required reach of right and left leg, as a share of their length, (n, 2).
     """
 
     root: np.ndarray
@@ -236,12 +236,12 @@ def figure(name: str) -> Figure:
 
 
 def smooth(u: np.ndarray) -> np.ndarray:
-    """Returns the smoothest way from 0 to 1 that starts and ends at rest."""
+    """Returns the smoothest curve from 0 to 1 that starts and ends at rest."""
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
 def rolled(angle: np.ndarray, corner: float) -> np.ndarray:
-    """Returns the ankle's way (forward, up) as the foot pitches about a corner of its sole, m."""
+    """Returns the ankle's path (forward, up) as the foot pitches about a corner of its sole, m."""
     height = FOOT[2]
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack(
@@ -250,7 +250,7 @@ def rolled(angle: np.ndarray, corner: float) -> np.ndarray:
 
 
 def soft_reach(wanted: np.ndarray) -> np.ndarray:
-    """Returns the reach of a leg, a share of its length, for what it is asked for."""
+    """Returns the reach of a leg, as a share of its length, for a required reach."""
     soft, end = SOFT
     bent = soft + (end - soft) * np.tanh((wanted - soft) / (end - soft))
     return np.where(wanted > soft, bent, wanted)
@@ -261,13 +261,14 @@ def leg(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solves a leg of two segments for its ankle.
 
-    The leg never stretches fully, so the ankle stays short of a place that is too far.
+    The leg never stretches fully, so the ankle does not reach a position that is too far away.
 
     Args:
       lengths: of thigh and shank, m.
       hip: joint position, m, (n, 3).
       ankle: joint position, m, (n, 3).
-      hinge: horizontal direction of the knee's axis, as the yaw of the way it bends to, rad, (n,).
+      hinge: horizontal direction of the knee's axis, as the yaw of its bending direction, rad,
+        (n,).
 
     Returns:
       The thigh's rotation in the world (n, 3, 3), the knee's angle, rad (n,), and the reach the leg
@@ -290,7 +291,7 @@ def leg(
 
 
 def features(made: Figure, bodies: Bodies, turn: float) -> np.ndarray:
-    """Returns the features of a step at its start, its own landing being the plan, (7,)."""
+    """Returns the features of a step at its start, with its own landing as the plan, (7,)."""
     position, _ = made.forward(bodies)
     right, left = (
         position[:, 1 + made.layout.joints.index(f'{side}_ankle'), :2] for side in ('right', 'left')

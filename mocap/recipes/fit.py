@@ -1,9 +1,9 @@
-"""Finds the figures of a run by least squares: python mocap/recipes/fit.py biped2d_run.
+"""Fits the parameters of a run by least squares: python mocap/recipes/fit.py biped2d_run.
 
-The residuals ask for joint curves like textbook gait, for feet that clear the ground, and for
-inverse dynamics that a body can follow: nothing but gravity in flight, and in stance a force that
-passes through the foot. Weights are by trial; starting figures matter: each run starts from a
-slower or coarser one in `STARTS` and reaches its pace in stages.
+The residuals measure deviations from textbook joint curves, feet below the ground, and inverse
+dynamics that are not feasible: only gravity acts in flight, and in stance the ground force passes
+through the foot. Weights were found by trial. The result depends on the start: each run starts from
+a slower or coarser one in `STARTS` and reaches its speed in stages.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LOW = 0.003  # m; a corner lower than this carries force
 HIP = {0: 38, 10: 34, 20: 18, 37: -9, 50: 10, 65: 42, 78: 52, 90: 45}
 KNEE = {0: -15, 14: -42, 26: -32, 37: -16, 50: -62, 65: -104, 72: -98, 82: -62, 92: -20}
 ANKLE = {0: 5, 17: 22, 28: 8, 38: -21, 50: -6, 65: 7, 85: 5}
-# The raptor's hint of a style: Fourier series of the gait machine's run, rad.
+# Weak reference of the raptor: Fourier series of the run of its gait state machine, rad.
 RAPTOR = (
     (0.0365, 0.4445, -0.9995, -0.0007, -0.1801, -0.0886, 0.0428, -0.0270, 0.0487),
     (-1.4468, 0.0747, 1.4903, 0.1043, -0.2070, -0.0212, -0.0474, 0.1016, 0.0068),
@@ -83,7 +83,7 @@ QUICKER = {
     'raptor_run_050': {'rise': 2.0, 'lift': 0.14},
     'raptor_run_066': {'rise': 2.0, 'lift': 0.14},
 }
-NARROWER = {  # taste: shorter stances and more lean cost less but look and land harder
+NARROWER = {  # chosen by hand: shorter stances and more lean have lower costs, but harder landings
     'biped2d': {'ds': (0.26, 0.36), 'lean': (-0.14, 0.1)},
     'raptor': {'ds': (0.21, 0.36)},
 }
@@ -158,7 +158,7 @@ def dynamics(made: run.Build, poses: np.ndarray, period: float, speed: float):
 
 
 def residuals(guess: run.Run, physics: float) -> np.ndarray:
-    """Returns what is to be squared and summed; `physics` weighs the inverse dynamics."""
+    """Returns the residuals; `physics` is the weight of the inverse dynamics."""
     made, p = run.build(guess.character), guess.shape
     raptor = 'toe' in made.leg
     phase = (np.arange(SAMPLES) + 0.5) / SAMPLES

@@ -1,7 +1,7 @@
-"""Finds the figures of a run in space by least squares: python mocap/recipes/fit3d.py [name ...].
+"""Fits the parameters of a 3D run by least squares: python mocap/recipes/fit3d.py [name ...].
 
-The residuals are those of `fit.py`, in space: joint curves like textbook running, feet that clear
-the ground, nothing but gravity in flight, and in stance a force that passes through the foot.
+The residuals are those of `fit.py`, in three dimensions: joint curves like textbook running, feet
+clear of the ground, only gravity in flight, and in stance a force that passes through the foot.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def dynamics(made: run.Run, bodies: figure3d.Bodies) -> Dynamics:
 
 
 def residuals(guess: run.Run, physics: float) -> np.ndarray:
-    """Returns what is to be squared and summed; `physics` weighs the inverse dynamics."""
+    """Returns the residuals; `physics` is the weight of the inverse dynamics."""
     p = guess.shape
     phase = (np.arange(fit.SAMPLES) + 0.5) / fit.SAMPLES
     bodies = run3d.bodies(guess, phase, passes=2)

@@ -1,4 +1,4 @@
-"""Makes every clip of mocap/ anew, or those named: python mocap/recipes/make.py [name ...]."""
+"""Makes all planar clips of mocap/, or the named ones: python mocap/recipes/make.py [name ...]."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the clips and step libraries in space anew, or those named: python make3d.py [name ...]."""
+"""Makes all 3D clips and step libraries, or the named ones: python make3d.py [name ...]."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RECIPES = (step3d, run3d)
 
 
 def clips() -> list[motion.Clip]:
-    """Returns all clips in space."""
+    """Returns all three-dimensional clips."""
     return [clip for recipe in RECIPES for clip in recipe.clips()]
 
 
@@ -27,7 +27,7 @@ def libraries() -> list[motion.Steps]:
 
 
 def describe(found: checks3d.Report) -> str:
-    """Returns what was measured as a line."""
+    """Returns the measurements as one line of text."""
     return (
         f'{found.speed:.4g} m/s ({found.speeds[0]:.2f} to {found.speeds[1]:.2f}), '
         f'root {found.heights[0]:.3f} to {found.heights[1]:.3f} m, '

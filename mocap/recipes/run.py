@@ -1,8 +1,8 @@
 """Runs of the bipeds and the raptor: feet and centre of mass prescribed, joints by leg kinematics.
 
 In stance a foot rolls over heel and toe of a fixed foothold, so it can neither slide nor sink; the
-centre of mass falls freely in flight; both repeat exactly. What is left free, about twenty figures
-per clip, is a row of `RUNS`, found by `fit.py`.
+centre of mass falls freely in flight; both repeat exactly. About twenty free parameters per clip
+are in `RUNS`, as fitted by `fit.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PASSES = 8  # fixed-point passes that place the pelvis under the prescribed cent
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """What the generator must know of a character.
+    """The data of a character that the generator needs.
 
     Attributes:
       figure: its tree and masses.
@@ -46,20 +46,20 @@ class Build:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One clip: the character, the pace, and the figures that shape it.
+    """One clip: the character, period and speed, and shape parameters.
 
     Attributes:
       character: name of its file in xml/.
       period: of the full cycle, s.
       speed: mean, m/s.
-      shape: figures by name. Times are shares of the cycle (ds: stance), of the stance (ff, ho:
+      shape: parameters by name. Times are shares of the cycle (ds: stance), of the stance (ff, ho:
         foot flat, heel off) or of the swing (sa, sb). th0, tto, ta, tb: foot pitch at landing,
         take-off, sa and sb, rad; r0, rto: its rates, rad/s. qa, qb: accelerations with which the
-        swing starts and ends, strides per swing time squared; lift: m, lsk: its skew, rise: its power (the
-        lower, the quicker the foot leaves and meets the ground). ax: braking
-        and push-off, m/s2; z: height of the centre of mass at landing, m; xl: foothold ahead of it,
-        m. lean, pc2 ... ps4: pelvis pitch, mean and harmonics, rad. b0 ... b4: metatarsus pitch of
-        the raptor at 0, ds/2, ds, and a third and two thirds of the swing, rad.
+        swing starts and ends, strides per swing time squared; lift: m, lsk: its skew, rise: its
+        power (the lower, the quicker the foot leaves and meets the ground). ax: braking and
+        push-off, m/s2; z: height of the centre of mass at landing, m; xl: foothold ahead of it, m.
+        lean, pc2 ... ps4: pelvis pitch, mean and harmonics, rad. b0 ... b4: metatarsus pitch of the
+        raptor at 0, ds/2, ds, and a third and two thirds of the swing, rad.
     """
 
     character: str
@@ -91,7 +91,7 @@ RAPTOR = (
 
 
 def build(character: str) -> Build:
-    """Returns what the generator must know of a character."""
+    """Returns the data of a character that the generator needs."""
     biped_foot, biped_soft = (0.1403, -0.0367, 0.0474), (0.99, 0.9996)
     if character == 'biped2d':
         joints, leg, still, mirrored = BIPED, BIPED_LEG, {}, {}
@@ -189,7 +189,7 @@ def foot(run: Run, foot_box: tuple[float, float, float], phase: np.ndarray):
 
 
 def leg_angles(run: Run, make: Build, hip: np.ndarray, pelvis: np.ndarray, phase: np.ndarray):
-    """Returns the joint angles (n, joints) of the right leg and the reach (n,) it is asked for."""
+    """Returns the joint angles (n, joints) of the right leg and its required reach (n,)."""
     p, names = run.shape, make.leg
     path, pitch, _ = foot(run, make.foot, phase)
     links = [make.figure.length(f'right_{name}') for name in names]
@@ -255,7 +255,7 @@ SHAPE = {
 
 
 def shape(**groups: tuple[float, ...]) -> dict[str, float]:
-    """Returns figures by name from tuples in the order of `SHAPE`."""
+    """Returns parameters by name from tuples in the order of `SHAPE`."""
     return {
         name: value
         for group, values in groups.items()

@@ -1,7 +1,7 @@
-"""Runs in space: feet and centre of mass as in `run.py`, and a pelvis that turns.
+"""Three-dimensional runs: feet and centre of mass as in `run.py`, and a pelvis that turns.
 
-The feet run on two lines and turn out a little; the pelvis turns, drops and sways with the legs,
-and the torso turns against it. What is left free is a row of `RUNS`, found by `fit3d.py`.
+The feet move on two lines and turn out slightly; the pelvis turns, drops and sways with the legs,
+and the torso turns against it. The free parameters are in `RUNS`, as fitted by `fit3d.py`.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ import run
 from trl_suite import motion
 
 PASSES = 8  # fixed-point passes that place the pelvis under the prescribed centre of mass
-LINE = 0.075  # m, feet beside the middle
+LINE = 0.075  # m, lateral distance of the feet from the middle
 TOE_OUT = 0.06  # rad
-# Figures beside those of `run.Run`. rot, list, sway: amplitudes of the pelvis's yaw and roll, rad,
-# and of its way sideways, m; rph, lph, sph: their phases; tyaw: turn of the torso in the world per
-# turn of the pelvis the other way; tlean: its mean pitch there, rad; it nods with the pelvis.
+# Parameters besides those of `run.Run`. rot, list, sway: amplitudes of the pelvis's yaw and roll,
+# rad, and of its lateral displacement, m; rph, lph, sph: their phases; tyaw: turn of the torso in
+# the world per turn of the pelvis the other way; tlean: its mean pitch there, rad; it nods with the
+# pelvis.
 SPACE = ('rot', 'rph', 'list', 'lph', 'sway', 'sph', 'tyaw', 'tlean')
 
 
 def shape(space: tuple[float, ...], **groups: tuple[float, ...]) -> dict[str, float]:
-    """Returns figures by name from tuples in the order of `SPACE` and `run.SHAPE`."""
+    """Returns parameters by name from tuples in the order of `SPACE` and `run.SHAPE`."""
     return {**run.shape(**groups), **dict(zip(SPACE, space, strict=True))}
 
 
@@ -62,7 +63,7 @@ def bodies(made: run.Run, phase: np.ndarray, passes: int = PASSES) -> figure3d.B
 
 
 def foot(made: run.Run, phase: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns path (n, 3) and pitch (n,) of a right foot that rolls the way it faces, rad (n,)."""
+    """Returns path (n, 3) and pitch (n,) of a right foot that rolls along its yaw, rad (n,)."""
     path, tilt, tau = run.foot(made, figure3d.FOOT, phase)
     flat = phase % 1 < made.shape['ff'] * made.shape['ds']
     to_heel = np.where(np.isnan(tau), flat, figure3d.smooth(np.nan_to_num(tau)))
@@ -148,7 +149,7 @@ def library() -> motion.Steps:
     phase = np.linspace(0, 0.5, round(STEP_RATE * made.period / 2) + 1)
     found = bodies(made, phase)
     table = body.poses(found)
-    table[:, :2] += -made.shape['xl'], LINE  # the stance foot's flat place is the origin
+    table[:, :2] += -made.shape['xl'], LINE  # the position of the flat stance foot is the origin
     label = (made.speed * made.period / 2, 2 * LINE, 0.0)
     return motion.Steps(
         name=made.character,

@@ -1,10 +1,11 @@
-"""Walks and single steps in space: feet and pelvis prescribed, joints by leg kinematics.
+"""Three-dimensional walks and steps: feet and pelvis prescribed, joints by leg kinematics.
 
-A step is where the swing foot lands relative to the stance foot - forward and outwards, along the
-heading at the start - and by how much the heading changes, towards the swing side. A clip is one
-step after another: it starts in right stance the moment both feet are down and ends when the left
-foot lands. The pose and its rates with both feet down follow from the step that ends there alone,
-so steps of any length, width and turn chain without a jump, left steps being mirrored right ones.
+A step is defined by the landing position of the swing foot relative to the stance foot, forward and
+outwards with respect to the heading at the start, and by the change of heading towards the swing
+side. A clip is a step that follows another one: it starts in right stance when both feet are on the
+ground and ends when the left foot lands. Pose and rates with both feet on the ground depend only on
+the step that ends there, so steps of any length, width and turn can be chained continuously; left
+steps are mirrored right ones.
 """
 
 from __future__ import annotations
@@ -20,13 +21,11 @@ from scipy import interpolate
 from trl_suite import motion
 
 STEP = 0.5  # s
-REFERENCE = 0.65  # m, the step length that the figures of `SHAPES` are for
+REFERENCE = 0.65  # m, the step length to which the parameters of `SHAPES` refer
 LIST, ROTATION, TOE_OUT = 0.07, 0.10, 0.08  # rad: pelvis dropped and turned, feet turned out
 LEAN, TORSO_LEAN, COUNTER = -0.05, -0.02, 1.0  # rad, rad, counter-turn of the torso per pelvis's
 CLEARANCE = 0.12  # m, by which the swing foot passes the stance foot
-SPARE = (
-    0.0025  # m the stance foot may stay off its place; where the leg is shorter, the pelvis sinks
-)
+SPARE = 0.0025  # m, largest error of the stance foot; if the leg is shorter, the pelvis sinks
 PASSES = 4  # in which it does
 RATE = 120  # frames per second of a walk
 STEP_RATE = 60  # frames per second of a library
@@ -41,7 +40,7 @@ class Step:
     turn: float = 0.0
 
 
-# Figures that shape a step, found by a least-squares fit (mocap/README.md says how it was posed).
+# Shape parameters of a step from a least-squares fit (mocap/README.md describes the criteria).
 # Both feet down: kap, speed forward, in steps per step time; c, sideways, m/s per m of width; xoff,
 # pelvis ahead of the middle of the feet, m; phl, pht, knee flexion of lead and trail leg, rad; vzn,
 # speed upwards, m/s. Mid-stance: sm, share of the step; phm, knee flexion; vm, speed upwards; azs,
@@ -72,18 +71,18 @@ SHAPES: Mapping[str, Mapping[str, float]] = {
 
 
 def bump(u: np.ndarray) -> np.ndarray:
-    """Returns 0 to 1 and back to 0."""
+    """Returns a curve from 0 to 1 and back to 0."""
     return (4 * u * (1 - u)) ** 3
 
 
 def late_bump(u: np.ndarray) -> np.ndarray:
-    """Returns the same with its top at 0.7."""
+    """Returns the same curve with its maximum at 0.7."""
     return (u / 0.7) ** 7 * ((1 - u) / 0.3) ** 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Node:
-    """The moment both feet are down: root and its rates, as the step that ends there sets them."""
+    """Root pose and rates with both feet on the ground, determined by the step that ends there."""
 
     xy: np.ndarray
     velocity: np.ndarray
@@ -130,9 +129,9 @@ def node(
 def step(
     made: figure3d.Figure, p: Mapping[str, float], previous: Step, this: Step, u: np.ndarray
 ) -> figure3d.Bodies:
-    """Returns a step in right stance over shares `u` of its time, (n,).
+    """Returns a step in right stance at shares `u` of its duration, (n,).
 
-    The stance foot's place is the origin; the heading is along x at the start.
+    The stance foot is at the origin; the heading is along x at the start.
     """
     right = np.zeros(2)
     cos, sin = np.cos(previous.turn), np.sin(previous.turn)
@@ -194,7 +193,7 @@ def step(
 
 
 def _stance(p, start: Node, end: Node, u):
-    """Returns the flat place (n, 3), pitch (n,) and the roll's shift (n, 2) of the stance foot."""
+    """Returns flat position (n, 3), pitch (n,) and rolling shift (n, 2) of the stance foot."""
     toe, heel, sole = figure3d.FOOT
     sff, sho = p['sff'], p['sho']
     landing = quintic(u / sff, p['ths'] * start.size, p['rhs'] * start.size, 0, 0, 0, 0, sff * STEP)
@@ -208,13 +207,13 @@ def _stance(p, start: Node, end: Node, u):
 
 
 def _travel(p, u):
-    """Returns the share of its way that the swing foot has gone: up before it goes, down after."""
+    """Returns the share of the path covered by the swing foot, with the lift before and after."""
     w = np.clip((u - p['sto'] - 0.03) / (1 - p['sto'] - 0.07), 0, 1)
     return (p['p'] - 1) * figure3d.smooth(w) + (2 - p['p']) * (3 * w**2 - 2 * w**3)
 
 
 def _swing(p, start: Node, end: Node, trail, land, u):
-    """Returns the path (n, 3), pitch (n,) and the roll's shift (n, 2) of the swing foot."""
+    """Returns path (n, 3), pitch (n,) and rolling shift (n, 2) of the swing foot."""
     toe, heel, sole = figure3d.FOOT
     size = (start.size + end.size) / 2
     tilt = interpolate.make_interp_spline(

@@ -1,4 +1,4 @@
-"""Draws a clip as a film strip: python mocap/recipes/strip.py NAME OUT.png (wants MUJOCO_GL)."""
+"""Draws a clip as a film strip: python mocap/recipes/strip.py NAME OUT.png (needs MUJOCO_GL)."""
 
 from __future__ import annotations
 

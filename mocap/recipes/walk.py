@@ -1,7 +1,7 @@
 """The planar walk: joint-angle curves as Fourier series, with arms for the biped that has them.
 
-The coefficients are the outcome of a least-squares fit that keeps the feet on the ground and still
-in stance while it stays close to textbook gait curves (mocap/README.md says how it was posed).
+The coefficients are the result of a least-squares fit that keeps the feet on the ground and at rest
+in stance, close to textbook gait curves (mocap/README.md describes the criteria).
 Series are a0, a1, b1, a2, b2, ... over the phase from right heel strike; the left leg is half a
 cycle later.
 """
@@ -57,7 +57,7 @@ def leg(phase: np.ndarray) -> np.ndarray:
 
 
 def arms(phase: np.ndarray) -> np.ndarray:
-    """Returns shoulders, forearms and neck in the order of `ARMS`: a made-up counter-swing."""
+    """Returns shoulders, forearms and neck in the order of `ARMS`: a counter-swing."""
     swing = 0.40 * np.cos(2 * np.pi * phase)
     bend = 0.15 * np.cos(2 * np.pi * phase - 0.3)
     neck = np.full_like(phase, 0.10)
