@@ -1,4 +1,4 @@
-"""Files that appear under their names when they are complete, never before."""
+"""Checks of paths, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Path = str | os.PathLike[str]
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
-    """Returns a path that can be written, so that nobody waits for a file that cannot be.
+    """Returns the path of a file to be written; checks it before a long computation starts.
 
     Raises:
-      ValueError: the suffix is none of the given ones.
+      ValueError: the suffix is not one of `suffixes`.
       OSError: the folder does not exist, or the path is a folder.
     """
     path = pathlib.Path(path)
@@ -30,11 +30,11 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
 
 
 def existing(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
-    """Returns a path that can be read.
+    """Returns the path of an existing file.
 
     Raises:
-      ValueError: the suffix is none of the given ones.
-      FileNotFoundError: there is no such file; the message has those with similar names beside it.
+      ValueError: the suffix is not one of `suffixes`.
+      FileNotFoundError: there is no such file; the message has similar names in the same folder.
     """
     path = pathlib.Path(path)
     _check_suffix(path, suffixes)
@@ -55,7 +55,7 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary path beside `path` that takes its place once all went well."""
+    """Yields a temporary path in the same folder; the file replaces `path` if nothing is raised."""
     part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
     try:
         yield part
@@ -65,7 +65,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def write_json(content: Any, path: pathlib.Path) -> None:
-    """Writes a .json file, readable by people too.
+    """Writes an indented .json file.
 
     Raises:
       ValueError: the content has a number that is not finite.
