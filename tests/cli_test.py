@@ -306,7 +306,7 @@ class InfoTest(CommandTest):
             'rigid tendons': 'muscle',
             'angles to the parent link': 'PD targets of a dog or raptor',
             'exactly vertical': 'terrain',
-            'the clip is our own': 'clip',
+            'the clip was made for this suite': 'clip',
             'MuJoCo at 300 Hz': 'imitation',
             'MuJoCo at 600 Hz': 'finer',
             'Bullet at 1200 Hz': 'coarse',
