@@ -91,8 +91,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
         config = config_type.of(spec.id, merged, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
-            f'{spec.task}: the actuation model is {spec.actuation!r}; expected '
-            f'{" or ".join(map(repr, type_.actuations or ()))}'
+            f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
+            f'{spec.actuation}'
         )
     parts = _parts(spec, type_)
     if type_ is not None:
