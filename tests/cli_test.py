@@ -275,10 +275,10 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
         self.assertRegex(out, r'\n  upright +0\.2  1\n')
         self.assertRegex(
-            out, r'\nStart\n  up to 12 m from the origin .* nothing stands or moves\s+within 1 m'
+            out, r'\nStart\n  up to 12 m from the origin .* no obstacle or belt\s+within\s+1 m'
         )
         self.assertRegex(
-            out, r'\nGoal\n  drawn up to 12 m .* nothing stands or moves\s+within 0\.25 m;\s'
+            out, r'\nGoal\n  drawn up to 12 m .* no obstacle or belt\s+within\s+0\.25 m;\s'
         )
         self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
         self.assertRegex(out, r'one of root, torso touches the ground in 4\s+samples')
@@ -287,8 +287,8 @@ class InfoTest(CommandTest):
         out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
         self.assertIn('Observation: 116 numbers', out)
         self.assertRegex(out, r'\n  ball +107 +116 +9 ')
-        self.assertRegex(out, r'as seen from the ball')
-        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg is put 0\.7 to 10 m from')
+        self.assertRegex(out, r'distance of the goal from the ball')
+        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg is placed 0\.7 to 10 m from')
         for name, weight in (
             ('approach', '0.1667'), ('near', '0.1667'), ('dribble', '0.3333'), ('goal', '0.3333'),
         ):  # fmt: skip
