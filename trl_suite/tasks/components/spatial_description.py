@@ -35,7 +35,7 @@ BLOCKS: Meanings = {
     'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
     'reference': (
         'm, m/s',
-        "the clip's root height; its link centres from its root; their velocities",
+        'root height, link centres from the root, and velocities of link centres of the reference',
     ),
     'goal': (
         'rad, m',
