@@ -281,7 +281,7 @@ class InfoTest(CommandTest):
             out, r'\nGoal\n  drawn up to 12 m .* no obstacle or belt\s+within\s+0\.25 m;\s'
         )
         self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
-        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+samples')
+        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+consecutive\s+samples')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
         out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
@@ -301,7 +301,7 @@ class InfoTest(CommandTest):
 
     def test_only_the_differences_that_apply(self):
         differences = {
-            'not in the registry': 'completion',
+            'not registered in the original': 'completion',
             'the terrain is inferred': 'mixed_humanoid',
             'rigid tendons': 'muscle',
             'angles to the parent link': 'PD targets of a dog or raptor',
@@ -321,26 +321,26 @@ class InfoTest(CommandTest):
             'rotation vectors': 'vectors',
             'ahead on the line along': 'straight on',
             'walks at 1.535 m/s': '3D walk',
-            '27 of them': 'steps',
+            '27 reference steps': 'steps',
             'option max_landing_error': 'footsteps',
             'half a cycle of the walk': 'in the plane',
             'observations and actions are mirrored': 'mirrored',
             'slower than the steps': 'run',
             'ankles of 0.03': 'run',
-            'captured, 4.4 m/s': 'run',
+            'from motion capture, 4.4 m/s': 'run',
             'a goal is redrawn': 'goal',
-            'the later one counts': 'blocks',
-            'inertia of 10^6 kg': 'moving',
+            'placed later counts': 'blocks',
+            'armature of 10^6 kg': 'moving',
             'belt is one box': 'belts',
             'treads': 'stairs',
             'whole footstep': 'high',
-            'controller is inside': 'high',
-            'over the whole step': 'high',
-            'cut after 200 s': 'high',
+            'controller is part of the environment': 'high',
+            'for the whole step': 'high',
+            'truncated after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
-            'heights of its pillars': 'forest',
-            'a goal is reached or its time': 'goal_navigation',
-            'times of ball and goal': 'soccer',
+            'including the pillars': 'forest',
+            'a goal is reached or has expired': 'goal_navigation',
+            'ball and goal have expired': 'soccer',
         }
         tracking = {'clip', 'imitation', 'short'}
         walking = {'space', 'vectors', 'straight on', 'clip', '3D walk', 'imitation', 'short'}
@@ -389,7 +389,7 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'goal_navigation', 'completion'}),
         ):
             with self.subTest(id_):
-                out = self.output('info', id_).split('\nDiffers')[1]
+                out = self.output('info', id_).split('\nDifferences')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
     def test_unknown(self):
@@ -551,7 +551,7 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('the task PlanarImitation has no scripted policy; goal navigation and soccer have', GAPS, '--policy',
+        ('the task PlanarImitation has no scripted policy; goal_navigation and soccer have one', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('no such file', GAPS, '--policy', 'none.npz'),
