@@ -178,12 +178,13 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
         self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = action_offset', out)
         self.assertRegex(
-            out, r'\n  BackForceX +378.3 +432.7  N +push of the hind foot on the body, ahead'
+            out,
+            r'\n  BackForceX +378.3 +432.7  N +forward virtual force of the hind foot on the body',
         )
         self.assertRegex(
             out, r'\n  Cv +\S+ +\S+  rad s/m +times the forward speed: added to Hip and Sh'
         )
-        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +a target\n')
+        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +joint target\n')
         self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
         self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
         self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+samples')
@@ -205,8 +206,8 @@ class InfoTest(CommandTest):
         self.assertRegex(
             out, r'\n  leg +0.2 +-0.2 to 0.2 m +180 N +1000 N/m +20 N s/m +its parent\n'
         )
-        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +a target\n')
-        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +a target\n')
+        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +joint target\n')
+        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +joint target\n')
         self.assertRegex(out, r'\n  MagicGain +0.8405 +0.162  1 +of the torque that keeps the root')
         self.assertIn('\n  exp(-0.5 (v - 3)^2)\n', out)
         self.assertNotIn('share of the time', out)
@@ -222,7 +223,7 @@ class InfoTest(CommandTest):
         ):  # fmt: skip
             self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start} ')
         self.assertRegex(out, r'\n  left_ankle +50 +57 +99 +105\n')
-        self.assertRegex(out, r'\n +115 +118 +3  m +first landing place from the left foot')
+        self.assertRegex(out, r'\n +115 +118 +3  m +first landing place relative to the left foot')
         self.assertRegex(out, r'\n +124 +125 +1  rad +planned heading')
         self.assertIn(
             'Action: 17 numbers in [-1, 1]; target rotation vector in rad = action_offset', out

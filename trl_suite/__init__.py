@@ -31,7 +31,8 @@ __all__ = ['suite', *_FROM_SUITE]
 
 
 def __getattr__(name: str) -> Any:
-    # Imported on first use: `import trl_suite` stays fast, and terrain and motion do not import MuJoCo.
+    # Imported on first use: `import trl_suite` stays fast, and terrain and motion do not import
+    # MuJoCo.
     if name in _FROM_SUITE:
         return getattr(importlib.import_module('trl_suite.suite'), name)
     if name == 'suite':

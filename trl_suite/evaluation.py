@@ -41,10 +41,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Runs complete episodes of an environment; returns statistics and the result of each episode.
 
-    Episode i is seeded with the i-th number of `numpy.random.SeedSequence(seed)`: it equals the first
-    episode of `suite.make(id, {'random': result['seeds'][i]})`, for any number of episodes and
-    threads, if the policy computes each action from that simulation's observation alone (a `Policy`
-    does).
+    Episode i is seeded with the i-th number of `numpy.random.SeedSequence(seed)`: it equals the
+    first episode of `suite.make(id, {'random': result['seeds'][i]})`, for any number of episodes
+    and threads, if the policy computes each action from that simulation's observation alone (a
+    `Policy` does).
 
     Args:
       environment: id, alias, or `EnvSpec`.
@@ -63,11 +63,12 @@ def evaluate(
       'step_limit'. Summary: 'return' (mean),
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
       standard errors; None for a single episode), 'normalized_return' (mean return over the step
-      limit; the reward of a step is at most 1), 'completion_rate' (share of episodes that last until
-      the step limit), 'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its 95 %
-      confidence interval from `BOOTSTRAP` bootstrap samples of the episodes, [m, m], since distances
-      are far from normally distributed; None for a single episode), 'median_distance' (m), 'speed'
-      (total distance over total time, m/s), 'falls' and 'diverged' (shares of episodes).
+      limit; the reward of a step is at most 1), 'completion_rate' (share of episodes that last
+      until the step limit), 'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its
+      95 % confidence interval from `BOOTSTRAP` bootstrap samples of the episodes, [m, m], since
+      distances are far from normally distributed; None for a single episode), 'median_distance'
+      (m), 'speed' (total distance over total time, m/s), 'falls' and 'diverged' (shares of
+      episodes).
       Lists, one entry per episode: 'seeds', 'returns', 'lengths', 'distances', 'fell'.
 
     Raises:

@@ -6,9 +6,10 @@
     result = sequences.run(sequence, learner, budget=200_000, path='result.json')
     print(sequences.forgetting(result['scores']))
 
-A learner is trained on the environments one after the other and is scored on all of them after each.
-All environments of a sequence have the same observation and action spaces, so that one network fits
-all of them. For multi-task learning, train on `sequence.ids` in any order and call `scores`.
+A learner is trained on the environments one after the other and is scored on all of them after
+each. All environments of a sequence have the same observation and action spaces, so that one
+network fits all of them. For multi-task learning, train on `sequence.ids` in any order and call
+`scores`.
 
 Seeds below 2**31 are for training, the others, below 2**32, for tests: `train_seeds` and
 `test_seeds` never overlap. The 128-bit seed of an episode's terrain is drawn from the random stream
@@ -156,7 +157,7 @@ def backward_transfer(scores: ArrayLike) -> float:
 
 
 def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
-    """Effect of earlier tasks on the score of a task not yet learnt (Lopez-Paz & Ranzato 2017, FWT).
+    """Effect of earlier tasks on a task not yet learnt (Lopez-Paz & Ranzato 2017, FWT).
 
     The mean over j > 0 of R[j-1, j] - initial[j].
 

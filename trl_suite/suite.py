@@ -123,8 +123,8 @@ def combine(
         foot; in three dimensions 'goal_navigation' or 'soccer' (with a footstep controller), or
         'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
         needs neither clip nor controller. Or a custom `TaskType`; or a class or function that is
-        called as task(character, arena, actuation_model=...), with clip=... if one is given, and with
-        the task's options as keyword arguments, and returns a `Task`.
+        called as task(character, arena, actuation_model=...), with clip=... if one is given, and
+        with the task's options as keyword arguments, and returns a `Task`.
       clip: the reference motion. For imitation: name of a clip, path of an .npz, or a `Clip`; for
         footsteps in three dimensions: name or path of a library of steps, or a `Steps`. By default
         the character's own. The tasks 'gait' and 'walk' have no reference motion.

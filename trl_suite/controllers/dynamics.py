@@ -1,6 +1,7 @@
 """The equations of motion of a planar character, in compiled functions of one simulation.
 
-For stable PD, gravity compensation and virtual forces: joint-space inertia, Jacobians, world angles,
+For stable PD, gravity compensation and virtual forces: joint-space inertia, Jacobians, world
+angles,
 velocity of the centre of mass. Degrees of freedom are in link order: x, z, pitch, then the joints;
 positive pitch is nose up.
 """
@@ -24,8 +25,8 @@ class Skeleton(NamedTuple):
     Attributes:
       qpos, dof: addresses in qpos and in qvel, (D,).
       joint: joint ids, (D,).
-      entry: index of each entry of the inertia matrix among those that MuJoCo stores, -1 where it is
-        always zero, (D, D).
+      entry: index of each entry of the inertia matrix among those that MuJoCo stores, -1 where it
+        is always zero, (D, D).
       body: id of the body that it moves, (D,).
       subtree_mass: mass of this body and its descendants, (D,) kg.
       moves: whether it rotates a body, (B, D) bool.
@@ -94,7 +95,7 @@ def skeleton(character: Character, world: World) -> Skeleton:
 
 
 def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the linear map from degrees of freedom to world angles without the joints' own angles.
+    """Returns the linear map from degrees of freedom to world angles, less the joints' own angles.
 
     Args:
       joints: numbers of joints in link order, (k,).
@@ -164,7 +165,8 @@ def write_jacobian(
 ) -> None:  # fmt: skip
     """Writes d(x, z) / d(degrees of freedom) of a point of a body to two rows of out[i], (., D).
 
-    The rows are `env_id` and the next one. The columns of slides other than those of the root are 0.
+    The rows are `env_id` and the next one. The columns of slides other than those of the root are
+    0.
     """
     for k in range(len(skeleton.dof)):
         joint, moves = skeleton.joint[k], skeleton.moves[body, k]

@@ -59,7 +59,8 @@ class Gait:
           gait: parameters; by default those for the character's name.
 
         Raises:
-          ValueError: there is no gait for this character, or it lacks a joint or a foot of the gait.
+          ValueError: there is no gait for this character, or it lacks a joint or a foot of the
+            gait.
         """
         self.character = character
         self.parameters = gait = gait or parameters.load(character.spec.name)
@@ -134,7 +135,7 @@ class Gait:
         return packed(self.rules)
 
     def _places(self, legs: np.ndarray) -> np.ndarray:
-        """Returns the parameter of a state that is the target of each joint; see `Machine.place`."""
+        """Returns `Machine.place`, the parameter of a state for the target of each joint."""
         gait = self.parameters
         own = [name.split('.')[-1] for name in gait.names[gait.misc :]]
         place = np.full((2, len(self.number)), -1)
@@ -180,7 +181,7 @@ class Gait:
         return self.rules.scratch.torque[env_ids]
 
     def advance(self, env_ids: np.ndarray) -> np.ndarray:
-        """Advances state machines after a control step; returns whether cycles have ended, (m,) bool.
+        """Advances machines after a control step; returns whether cycles have ended, (m,) bool.
 
         A machine whose cycle has ended stays in its last state until `apply`.
         """

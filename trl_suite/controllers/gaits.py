@@ -1,7 +1,7 @@
 """The gaits: the bound of dog and goat, the stride of raptor and biped, the hopper's hop.
 
-Compiled functions of simulation i; sources: see `trl_suite.controllers.machine`. The balance feedback
-of the stride follows Yin, Loken, van de Panne (2007).
+Compiled functions of simulation i; sources: see `trl_suite.controllers.machine`. The balance
+feedback of the stride follows Yin, Loken, van de Panne (2007).
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def bound_torques(i: int, gait: GaitRules) -> None:
         stand(i, gait)
         if machine.holds_weight:
             add_weight(i, gait)
-        # A force on the body is the opposite force on the ground, by the hind or fore foot per state.
+        # A force on the body is the opposite force on the ground, by the hind or fore foot per
+        # state.
         leg = 0 if state.number[i] < 2 else 1
         ahead, up = state.vector[i, 2 + 2 * leg], state.vector[i, 3 + 2 * leg]
         support = gait.scratch.support
@@ -109,8 +110,8 @@ def add_weight(i: int, gait: GaitRules) -> None:
         scratch.torque[i, joint] += -weight(i, k, skeleton, com, anchors) - carried
 
 
-# Stride: one step per cycle; stance and swing leg are then exchanged. States: contact, down, passing,
-# up. Parameters: TransTime, Cv, Cd; the first parameter of a state is the root's pitch.
+# Stride: one step per cycle; stance and swing leg are then exchanged. States: contact, down,
+# passing, up. Parameters: TransTime, Cv, Cd; the first parameter of a state is the root's pitch.
 
 
 @compiled
@@ -123,7 +124,7 @@ def stride_ends(i: int, gait: GaitRules) -> bool:
 
 @compiled
 def stride_torques(i: int, gait: GaitRules) -> None:
-    """Writes torques: stable PD, balance feedback on the swing hip, root pitch by the stance hip."""
+    """Writes torques: stable PD, balance feedback by the swing hip, root pitch by the stance hip."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     skeleton, physics = gait.skeleton, gait.physics
     stance = state.stance[i]
@@ -145,7 +146,8 @@ def stride_torques(i: int, gait: GaitRules) -> None:
     limit(i, gait)
 
 
-# Hop. States: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter: MagicGain.
+# Hop. States: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter:
+# MagicGain.
 DESCENT, DOWN, UP, ASCENT = range(STATES)
 
 

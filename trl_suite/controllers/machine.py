@@ -1,7 +1,8 @@
 """Common parts of all gaits: state machines that control a planar character by stable PD.
 
-A cycle has four states; each ends after a time or at a contact. On entry to a state its joint targets
-are set; feedback adjusts some of them in every control step. Compiled functions of simulation i.
+A cycle has four states; each ends after a time or at a contact. On entry to a state its joint
+targets are set; feedback adjusts some of them in every control step. Compiled functions of
+simulation i.
 
 Source: the controllers of Terrain RL Simulator (2018), of Peng, Berseth, van de Panne (2016); stable
 PD after Tan, Liu, Turk (2011).

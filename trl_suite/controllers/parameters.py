@@ -4,12 +4,12 @@ One JSON file per character:
 
     kind                     'bound', 'stride' or 'hop', see `trl_suite.controllers.gaits`; the
                              meaning of the first parameters depends on it
-    legs                     joints of each leg, the hip first: for a bound the hind leg and the fore
-                             leg, down to the joint of the foot, for a stride right and left
+    legs                     joints of each leg, the hip first: for a bound the hind leg and the
+                             fore leg, down to the joint of the foot, for a stride right and left
     feet                     links that touch the ground, one for each leg
     misc, state_parameters   names; a vector is [misc..., those of state 0, those of state 1, ...]
-    targets                  parameter of a state -> joints whose target it is; for a stride, in right
-                             stance
+    targets                  parameter of a state -> joints whose target it is; for a stride, in
+                             right stance
     states                   names, in their order in a cycle
     fixed                    parameters that actions do not set
     absolute                 parameters of which the absolute value is used
@@ -77,7 +77,8 @@ class Parameters:
       forward_only: whether moving backwards is a fall.
       backward_reward: whether the reward of a cycle with negative speed can be positive.
       reward: weights of the reward terms, by name.
-      observe_pitch: whether pitch and its rate are observed instead of z of the last link and its rate.
+      observe_pitch: whether pitch and its rate are observed instead of z of the last link and its
+        rate.
     """
 
     character: str
@@ -111,7 +112,7 @@ class Parameters:
         return vectors
 
     def action(self, vector: np.ndarray) -> np.ndarray:
-        """Returns actions (..., a) for parameters (..., P), of which those that are fixed are ignored."""
+        """Returns actions (..., a) for parameters (..., P); fixed parameters are ignored."""
         return (vector - self.action_offset)[..., self.actions] / self.action_scale[self.actions]
 
     def place(self, name: str) -> int:

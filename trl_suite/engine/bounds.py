@@ -1,9 +1,10 @@
 """Bounding volumes, used by collision detection, of the geoms of static bodies.
 
 After writing `geom_pos`, `geom_size` or `geom_quat` one must call `mj_setConst`, otherwise other
-bodies fall through these geoms. For geoms of bodies without joints, it only changes their bounds, the
-bounding volume hierarchies of their bodies, and the flags of coinciding frames (`geom_sameframe`);
-but it also recomputes all inertias, which takes most of its time. `refresh` writes only these bounds.
+bodies fall through these geoms. For geoms of bodies without joints, it only changes their bounds,
+the bounding volume hierarchies of their bodies, and the flags of coinciding frames
+(`geom_sameframe`); but it also recomputes all inertias, which takes most of its time. `refresh`
+writes only these bounds.
 
 Source: MuJoCo 3.17, `mj_setConst`; tests compare all numbers of the two.
 """
@@ -56,8 +57,8 @@ def geoms(model: mujoco.MjModel) -> Geoms:
 def refresh(body: int, geoms: Geoms) -> None:
     """Updates the bounds of the geoms of a body.
 
-    The body and its ancestors must have no joints. Its geoms must be boxes, planes or height fields;
-    the sizes of planes and height fields must be unchanged.
+    The body and its ancestors must have no joints. Its geoms must be boxes, planes or height
+    fields; the sizes of planes and height fields must be unchanged.
     """
     first = geoms.body_geomadr[body]
     for geom in range(first, first + geoms.body_geomnum[body]):

@@ -1,8 +1,8 @@
 """n simulations as arrays: the complete interface between tasks and physics.
 
 Every array of a `World` has a leading axis of n simulations. Tasks access the engine only through
-these arrays and a few methods, so that one implementation of a task works for the single environment
-(n = 1, over one `dm_control` Physics) and for a batch.
+these arrays and a few methods, so that one implementation of a task works for the single
+environment (n = 1, over one `dm_control` Physics) and for a batch.
 """
 
 from __future__ import annotations

@@ -22,11 +22,11 @@ class Environment(composer.Environment):
     """`composer.Environment` with all substeps of a control step in one call.
 
     Differences from composer: substeps run in C (`before_substep` and `after_substep` hooks are
-    rejected), observation blocks bypass the observation updater, divergence ends the episode instead
-    of raising an exception, and the full state can be saved and restored.
+    rejected), observation blocks bypass the observation updater, divergence ends the episode
+    instead of raising an exception, and the full state can be saved and restored.
 
-    As usual in dm_env, `TimeStep.discount` of the last step is 0 if the task failed and 1 if the step
-    or time limit ended the episode.
+    As usual in dm_env, `TimeStep.discount` of the last step is 0 if the task failed and 1 if the
+    step or time limit ended the episode.
     """
 
     _task: Task
@@ -72,7 +72,8 @@ class Environment(composer.Environment):
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
         )
-        # The constructor has compiled the model; composer would compile it again at the first reset.
+        # The constructor has compiled the model; composer would compile it again at the first
+        # reset.
         self._mjcf_never_compiled = False
         self._parts = tuple(task.blocks.items())
         # Whether an entity or the user has hooks around a step; calling none of them saves time.

@@ -36,8 +36,8 @@ class Step(NamedTuple):
       reward: (n,).
       terminated: whether the episode failed, (n,) bool.
       truncated: whether the step or time limit ended the episode, (n,) bool.
-      info: arrays (n, ...) by name: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), ...; with
-        autoreset 'same_step' also 'ended' and, if an episode ended, 'final_observation'.
+      info: arrays (n, ...) by name: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), ...;
+        with autoreset 'same_step' also 'ended' and, if an episode ended, 'final_observation'.
     """
 
     observation: Any
@@ -51,11 +51,11 @@ class VectorEnvironment:
     """n simulations of one environment.
 
     `autoreset` has the modes of Gymnasium 1. With 'next_step', a simulation whose episode has ended
-    ignores its action in the next step and returns the first observation of a new episode with reward
-    0. With 'same_step', it is reset in the step in which its episode ended: the observation is the
-    first of the new episode, and the last one of the old episode is in `info['final_observation']`.
-    With 'disabled', the caller resets simulations; stepping a simulation whose episode has ended
-    raises an exception.
+    ignores its action in the next step and returns the first observation of a new episode with
+    reward 0. With 'same_step', it is reset in the step in which its episode ended: the observation
+    is the first of the new episode, and the last one of the old episode is in
+    `info['final_observation']`. With 'disabled', the caller resets simulations; stepping a
+    simulation whose episode has ended raises an exception.
 
     Attributes:
       num_envs: number of simulations n.
@@ -92,8 +92,8 @@ class VectorEnvironment:
           flat_observation: return observations as one array instead of a dict of blocks.
           step_limit: control steps after which an episode is truncated; by default (-1) that of the
             `EnvSpec`; None for no limit.
-          task_kwargs: as for `suite.load`, including `time_limit` (s) and `step_limit`, which overrides
-            the argument above; not `random`, for which the argument `seed` is used.
+          task_kwargs: as for `suite.load`, including `time_limit` (s) and `step_limit`, which
+            overrides the argument above; not `random`, for which the argument `seed` is used.
 
         Raises:
           ValueError: unknown names or options, or numbers out of range.
@@ -172,8 +172,8 @@ class VectorEnvironment:
 
         Args:
           env_ids: numbers of simulations, or a mask (n,) bool; None for all.
-          seed: reseeds these simulations first: one seed for all n simulations or n seeds, as for the
-            constructor.
+          seed: reseeds these simulations first: one seed for all n simulations or n seeds, as for
+            the constructor.
 
         Returns:
           The observations of all simulations.
@@ -194,7 +194,8 @@ class VectorEnvironment:
         Args:
           action: (n, k), clipped to [-1, 1].
           env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others are not
-            stepped: their reward and its terms are 0, and their other entries of `info` are those of
+            stepped: their reward and its terms are 0, and their other entries of `info` are those
+              of
             their last step.
 
         Raises:
@@ -341,7 +342,7 @@ class VectorEnvironment:
     def copy_from(
         self, other: VectorEnvironment, other_rows: Sequence[int], env_ids: Sequence[int]
     ) -> None:
-        """Copies the state of simulations of another environment, e.g. to evaluate candidate actions.
+        """Copies the state of simulations of another environment, e.g. to try actions.
 
         Random streams and seeds are not copied: the copies evolve identically until a random number
         is drawn from these streams.

@@ -66,8 +66,8 @@ class PlanarMeasurement(NamedTuple):
       facing: 1, or -1 while the trunk points backwards, (n,).
       under: height of the ground under the root, (n,) m.
       height: height of the root above the ground, (n,) m.
-      effectors: end effectors: all x relative to the centre of mass, or to the root, then all z above
-        the ground, (n, 2 * E) m.
+      effectors: end effectors: all x relative to the centre of mass, or to the root, then all z
+        above the ground, (n, 2 * E) m.
       com_velocity: velocity of the centre of mass, (n, 2) m/s.
       leaving: whether the character has left its ground window, which must then be moved, (n,).
       waiting: whether ground outside the window must be drawn before the measurement, (n,).
@@ -298,11 +298,11 @@ class PlanarFigure:
 
         Args:
           env_ids: numbers of simulations, which are reset.
-          poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); x and z
-            are overwritten with those of the placement.
+          poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); x and
+            z are overwritten with those of the placement.
           rates: velocities, (m, 3 + J).
-          extents: extents of the collision geoms in these poses, relative to the root, (m, 3, G); see
-            `trl_suite.kinematics.planar_reference.link_extents`.
+          extents: extents of the collision geoms in these poses, relative to the root, (m, 3, G);
+            see `trl_suite.kinematics.planar_reference.link_extents`.
         """
         world = self._world
         world.reset(env_ids)

@@ -42,16 +42,16 @@ def feature(phase: float, column: int, clip: ClipTable) -> float:
 class Reference:
     """Kinematics of a looping planar clip, tabulated over the phase.
 
-    Features of one phase, all independent of the ground and of the distance travelled; see `columns`:
-      angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
-      effectors (2 * E,) end effectors: all x relative to the centre of mass, or to the root, then all
-        z above 0, m;
+    Features of one phase, all independent of the ground and of the distance travelled; see
+      `columns`: angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
+      effectors (2 * E,) end effectors: all x relative to the centre of mass, or to the root, then
+        all z above 0, m;
       com_velocity (2,) m/s; height of the root, m;
       positions (2 * links,) link centres relative to the root, x and z alternating, m;
       velocities (2 * links,) of the link centres, m/s;
       root_rate (2,) velocity of the root in x and z, m/s;
-      extents (3 * G,) of the collision geoms: x of centres relative to the root, half lengths in x, z
-        of lowest points relative to the root, m;
+      extents (3 * G,) of the collision geoms: x of centres relative to the root, half lengths in x,
+        z of lowest points relative to the root, m;
       phase; quarter (bins,) one-hot of the part of the cycle.
     """
 

@@ -82,8 +82,8 @@ class SpatialMeasurement(NamedTuple):
       fallen: whether a fall link touches the ground, (n,).
       pose: height of the root above the ground, then for each link the position of its centre from
         the root (3) and its orientation (4), w not negative, in the heading frame, (n, 7L + 1).
-      velocity: for each link the velocity of its centre relative to the ground under the root (3) and
-        its angular velocity (3), in the heading frame, (n, 6L).
+      velocity: for each link the velocity of its centre relative to the ground under the root (3)
+        and its angular velocity (3), in the heading frame, (n, 6L).
       features: features to compare with a reference, (n, F); see `feature_columns`.
     """
 
@@ -118,11 +118,11 @@ def measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
 def feature_columns(body: SpatialBody) -> dict[str, slice]:
     """Returns name -> columns of the features of a character.
 
-    `rotations`: quaternions of the root without its heading and of the ball joints; `angles`: of the
-    hinges, rad; `rates`: of the root in the heading frame and of all joints, rad/s; `effectors`: end
-    effector positions in the heading frame, x and y from the centre of mass or the root (see
-    `SpatialBody.about_com`), z above the ground, m; `com_velocity`: in world axes, m/s; `height`: of
-    the root above the ground, m.
+    `rotations`: quaternions of the root without its heading and of the ball joints; `angles`: of
+    the hinges, rad; `rates`: of the root in the heading frame and of all joints, rad/s;
+    `effectors`: end effector positions in the heading frame, x and y from the centre of mass or the
+    root (see `SpatialBody.about_com`), z above the ground, m; `com_velocity`: in world axes, m/s;
+    `height`: of the root above the ground, m.
     """
     sizes = {
         'rotations': 4 + len(body.balls), 'angles': len(body.hinges),
@@ -315,7 +315,7 @@ def put_down(
     i: int, env_id: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
     measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
-    """Places the character of simulation i on the ground, from row `env_id` of poses, rates, spawns.
+    """Places the character of simulation i, from row `env_id` of poses, rates and spawns.
 
     See `SpatialFigure.place`.
     """
@@ -486,11 +486,13 @@ class SpatialFigure:
     ) -> None:
         """Places the characters of some simulations on the ground.
 
-        Each is raised until the corners of all its bounding boxes are above the ground; never lowered.
+        Each is raised until the corners of all its bounding boxes are above the ground; never
+        lowered.
 
         Args:
           env_ids: numbers of simulations whose physics has been reset.
-          poses: free root, with z above the ground, then joints in link order, (m, columns of a pose).
+          poses: free root, with z above the ground, then joints in link order, (m, columns of a
+            pose).
           rates: velocities, (m, columns of a velocity).
           spawns: displacement x, y (m) and rotation about z (rad) of these poses, (m, 3).
         """

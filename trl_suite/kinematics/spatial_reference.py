@@ -48,7 +48,7 @@ class TrackTable(NamedTuple):
 
 @compiled_inline
 def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
-    """Returns the row of the table at a fraction in [0, 1] of a track, and the remainder in [0, 1]."""
+    """Returns the row of the table for a fraction in [0, 1] of a track, and the remainder."""
     u = share * tracks.samples
     sample = min(max(math.floor(u), 0.0), tracks.samples - 1.0)
     return int(sample) + track * (tracks.samples + 1), u - sample
@@ -81,8 +81,8 @@ class SpatialReference:
         Args:
           body: ids of the character.
           model: its compiled model.
-          poses: poses of each track at evenly spaced times, including its end, (tracks, samples + 1,
-            columns of a pose).
+          poses: poses of each track at evenly spaced times, including its end, (tracks, samples +
+            1, columns of a pose).
           rates: velocities, (tracks, samples + 1, columns of a velocity).
         """
         count, samples = poses.shape[0], poses.shape[1] - 1
@@ -119,7 +119,7 @@ class SpatialReference:
 
     @classmethod
     def of_steps(cls, steps: Steps, body: SpatialBody, model: mujoco.MjModel) -> SpatialReference:
-        """Returns a reference with a library's k steps in right stance, then the k mirrored ones."""
+        """Returns a reference with a library's k steps in right stance, then their mirror images."""
         times = np.linspace(0, steps.duration, STEP_SAMPLES + 1)
         index = np.tile(np.arange(len(steps)), 2)[:, None]
         mirrored = (np.arange(2 * len(steps)) >= len(steps))[:, None]

@@ -22,7 +22,7 @@ DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
 def task_type(spec: EnvSpec) -> TaskType | None:
-    """Returns the task type of an environment; None if a user's class or function makes the task."""
+    """Returns the task type of an environment; None if a custom function makes the task."""
     own = spec.own.get('task_type')
     if own is None:
         return TASK_TYPES[spec.task_type]
@@ -65,8 +65,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
     Args:
       spec: spec of the environment.
-      options: options of the task, which override those of the spec; in addition, every task has the
-        options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
+      options: options of the task, which override those of the spec; in addition, every task has
+        the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
 
     Raises:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
@@ -107,7 +107,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
 
 def _policy(source: Any) -> Any:
-    """Returns the policy shipped for an id or alias; files and other objects are returned unchanged."""
+    """Returns the policy shipped for an id or alias; other sources are returned unchanged."""
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
     return policies.reference(find(source).id)

@@ -1,4 +1,4 @@
-"""DeepLoco: footstep controllers, tasks that plan footsteps for one, and the same without hierarchy.
+"""DeepLoco: footstep controllers, tasks that plan footsteps, and these tasks without hierarchy.
 
 Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 """
@@ -51,7 +51,7 @@ _STEP2D = EnvSpec(
     terrain='flat',
     task_type='planar_footsteps',
     clip='biped2d_full_walk',
-    description='The biped with arms walks along planned footsteps, straight on over flat ground.',
+    description='The biped with arms walks straight ahead along planned footsteps on flat ground.',
     tags=frozenset({'planar', 'flat', 'completion'}),
 )
 

@@ -18,8 +18,8 @@ BY = {
 }  # fmt: skip
 
 # Phases in the air. In stance the clip brakes: its hips turn at 12 rad/s, and at the corresponding
-# shortening velocity the raptor's hip extensors produce a third of the force that braking requires, so
-# that nearly all episodes that start there fail.
+# shortening velocity the raptor's hip extensors produce a third of the force that braking requires,
+# so that nearly all episodes that start there fail.
 _FLIGHT = ((0.25, 0.5), (0.75, 1.0))
 
 

@@ -34,7 +34,8 @@ class EnvSpec:
       tags: tags by which environments can be selected.
       aliases: other ids.
       step_limit: steps after which an episode is truncated.
-      differences: differences from the original, in sentences, in addition to those of the task type.
+      differences: differences from the original, in sentences, in addition to those of the task
+        type.
       own: custom objects that replace the named 'character', 'terrain', 'clip' or 'task_type'.
     """
 

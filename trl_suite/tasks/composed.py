@@ -30,10 +30,11 @@ OPTIONS = ('rewards', 'observations', 'failures')
 class Composed(Task):
     """Another task with additional reward terms, observation blocks and failures.
 
-    Each custom function is called with this task and returns an array with one row per simulation. It
-    may read `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], and all attributes
-    of the other task, and call functions of `trl_suite.tasks.parts`. The row of a simulation must
-    depend on this simulation only, in the same way for all, and not on random numbers.
+    Each custom function is called with this task and returns an array with one row per simulation.
+    It may read `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], and all
+    attributes of the other task, and call functions of `trl_suite.tasks.parts`. The row of a
+    simulation must depend on this simulation only, in the same way for all, and not on random
+    numbers.
 
     Attributes:
       task: the other task.
@@ -54,10 +55,10 @@ class Composed(Task):
           task: any task that no other environment uses.
           rewards: name -> (weight, function); the function returns (n,). weight * value is added to
             the reward, except in steps in which the other task fails.
-          observations: name -> (size, function); the function returns (n, size), or (n,) if the size
-            is 1. These blocks follow those of the other task.
-          failures: name -> function; it returns (n,) bool. Where True, the episode ends with discount
-            0.
+          observations: name -> (size, function); the function returns (n, size), or (n,) if the
+            size is 1. These blocks follow those of the other task.
+          failures: name -> function; it returns (n,) bool. Where True, the episode ends with
+            discount 0.
 
         Raises:
           ValueError: a name that is in use, an invalid weight or size, or an object that is not a
@@ -193,7 +194,7 @@ class Composed(Task):
         return self._added(self.task.info(), lambda term: term.copy())
 
     def info_of(self, env_id: int) -> dict[str, Any]:
-        """Returns the info of one simulation of the other task, with the custom reward terms added."""
+        """Returns `info` for one simulation, as numbers."""
         return self._added(self.task.info_of(env_id), lambda term: term.item(env_id))
 
     def _added(self, found: dict[str, Any], read: Callable[[np.ndarray], Any]) -> dict[str, Any]:
@@ -215,7 +216,7 @@ class Composed(Task):
 
 
 def compose(task: Task, parts: Mapping[str, Any]) -> Task:
-    """Returns a `Composed` task with some of its keyword arguments; the task itself if they are empty.
+    """Returns a `Composed` task with these keyword arguments; the task itself if they are empty.
 
     Raises:
       ValueError: an unknown keyword, a value that is not a dict by name, or see `Composed`.

@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(n: int, size: int, terms: int = 0) -> Outcome:
-    """Allocates the outcome of n simulations, for an observation size and a number of reward terms."""
+    """Allocates the outcome of n simulations, for a size of observations and a number of terms."""
     return Outcome(
         np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
     )  # fmt: skip
@@ -130,8 +130,8 @@ class Task(composer.Task):
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
       saved: tuples of arrays (n, ...) that are the state of the task, including `outcome`.
-      info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays; updated
-        in place.
+      info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays;
+        updated in place.
     """
 
     world: World
@@ -162,7 +162,7 @@ class Task(composer.Task):
 
     @abc.abstractmethod
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        """Applies the actions of some simulations; `action` has those of all, (n, k), in [-1, 1]."""
+        """Applies the actions of some simulations; `action`: of all, (n, k), in [-1, 1]."""
 
     @abc.abstractmethod
     def finish_step(self, env_ids: np.ndarray) -> None:

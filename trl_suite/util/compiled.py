@@ -9,13 +9,13 @@
 
 A compiled function takes numbers, arrays and (named) tuples of them, and returns numbers or tuples of
 numbers. It may call other compiled functions and `math`. It must not allocate memory: Numba raises
-an error for a function that does, since reference counting is disabled (it would cost more than most
-functions, and threads would contend for the counts). It never raises: a division by zero gives
+an error for a function that does, since reference counting is disabled (it would cost more than
+most functions, and threads would contend for the counts). It never raises: a division by zero gives
 infinity or NaN, as in NumPy. Indices are not checked. It runs without the global interpreter lock.
 
-A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined in
-every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`; tuples of
-arrays are passed to them as packs, see `packed`.
+A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
+in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
+tuples of arrays are passed to them as packs, see `packed`.
 
 Numba is imported and a function is compiled when it is first called; the result is cached on disk.
 The cache is in `$NUMBA_CACHE_DIR`, or else in the user's cache folder, with one subfolder for each
@@ -74,7 +74,7 @@ class Compiled:
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
-        """The Numba dispatcher for compiled callers; the Python function if compiling is disabled."""
+        """The Numba dispatcher for compiled callers; the function itself if compiling is disabled."""
         return self._made.get(False) or self._make(False)
 
     @property
@@ -101,7 +101,8 @@ class Compiled:
         folder = cache_folder()
         if folder is None:
             return numba.njit(self.function, **options)
-        # Numba reads CACHE_DIR when a function is decorated; afterwards the user's value is restored.
+        # Numba reads CACHE_DIR when a function is decorated; afterwards the user's value is
+        # restored.
         with _setting:
             # Two folders, since Numba cannot distinguish functions with and without wrappers.
             folder = folder / ('entries' if entry else 'rows')

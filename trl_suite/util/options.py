@@ -71,8 +71,8 @@ class Config:
     """Base class of options; a subclass has a field, made by `option`, for each of them.
 
     Raises:
-      ValueError: a value of another type or out of range; the message has the name of the option and
-        what was expected.
+      ValueError: a value of another type or out of range; the message has the name of the option
+        and what was expected.
     """
 
     def __post_init__(self) -> None:

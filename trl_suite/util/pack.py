@@ -1,9 +1,10 @@
 """Named tuples of arrays and numbers that are passed to compiled functions as one pointer.
 
-Numba passes every element of a tuple as separate arguments: sixty arrays are four hundred arguments,
-which take seconds to compile for every function, and 30 us for every call from Python. A pack is the
-address of a memory block that describes the arrays as Numba does; compiled functions read from it the
-fields that they use, by the names of the tuple. The pack is read-only; the arrays may be writable.
+Numba passes every element of a tuple as separate arguments: sixty arrays are four hundred
+arguments, which take seconds to compile for every function, and 30 us for every call from Python. A
+pack is the address of a memory block that describes the arrays as Numba does; compiled functions
+read from it the fields that they use, by the names of the tuple. The pack is read-only; the arrays
+may be writable.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class Pack:
 
 
 def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
-    """Appends the block of a named tuple to `words`; returns its type, with offsets in the block."""
+    """Appends the block of a named tuple to `words`; returns its type."""
     begin, fields = len(words), []
     for name, entry in zip(value._fields, value, strict=True):
         word = len(words) - begin

@@ -1,4 +1,4 @@
-"""Folders of the suite's data files: in an installed wheel inside the package, else in the checkout."""
+"""Folders of the suite's data files: inside the package in a wheel, else in the checkout."""
 
 import importlib.resources
 import pathlib

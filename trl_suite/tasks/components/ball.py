@@ -30,7 +30,8 @@ GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
 AT_GOAL, NEAR = 0.5, 2.0  # m; distances of the ball from goal and walker for full reward
 SPEED = 1.0  # m/s; target speed of walker and ball
 SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
-# Speed of the walker towards the ball, its distance, speed of the ball towards the goal, its distance.
+# Speed of the walker towards the ball, its distance, speed of the ball towards the goal, its
+# distance.
 SOCCER_TERMS = {
     'approach': (0.2 / 1.2, SPEED_SHARPNESS), 'near': (0.2 / 1.2, BALL_SHARPNESS),
     'dribble': (0.4 / 1.2, SPEED_SHARPNESS), 'goal': (0.4 / 1.2, GOAL_SHARPNESS),
@@ -244,7 +245,7 @@ class Ball:
         return self.world.qpos[:, self.qpos[:3]]
 
     def put(self, env_id: int, place: np.ndarray, count: int, random: np.random.Generator) -> None:
-        """Places one ball, at rest, at a random displacement from a position (x, y) on level ground.
+        """Places one ball, at rest, at a random displacement from a position on level ground.
 
         Args:
           env_id: number of the simulation.

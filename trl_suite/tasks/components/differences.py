@@ -1,4 +1,4 @@
-"""Differences from the original that several task types share; docs/differences.md has the reasons."""
+"""Differences from the original that task types share; docs/differences.md has the reasons."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ OWN_CLIP = Difference(
 START_PHASE = Difference('the start phase is drawn uniformly instead of swept')
 LANDING = Difference('a landing error ends the episode only with the option max_landing_error')
 FACES = Difference(
-    'vertical faces of the terrain are exactly vertical, and the ground from -1 to 1 m is flat at every start',
+    'faces of gaps, walls and steps are exactly vertical, and every start has flat ground from -1 to 1 m',
     lambda spec: spec.terrain != 'flat',
 )
 CUT = Difference('episodes are truncated after 256 steps (discount 1)')

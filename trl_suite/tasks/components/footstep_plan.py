@@ -33,8 +33,8 @@ class FootstepPlan(NamedTuple):
       stance: stance foot, `RIGHT` or `LEFT`, (n,).
       landing: landing place of the swing foot, then of the stance foot, (n, 2, 3) m.
       heading: planned heading, (n,) rad.
-      landing_error: horizontal distance of the last foot that landed from its landing place, (n,) m; 0
-        before the first landing.
+      landing_error: horizontal distance of the last foot that landed from its landing place, (n,)
+        m; 0 before the first landing.
       heading_error: magnitude of the heading error at that time, (n,) rad.
       landed: whether a foot landed in the last step, (n,).
     """

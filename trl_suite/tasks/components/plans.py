@@ -24,8 +24,8 @@ class Plans:
     """Options for drawing plans; a plan has the next landing places of both feet and a heading.
 
     At every switch of stance, the second landing place of the old plan becomes the first of the new
-    one. The new second place is displaced from it by the length of a step along the planned heading,
-    and by its width to the side of the foot.
+    one. The new second place is displaced from it by the length of a step along the planned
+    heading, and by its width to the side of the foot.
 
     Attributes:
       length: minimum and maximum length of a step, m.

@@ -59,10 +59,10 @@ def facing(error: float) -> float:
 
 @compiled
 def wrapped(angle: float) -> float:
-    """Returns an angle in rad wrapped to [-pi, pi]; an angle in this range is returned unchanged."""
+    """Returns an angle in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
     return angle - 2 * math.pi * np.rint(angle / (2 * math.pi))
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """Returns angles in rad wrapped to [-pi, pi]; angles in this range are returned unchanged."""
+    """Returns angles in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))

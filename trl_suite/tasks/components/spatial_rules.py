@@ -91,7 +91,8 @@ class SpatialRules(NamedTuple):
     Attributes:
       ctrl: controls of the physics, (n, ...).
       period: period of the reference motion, s.
-      terrain, pose, velocity, phase: first columns of these blocks in the full observation; -1: absent.
+      terrain, pose, velocity, phase: first columns of these blocks in the full observation; -1:
+        absent.
       full: the full observation, (n, size).
       action: actions after reflection, (n, k); scratch.
       leaving: whether the walker has left its ground window, which must then be moved, (n,).

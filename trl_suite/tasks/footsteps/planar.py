@@ -112,7 +112,7 @@ def read_clock(i: int, rules: imitation_rules.Rules) -> int:
 def land(
     i: int, diverged: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> bool:  # fmt: skip
-    """At a switch of stance, writes the landing error and the next plan; returns whether it failed."""
+    """At a switch of stance, writes landing error and next plan; returns whether the step failed."""
     stance = read_clock(i, rules)
     plan.landed[i] = stance != plan.stance[i] and not diverged
     if not plan.landed[i]:
@@ -268,13 +268,13 @@ class PlanarFootsteps(PlanarImitation):
     """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip.
 
     Observation blocks, in this order (N links; heading frame as for `PlanarImitation`), N = 12: 69 numbers:
-      terrain, pose, velocity, phase: as for `PlanarImitation`; right stance while the phase is below
-        0.5.
+      terrain, pose, velocity, phase: as for `PlanarImitation`; right stance while the phase is
+        below 0.5.
       contact: whether right and left foot touch the ground; 2.
-      plan: as in three dimensions, with y = 0 in each position (x, y, z): first landing place relative
-        to the right foot, 0 in right stance, and to the left foot, 0 in left stance; second landing
-        place relative to the right foot, 0 in left stance, and to the left foot, 0 in right stance;
-        z is relative to the ground under the root; then 0 for the heading; 13.
+      plan: as in three dimensions, with y = 0 in each position (x, y, z): first landing place
+        relative to the right foot, 0 in right stance, and to the left foot, 0 in left stance;
+        second landing place relative to the right foot, 0 in left stance, and to the left foot, 0
+        in right stance; z is relative to the ground under the root; then 0 for the heading; 13.
 
     Attributes:
       plan: the footsteps; see `Plan`.
@@ -306,8 +306,8 @@ class PlanarFootsteps(PlanarImitation):
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: incompatible options, a character without two feet, or a clip that does not fit
-            it; `bind` raises it for a clip with left stance first.
+          ValueError: incompatible options, a character without two feet, or a clip that does not
+            fit it; `bind` raises it for a clip with left stance first.
         """
         check_feet(character.spec)
         super().__init__(character, arena, clip, config, actuation_model=actuation_model)
@@ -370,7 +370,7 @@ class PlanarFootsteps(PlanarImitation):
         ]
 
     def reference_pose(self, env_id: int) -> np.ndarray:
-        """Returns the reference pose, aligned with the root at the last switch: x, z, pitch, joints."""
+        """Returns the reference pose, aligned with x at the last switch: x, z, pitch, joints."""
         begun, x = self.plan.begun[env_id]
         first, pose = self.clip.pose(
             np.array([begun, self.state.cycles[env_id]]) * self.reference.period

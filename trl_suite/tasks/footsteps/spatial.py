@@ -105,11 +105,12 @@ class SpatialFootsteps(SpatialTask):
       pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Right stance below 0.5.
       contact: whether right and left foot touch the ground; 2.
-      plan: first landing place relative to the right foot, 0 in right stance, and to the left foot, 0
-        in left stance; second landing place relative to the right foot, 0 in left stance, and to the
-        left foot, 0 in right stance; (x, y, z) each, z relative to the ground under the root; then
-        the planned heading, rad to the left of the current one; 13.
-    With the option mirrored, 117 numbers: observations and actions are reflected in left stance; the
+      plan: first landing place relative to the right foot, 0 in right stance, and to the left foot,
+        0 in left stance; second landing place relative to the right foot, 0 in left stance, and to
+        the left foot, 0 in right stance; (x, y, z) each, z relative to the ground under the root;
+        then the planned heading, rad to the left of the current one; 13.
+    With the option mirrored, 117 numbers: observations and actions are reflected in left stance;
+      the
     phase is that of the single step, with the one-hot of its half (3), and the plan (7) has the
     heading first, then the first landing place relative to the swing foot, then the second relative
     to the stance foot.
@@ -135,7 +136,8 @@ class SpatialFootsteps(SpatialTask):
           character: a spatial biped without actuators; it is attached to the arena.
           arena: the arena with its terrain.
           steps: library of single steps of this character; the clock has the period of two steps.
-          config: the options; with action_offset 'clip', action 0 is the mean pose of a straight step.
+          config: the options; with action_offset 'clip', action 0 is the mean pose of a straight
+            step.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
@@ -315,7 +317,7 @@ class SpatialFootsteps(SpatialTask):
         return places
 
     def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
-        """Sets planned headings from places (m, 2) to the goals, unless these are within NEAR_GOAL."""
+        """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
         way = self.goal[env_ids, :2] - places
         headings = np.arctan2(way[:, 1], way[:, 0])
         far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
@@ -408,7 +410,7 @@ class SpatialFootsteps(SpatialTask):
     def _put_reference(
         self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
     ) -> None:
-        """Aligns the reference with position and heading of the characters, for the chosen steps."""
+        """Aligns the chosen steps with position and heading of the characters."""
         self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
         columns = self.reference.columns
         now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
@@ -464,7 +466,7 @@ def straight_step(steps: Steps, length: float) -> int:
 
 
 def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses with x = y = 0, and rates, at phases (m,) of a cycle of this step and its mirror."""
+    """Returns poses with x = y = 0, and rates, at phases (m,) of a step and its mirror image."""
     times = (2 * phase - np.floor(2 * phase)) * steps.duration
     poses, rates = (
         part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)

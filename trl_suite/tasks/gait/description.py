@@ -49,7 +49,7 @@ _EFFECTS = {
     'FrontForceX': 'forward virtual force of the fore foot on the body, in FrontStance and Gather',
     'FrontForceY': 'upward virtual force of the fore foot on the body, in FrontStance and Gather',
     'SpineCurve': 'target of every joint of the spine',
-    'Cd': 'gain from the displacement of the centre of mass ahead of the stance foot to SwingHip, in Passing and Up',
+    'Cd': 'gain from the distance of the centre of mass ahead of the stance foot to SwingHip, in Passing and Up',
     'RootPitch': 'target of the root pitch, controlled by the hip of a stance foot on the ground',
     'MagicGain': 'factor of the hip torque that keeps the root upright on the ground',
 }

@@ -47,7 +47,8 @@ PATIENCE, PROGRESS = (
 )  # s, m; an episode fails if the root moves less than this in this time
 MAX_JOINT_SPEED = 1000.0  # rad/s; high, since these joints have no damping
 
-# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 * stumbling time fraction).
+# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 * stumbling time
+# fraction).
 SPEED_SHARPNESS, STUMBLE_SHARPNESS = 0.5, 10.0
 TERMS = ('speed', 'stumble')
 SPEED, STUMBLE = range(len(TERMS))

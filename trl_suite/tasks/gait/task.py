@@ -1,8 +1,8 @@
 """The TerrainRL family: an action sets the parameters of a gait, once per cycle.
 
 A step of the environment is one gait cycle: it ends with the cycle, with a fall within it, or after
-`LONGEST_CYCLE`. To discount by time, use gamma ** (`info['duration']` / unit of time) for a step; the
-environment's discount is 0 after a fall and 1 otherwise.
+`LONGEST_CYCLE`. To discount by time, use gamma ** (`info['duration']` / unit of time) for a step;
+the environment's discount is 0 after a fall and 1 otherwise.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class GaitTask(Task):
     """A planar character travels at a target speed; actions set the parameters of its gait.
 
     Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
-    relative to the ground under it, m; 'pose', height of the root above the ground and (x, z) of every
-    other link relative to the root, m; 'velocity', (x, z) of every link, m/s. For bipeds the stance
-    leg comes first, then the swing leg. For the hopper, z of the last link is replaced by the root's
-    pitch in 'pose' and by its rate in 'velocity'.
+    relative to the ground under it, m; 'pose', height of the root above the ground and (x, z) of
+    every other link relative to the root, m; 'velocity', (x, z) of every link, m/s. For bipeds the
+    stance leg comes first, then the swing leg. For the hopper, z of the last link is replaced by
+    the root's pitch in 'pose' and by its rate in 'velocity'.
 
     Attributes:
       gait: the state machines.

@@ -250,7 +250,8 @@ class PlanarImitation(Task):
             drawn = random_state.random_sample()
             phases[k] = self._start_phase(drawn)
             if self.config.spawn == 'upstream':
-                # The boundary of the original's segments: it builds them before it moves the root to 0.
+                # The boundary of the original's segments: it builds them before it moves the root
+                # to 0.
                 centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
             seed = drawn_seed(random_state)
             strip = PlanarGround(
@@ -268,7 +269,7 @@ class PlanarImitation(Task):
         self._observe(env_ids, True)
 
     def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        """Called by `reset` after the characters were placed; draws the initial state of a subclass."""
+        """Called by `reset` after the characters were placed; for subclasses."""
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if apply_actions(env_ids, action, self._pack):

@@ -85,7 +85,8 @@ class Rules(NamedTuple):
       ctrl: controls of the physics, (n, ...).
       weights: weights of pitch and joints in the errors of pose and velocity, (1 + J,).
       term_weights, term_scales: weights and error scales of the reward terms, (5,).
-      rest, scale: of every muscle, tendon length at which the strain is 0, and length of unit strain, m.
+      rest, scale: of every muscle, tendon length at which the strain is 0, and length of unit
+        strain, m.
     """
 
     engine: native.Engine

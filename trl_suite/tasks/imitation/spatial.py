@@ -167,8 +167,8 @@ class SpatialImitation(SpatialTask):
       goal: bearing (rad, positive to the left) and distance (m) of the point on the line through
         the start along +x that is 3 m ahead of the root. The original observes bearing and distance
         of the start instead, from which the direction +x cannot be derived.
-    Mirrored observations and actions are reflected while the phase is 0.5 or more; the block phase then
-    has the phase of the single step and the one-hot of its half.
+    Mirrored observations and actions are reflected while the phase is 0.5 or more; the block phase
+    then has the phase of the single step and the one-hot of its half.
     """
 
     TERMS = rewards.IMITATION_TERMS

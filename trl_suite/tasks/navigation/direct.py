@@ -76,11 +76,11 @@ class DirectNavigationConfig(DirectConfig):
 
 
 class DirectNavigation(SpatialTask):
-    """A spatial character imitates a clip while it walks from goal to goal, or dribbles a ball to them.
+    """A spatial character imitates a clip while it walks, or dribbles a ball, from goal to goal.
 
-    The reward is that of imitation, with the clip's velocity rotated towards the goal, and additional
-    terms for heading towards the goal and for proximity (`rewards.DIRECT_TERMS`). With a ball, half of
-    the reward has these terms, with the ball as the goal, and half is for dribbling
+    The reward is that of imitation, with the clip's velocity rotated towards the goal, and
+    additional terms for heading towards the goal and for proximity (`rewards.DIRECT_TERMS`). With a
+    ball, half of the reward has these terms, with the ball as the goal, and half is for dribbling
     (`ball.SOCCER_TERMS`).
 
     Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
@@ -197,7 +197,7 @@ class DirectNavigation(SpatialTask):
         finish_all(env_ids, self._pack)
 
     def _draw(self, env_ids: np.ndarray) -> None:
-        """Places balls and draws goals again, in simulations where they have expired or were reached."""
+        """Places balls and draws goals again, where they have expired or were reached."""
         root, count = self.figure.found.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]

@@ -149,9 +149,9 @@ class HierarchicalNavigation(SpatialTask):
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
     next, half a cycle of the footstep controller that controls the joints; the first step of an
-    episode may be shorter. A plan has the landing place of the swing foot, the next landing place of
-    the stance foot, and a heading, relative to position and heading of the root at the beginning of
-    the step.
+    episode may be shorter. A plan has the landing place of the swing foot, the next landing place
+    of the stance foot, and a heading, relative to position and heading of the root at the beginning
+    of the step.
 
     Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
       terrain: the 32 x 32 map of `Surroundings.height_map`, m, if heights are observed.
@@ -404,7 +404,7 @@ class HierarchicalNavigation(SpatialTask):
                 going = going[~self.state.over[going]]
 
     def lay(self, action: np.ndarray) -> np.ndarray:
-        """Sets the plans of simulations where a footstep begins, as the next step with these actions.
+        """Sets plans where a footstep begins, as the next step with the same actions would.
 
         With the interface 'frame', a footstep controller can thus observe a plan before it acts.
 
@@ -429,7 +429,7 @@ class HierarchicalNavigation(SpatialTask):
         finish_all(env_ids, self._pack)
 
     def _draw(self, env_ids: np.ndarray) -> None:
-        """Places balls and draws goals again, in simulations where they have expired or were reached."""
+        """Places balls and draws goals again, where they have expired or were reached."""
         root, count = self.figure.found.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]

@@ -39,8 +39,8 @@ from trl_suite.util.compiled import compiled, compiled_loop
 CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
 INTERFACES = ('plan', 'frame')
 MAPS = ('height', 'velocity')
-# A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan at
-# action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
+# A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
+# at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
 PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
@@ -123,7 +123,8 @@ class PlanningRules(NamedTuple):
 
 
 # A step of simulation i: `begin_step`; then for every control step the action of the footstep
-# controller, physics and `finish_control_step`; then `score`, the next goal if one is needed, `finish`.
+# controller, physics and `finish_control_step`; then `score`, the next goal if one is needed,
+# `finish`.
 
 
 @compiled

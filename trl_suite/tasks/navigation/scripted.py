@@ -1,7 +1,7 @@
 """Hand-written policies for the high-level tasks: a baseline, and an example of footstep plans.
 
-They walk towards the goal with limited turns, and around obstacles in the observed maps. With a ball,
-they approach it from the side opposite to its goal.
+They walk towards the goal with limited turns, and around obstacles in the observed maps. With a
+ball, they approach it from the side opposite to its goal.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Walking forward without a reference motion: for characters without a clip, and for custom tasks."""
+"""Walking without a reference motion: for characters without a clip, and for custom tasks."""
 
 from trl_suite.tasks.components import spatial_description
 from trl_suite.tasks.imitation.description import PLANAR_BLOCKS

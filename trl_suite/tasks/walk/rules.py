@@ -118,7 +118,7 @@ def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> i
 
 @compiled_loop
 def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int:
-    """Finishes steps, or only observes; returns how many are waiting for ground, see `must_wait`."""
+    """Finishes steps, or only observes; returns how many are waiting, see `must_wait`."""
     waiting = 0
     for i in env_ids:
         outcome = rules.outcome

@@ -1,4 +1,4 @@
-"""Walking forward without a reference motion: for characters without a clip, and for custom tasks."""
+"""Walking without a reference motion: for characters without a clip, and for custom tasks."""
 
 from __future__ import annotations
 
@@ -95,9 +95,11 @@ class Walk(Task):
     `WALK`, unless the option `rewards` is given; a subclass may compute one after
     `super().finish_step`.
 
-    Observation blocks, in this order: terrain (optional), pose and velocity as in `PlanarImitation` and
+    Observation blocks, in this order: terrain (optional), pose and velocity as in `PlanarImitation`
+      and
     `SpatialImitation`; for a spatial character also
-      target_heading: cosine and sine of the bearing of the target heading, the heading at the start; 2.
+      target_heading: cosine and sine of the bearing of the target heading, the heading at the
+        start; 2.
 
     Attributes:
       full_speed: speed at which the reward term `speed_ratio` is full, m/s.
