@@ -180,12 +180,13 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
         self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = action_offset', out)
         self.assertRegex(
-            out, r'\n  BackForceX +378.3 +432.7  N +push of the hind foot on the body, ahead'
+            out,
+            r'\n  BackForceX +378.3 +432.7  N +forward virtual force of the hind foot on the body',
         )
         self.assertRegex(
             out, r'\n  Cv +\S+ +\S+  rad s/m +times the forward speed: added to Hip and Sh'
         )
-        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +a target\n')
+        self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +joint target\n')
         self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
         self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
         self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+samples')
@@ -207,8 +208,8 @@ class InfoTest(CommandTest):
         self.assertRegex(
             out, r'\n  leg +0.2 +-0.2 to 0.2 m +180 N +1000 N/m +20 N s/m +its parent\n'
         )
-        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +a target\n')
-        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +a target\n')
+        self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +joint target\n')
+        self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +joint target\n')
         self.assertRegex(out, r'\n  MagicGain +0.8405 +0.162  1 +of the torque that keeps the root')
         self.assertIn('\n  exp(-0.5 (v - 3)^2)\n', out)
         self.assertNotIn('share of the time', out)
@@ -224,7 +225,7 @@ class InfoTest(CommandTest):
         ):  # fmt: skip
             self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start} ')
         self.assertRegex(out, r'\n  left_ankle +50 +57 +99 +105\n')
-        self.assertRegex(out, r'\n +115 +118 +3  m +first landing place from the left foot')
+        self.assertRegex(out, r'\n +115 +118 +3  m +first landing place relative to the left foot')
         self.assertRegex(out, r'\n +124 +125 +1  rad +planned heading')
         self.assertIn(
             'Action: 17 numbers in [-1, 1]; target rotation vector in rad = action_offset', out
@@ -277,20 +278,20 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
         self.assertRegex(out, r'\n  upright +0\.2  1\n')
         self.assertRegex(
-            out, r'\nStart\n  up to 12 m from the origin .* nothing stands or moves\s+within 1 m'
+            out, r'\nStart\n  up to 12 m from the origin .* no obstacle or belt\s+within\s+1 m'
         )
         self.assertRegex(
-            out, r'\nGoal\n  drawn up to 12 m .* nothing stands or moves\s+within 0\.25 m;\s'
+            out, r'\nGoal\n  drawn up to 12 m .* no obstacle or belt\s+within\s+0\.25 m;\s'
         )
         self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
-        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+samples')
+        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+consecutive\s+samples')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
         out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
         self.assertIn('Observation: 116 numbers', out)
         self.assertRegex(out, r'\n  ball +107 +116 +9 ')
-        self.assertRegex(out, r'as seen from the ball')
-        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg is put 0\.7 to 10 m from')
+        self.assertRegex(out, r'distance of the goal from the ball')
+        self.assertRegex(out, r'a ball of radius 0\.2 m and 0\.1 kg is placed 0\.7 to 10 m from')
         for name, weight in (
             ('approach', '0.1667'), ('near', '0.1667'), ('dribble', '0.3333'), ('goal', '0.3333'),
         ):  # fmt: skip
@@ -303,12 +304,12 @@ class InfoTest(CommandTest):
 
     def test_only_the_differences_that_apply(self):
         differences = {
-            'not in the registry': 'completion',
+            'not registered in the original': 'completion',
             'the terrain is inferred': 'mixed_humanoid',
             'rigid tendons': 'muscle',
             'angles to the parent link': 'PD targets of a dog or raptor',
             'exactly vertical': 'terrain',
-            'the clip is our own': 'clip',
+            'the clip was made for this suite': 'clip',
             'MuJoCo at 300 Hz': 'imitation',
             'MuJoCo at 600 Hz': 'finer',
             'Bullet at 1200 Hz': 'coarse',
@@ -321,28 +322,28 @@ class InfoTest(CommandTest):
             'z up': 'space',
             'one cone': 'space',
             'rotation vectors': 'vectors',
-            'straight on': 'straight on',
+            'ahead on the line along': 'straight on',
             'walks at 1.535 m/s': '3D walk',
-            '27 of them': 'steps',
+            '27 reference steps': 'steps',
             'option max_landing_error': 'footsteps',
             'half a cycle of the walk': 'in the plane',
-            'truly mirrored': 'mirrored',
+            'observations and actions are mirrored': 'mirrored',
             'slower than the steps': 'run',
             'ankles of 0.03': 'run',
-            'captured, 4.4 m/s': 'run',
-            'drawn anew': 'goal',
-            'the later one counts': 'blocks',
-            'inertia of 10^6 kg': 'moving',
+            'from motion capture, 4.4 m/s': 'run',
+            'a goal is redrawn': 'goal',
+            'placed later counts': 'blocks',
+            'armature of 10^6 kg': 'moving',
             'belt is one box': 'belts',
             'treads': 'stairs',
             'whole footstep': 'high',
-            'controller is inside': 'high',
-            'over the whole step': 'high',
-            'cut after 200 s': 'high',
+            'controller is part of the environment': 'high',
+            'for the whole step': 'high',
+            'truncated after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
-            'heights of its pillars': 'forest',
-            'a goal is reached or its time': 'goal_navigation',
-            'times of ball and goal': 'soccer',
+            'including the pillars': 'forest',
+            'a goal is reached or has expired': 'goal_navigation',
+            'ball and goal have expired': 'soccer',
         }
         tracking = {'clip', 'imitation', 'short'}
         walking = {'space', 'vectors', 'straight on', 'clip', '3D walk', 'imitation', 'short'}
@@ -391,7 +392,7 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'goal_navigation', 'completion'}),
         ):
             with self.subTest(id_):
-                out = self.output('info', id_).split('\nDiffers')[1]
+                out = self.output('info', id_).split('\nDifferences')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
     def test_unknown(self):
@@ -553,7 +554,7 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('the task PlanarImitation has no scripted policy; goal navigation and soccer have', GAPS, '--policy',
+        ('the task PlanarImitation has no scripted policy; goal_navigation and soccer have one', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('no such file', GAPS, '--policy', 'none.npz'),

@@ -226,7 +226,7 @@ class CacheTest(FolderTest):
             NUMBA_CACHE_DIR=nowhere, XDG_CACHE_HOME=nowhere, HOME=nowhere, LOCALAPPDATA=nowhere,
         )  # fmt: skip
         self.assertEqual(found, ['11.0', '20.0'])
-        self.assertEqual(warned.count('no folder for compiled code can be written'), 1)
+        self.assertEqual(warned.count('no folder for compiled code is writable'), 1)
 
     def test_numbas_setting_is_left_alone(self):
         found, _ = self.ask("""

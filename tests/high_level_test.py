@@ -792,7 +792,7 @@ class ControllerTest(FolderTest):
         environments = VectorEnvironment(PLANE, 4, 1, seed=0, task_kwargs={'controller': half})
         environments.reset()
         with self.assertRaisesRegex(
-            ValueError, 'controller half gives no finite action for simulation 2'
+            ValueError, 'controller half returns an action that is not finite for observation 2'
         ):
             environments.step(np.zeros((4, 5)))
 

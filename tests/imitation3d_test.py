@@ -609,7 +609,7 @@ class HelperTest(parameterized.TestCase):
         ({'substeps': 5}, 'substeps is 5'), ({'substeps': 10.5}, 'substeps is 10.5'),
         ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
         ({'action_scale': 0}, 'action_scale is 0'), ({'action_scale': np.inf}, 'action_scale is inf'),
-        ({'action_scale': 1.0, 'action_offset': 'original'}, 'give no action_scale'),
+        ({'action_scale': 1.0, 'action_offset': 'original'}, 'takes no action_scale'),
         ({'start_phase': 1.0}, 'start_phase is 1.0'), ({'start_phase': -0.1}, 'start_phase is -0.1'),
         ({'start_phase': np.nan}, 'start_phase is nan'),
         ({'mirrored': True, 'reference_observation': True}, 'mirrored observations need the phase'),
@@ -624,9 +624,9 @@ class HelperTest(parameterized.TestCase):
     def test_parts_that_do_not_fit(self):
         for arguments, message in (
             (('biped3d', 'torque', None, 'imitation', None, {'action_scale': 1.0}),
-             'shape position control'),
+             'options of position control'),
             (('biped3d', 'velocity', None, 'imitation', None, {'action_offset': 'posture'}),
-             'shape position control'),
+             'options of position control'),
             (('biped3d', None, None, 'imitation', 'biped2d_walk'), "'biped2d_walk'.*free root"),
             (('biped3d', None, None, 'imitation', 'biped3d_full_walk'),
              "'biped3d_full_walk'.*does not fit character 'biped3d'"),

@@ -516,7 +516,7 @@ class HelperTest(parameterized.TestCase):
         once = motion.Clip('once', clip.times, clip.poses, 'planar', clip.joints, clip.sizes)
         with self.assertRaisesRegex(ValueError, 'does not loop'):
             suite.build('biped2d', clip=once)
-        with self.assertRaisesRegex(ValueError, 'shape position control'):
+        with self.assertRaisesRegex(ValueError, 'options of position control'):
             suite.build('biped2d', 'torque', task_kwargs={'action_scale': 1.0})
 
 

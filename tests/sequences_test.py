@@ -189,7 +189,7 @@ class RunTest(parameterized.TestCase):
     def test_refusals(self):
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Counter(stop_at=1))
-        with self.assertRaisesRegex(ValueError, '1 of 3 stages, and a Counter has no load'):
+        with self.assertRaisesRegex(ValueError, '1 of 3 stages, and a Counter cannot resume'):
             self.run_short(Counter())
         with self.assertRaisesRegex(ValueError, 'another budget: 7; expected 8'):
             self.run_short(Counter(), budget=8)
@@ -198,7 +198,7 @@ class RunTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, "'.txt'"):
             self.run_short(Counter(), path=self.folder / 'result.txt')
         self.path.write_text('{"scores": 3}')
-        with self.assertRaisesRegex(ValueError, 'no result of a sequence'):
+        with self.assertRaisesRegex(ValueError, 'not a result of sequences.run'):
             self.run_short(Counter())
 
 

@@ -16,9 +16,9 @@ if (
     sys.platform == 'linux'
     and 'MUJOCO_GL' not in os.environ
     and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
-    and ctypes.util.find_library('EGL')  # without it dm_control could not even be imported
+    and ctypes.util.find_library('EGL')  # without this library, importing dm_control would fail
 ):
-    # dm_control would choose GLFW, which cannot draw without a display. This creates no context.
+    # dm_control would choose GLFW, which cannot render without a display. This creates no context.
     os.environ['MUJOCO_GL'] = 'egl'
 
 __version__ = '0.1.0'
@@ -31,7 +31,8 @@ __all__ = ['suite', *_FROM_SUITE]
 
 
 def __getattr__(name: str) -> Any:
-    # Imported on first use: `import trl_suite` stays fast, and terrain and motion need no engine.
+    # Imported on first use: `import trl_suite` stays fast, and terrain and motion do not import
+    # MuJoCo.
     if name in _FROM_SUITE:
         return getattr(importlib.import_module('trl_suite.suite'), name)
     if name == 'suite':

@@ -1,4 +1,4 @@
-"""What a policy achieves: returns, lengths and distances of many seeded episodes.
+"""Evaluates policies: returns, lengths and distances of many seeded episodes.
 
 from trl_suite import evaluation, policies
 
@@ -22,10 +22,10 @@ from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.navigation.scripted import scripted
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
-CHUNK = 256  # episodes that run side by side
+CHUNK = 256  # episodes that run in parallel
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
-BOOTSTRAP = 10_000  # resamplings
-_NORMAL_95 = 1.96  # standard errors on either side of a mean
+BOOTSTRAP = 10_000  # bootstrap samples
+_NORMAL_95 = 1.96  # half width of a 95 % confidence interval, in standard errors
 
 
 def evaluate(
@@ -39,38 +39,40 @@ def evaluate(
     factory: bool = False,
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Runs whole episodes of an environment, and tells how each went and how they went on average.
+    """Runs complete episodes of an environment; returns statistics and the result of each episode.
 
-    Episode i has the i-th number of `numpy.random.SeedSequence(seed)` as its seed: it is the first
-    episode of `suite.make(id, {'random': result['seeds'][i]})`, whatever the number of episodes and
-    threads, if the policy treats each simulation by itself (a `Policy` does).
+    Episode i is seeded with the i-th number of `numpy.random.SeedSequence(seed)`: it equals the
+    first episode of `suite.make(id, {'random': result['seeds'][i]})`, for any number of episodes
+    and threads, if the policy computes each action from that simulation's observation alone (a
+    `Policy` does).
 
     Args:
-      environment: id, alias, or row of the catalogue.
-      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and of simulations whose
-        episode has ended the action does not count.
-      episodes: how many.
-      seed: of them all; or a sequence of as many seeds as episodes.
-      num_threads: threads that step the physics; 0 takes all cores.
+      environment: id, alias, or `EnvSpec`.
+      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n may differ between calls;
+        actions of simulations whose episode has ended are ignored.
+      episodes: number of episodes.
+      seed: seed of the whole evaluation; or a sequence with one seed per episode.
+      num_threads: threads that step the physics; 0 uses all cores.
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
-      factory: `policy` is not a policy but makes one: `VectorEnvironment` -> policy. So can a
-        policy see more than observations; the values of `BASELINES` are such.
-      progress: show a bar of the steps of the longest episodes, where stderr is a terminal.
+      factory: `policy` is a function `VectorEnvironment` -> policy, so that the policy can use more
+        than observations; the values of `BASELINES` are such functions.
+      progress: show a progress bar, in steps up to the step limit, if stderr is a terminal.
 
     Returns:
-      What JSON can hold. Settings: 'id', 'episodes', 'seed' (None for a sequence),
+      A dict that can be written as JSON. Settings: 'id', 'episodes', 'seed' (None for a sequence),
       'step_limit'. Summary: 'return' (mean),
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
-      standard errors; None for a single episode), 'normalized_return' (mean return over the step limit; no
-      step has a reward above 1), 'full' (share of episodes that last until the step limit),
-      'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its 95 % confidence interval
-      by `BOOTSTRAP` resamplings of the episodes, [m, m]; None for a single episode: how far a policy
-      gets is far from normal), 'median_distance' (m), 'speed' (distance over time, m/s), 'falls' and
-      'diverged' (shares of episodes).
+      standard errors; None for a single episode), 'normalized_return' (mean return over the step
+      limit; the reward of a step is at most 1), 'completion_rate' (share of episodes that last
+      until the step limit), 'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its
+      95 % confidence interval from `BOOTSTRAP` bootstrap samples of the episodes, [m, m], since
+      distances are far from normally distributed; None for a single episode), 'median_distance'
+      (m), 'speed' (total distance over total time, m/s), 'falls' and 'diverged' (shares of
+      episodes).
       Lists, one entry per episode: 'seeds', 'returns', 'lengths', 'distances', 'fell'.
 
     Raises:
-      ValueError: unknown names or options, numbers out of range, or a `Policy` that does not fit.
+      ValueError: unknown names or options, numbers out of range, or an incompatible `Policy`.
     """
     if int(episodes) != episodes or episodes < 1:
         raise ValueError(f'episodes is {episodes}; expected a positive integer')
@@ -135,7 +137,7 @@ def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict
     n = environments.num_envs
     returns, lengths, distances, durations = np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n)
     fell, diverged, full = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
-    runs = np.ones(n, bool)  # simulations in their first episode
+    runs = np.ones(n, bool)  # simulations whose episode has not ended
     observation = environments.reset()
     while runs.any():
         observation, reward, terminated, truncated, info = environments.step(
@@ -170,17 +172,18 @@ def zero(environments: VectorEnvironment) -> BatchPolicy:
 
 
 def random(environments: VectorEnvironment) -> BatchPolicy:
-    """Makes a policy that draws actions evenly from [-1, 1]."""
+    """Makes a policy that draws actions uniformly from [-1, 1]."""
     generator = np.random.default_rng(environments.seeds.tolist())
     shape = environments.num_envs, len(environments.action_map)
     return lambda observation: generator.uniform(-1, 1, shape)
 
 
 def clip(environments: VectorEnvironment) -> BatchPolicy:
-    """Makes a policy that follows the reference clip without looking.
+    """Makes a policy that follows the reference clip in open loop.
 
     Raises:
-      ValueError: the task has no clip; or, when the policy acts, its actuation cannot follow one.
+      ValueError: the task has no clip; or, when the policy is called, its actuation model cannot
+        follow one.
     """
     task: Any = environments.task
     if not hasattr(task, 'clip_action'):

@@ -6,16 +6,17 @@
     result = sequences.run(sequence, learner, budget=200_000, path='result.json')
     print(sequences.forgetting(result['scores']))
 
-A learner sees the environments one after the other and is scored on all of them after each. All
-environments of a sequence have the same observation and action, so that one network serves them.
-For multi-task learning take `sequence.ids` in any order and score the outcome with `scores`.
+A learner is trained on the environments one after the other and is scored on all of them after
+each. All environments of a sequence have the same observation and action spaces, so that one
+network fits all of them. For multi-task learning, train on `sequence.ids` in any order and call
+`scores`.
 
-Seeds below 2**31 are for training, those from 2**31 on for tests: `train_seeds` and `test_seeds` can
-never meet. An episode draws the 128-bit seed of its ground from the stream of its environment's
-seed, so that other seeds mean another ground. The runner tests with test seeds; a learner is
-expected to train with `VectorEnvironment(id, n, seed=train_seeds(n, seed))`.
+Seeds below 2**31 are for training, the others, below 2**32, for tests: `train_seeds` and
+`test_seeds` never overlap. The 128-bit seed of an episode's terrain is drawn from the random stream
+of its environment's seed, so that different seeds give different terrain. `run` tests with test
+seeds; a learner should train with `VectorEnvironment(id, n, seed=train_seeds(n, seed))`.
 
-Metrics take a matrix R, R[i, j] the score on task j after training on tasks 0 to i.
+The metrics take a matrix R, where R[i, j] is the score on task j after training on tasks 0 to i.
 """
 
 from __future__ import annotations
@@ -38,23 +39,24 @@ from trl_suite import evaluation
 from trl_suite.registry import catalogue
 from trl_suite.util import errors, files
 
-FIRST_TEST_SEED = 2**31  # of 2**32; smaller ones are for training
-EPISODES = 32  # of every test
-SCORE = 'normalized_return'  # what counts of an evaluation: the mean return over the step limit
-_SETTINGS = ('sequence', 'ids', 'budget', 'episodes', 'seed')  # that a result must agree on
+FIRST_TEST_SEED = 2**31  # smaller seeds are for training
+EPISODES = 32  # per test and task
+SCORE = 'normalized_return'  # entry of an evaluation: the mean return over the step limit
+_SETTINGS = ('sequence', 'ids', 'budget', 'episodes', 'seed')  # must be equal to resume a run
 
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """Environments in the order in which they are to be learnt.
+    """Environments in the order in which they are learnt.
 
     Attributes:
-      name: name in `SEQUENCES`, or the user's own.
-      ids: of the environments, T of them, each once.
+      name: name in `SEQUENCES`, or a custom one.
+      ids: ids of the T environments, without repeats; T >= 2.
       description: one line.
 
     Raises:
-      ValueError: an id is unknown (the message has the closest matches) or occurs twice.
+      ValueError: an id is unknown (the message has the closest matches) or occurs twice, or there
+        are fewer than two.
     """
 
     name: str
@@ -73,15 +75,15 @@ class Sequence:
         return len(self.ids)
 
 
-# The order of PLAiD (Berseth et al. 2018), and the family's other terrains behind it.
+# The order of PLAiD (Berseth et al. 2018), then the other terrains of the family.
 _PLAID = ('Flat', 'Incline', 'Steps', 'Slopes', 'Gaps')
 _MORE = ('Walls', 'Mixed', 'Slopes_Mixed')
-# From level ground with single features to all of them on slopes.
+# From single features on level ground to slopes, drops and rugged stairs.
 _GAITS = ('Steps', 'Walls', 'Gaps', 'Mixed', 'Slopes', 'Slopes_Mixed', 'Cliffs', 'Stairs_Rugged')
 _FAMILIES = (
     ('plaid', 'PD_{}_{}_Terrain-v0', _PLAID, 'tracks a clip over'),
     ('plaid_long', 'PD_{}_{}_Terrain-v0', _PLAID + _MORE, 'tracks a clip over'),
-    ('gaits', 'FSM_{}_Terrain_{}-v0', _GAITS, 'sets the gait of every cycle to cross'),
+    ('gaits', 'FSM_{}_Terrain_{}-v0', _GAITS, 'sets the gait parameters of every cycle to cross'),
 )
 
 SEQUENCES: dict[str, Sequence] = {
@@ -107,19 +109,19 @@ def get(name: str) -> Sequence:
 
 
 def train_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
-    """Returns seeds for training, integers in [0, 2**31): as `VectorEnvironment` takes them.
+    """Returns seeds for training, integers in [0, 2**31), for `VectorEnvironment`.
 
     Args:
-      count: how many.
-      seed: of the seeds, e.g. (run, stage).
+      count: number of seeds.
+      seed: seed from which these seeds are drawn, e.g. (run, stage).
     """
     return [number % FIRST_TEST_SEED for number in _drawn(count, seed)]
 
 
 def test_seeds(count: int, seed: int | tuple[int, ...] = 0) -> list[int]:
-    """Returns seeds for tests, integers in [2**31, 2**32): as `evaluation.evaluate` takes them.
+    """Returns seeds for tests, integers in [2**31, 2**32), for `evaluation.evaluate`.
 
-    Arguments are those of `train_seeds`.
+    The arguments are those of `train_seeds`.
     """
     return [FIRST_TEST_SEED + number for number in train_seeds(count, seed)]
 
@@ -132,30 +134,30 @@ def _drawn(count: int, seed: int | tuple[int, ...]) -> list[int]:
 
 
 def average_performance(scores: ArrayLike) -> float:
-    """Mean score over all tasks after the last (Lopez-Paz & Ranzato 2017, ACC).
+    """Mean score over all tasks after the last stage (Lopez-Paz & Ranzato 2017, ACC).
+
+    All metrics take `scores` in this form and raise the same errors.
 
     Args:
-      scores: R, (T, T), like all arguments of that name; entries that a metric does not need may be
-        NaN.
+      scores: R, (T, T); entries that a metric does not use may be NaN.
 
     Raises:
-      ValueError: R is not square, has fewer than two tasks, or lacks an entry that is needed. So
-        do all metrics.
+      ValueError: R is not square, has fewer than two tasks, or an entry that is used is not finite.
     """
     return _mean(_matrix(scores)[-1])
 
 
 def backward_transfer(scores: ArrayLike) -> float:
-    """What later tasks changed about earlier ones (Lopez-Paz & Ranzato 2017, BWT); < 0: forgotten.
+    """Effect of learning later tasks on earlier ones (Lopez-Paz & Ranzato 2017, BWT).
 
-    The mean over j < T - 1 of R[T-1, j] - R[j, j].
+    Negative values mean forgetting. The mean over j < T - 1 of R[T-1, j] - R[j, j].
     """
     found = _matrix(scores)
     return _mean((found[-1] - np.diag(found))[:-1])
 
 
 def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
-    """What earlier tasks do for one not yet learnt (Lopez-Paz & Ranzato 2017, FWT).
+    """Effect of earlier tasks on a task not yet learnt (Lopez-Paz & Ranzato 2017, FWT).
 
     The mean over j > 0 of R[j-1, j] - initial[j].
 
@@ -170,16 +172,16 @@ def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
 
 
 def forgetting(scores: ArrayLike) -> float:
-    """How far tasks end below the best they ever were (Chaudhry et al. 2018); >= 0 is usual.
+    """Mean drop of the final score below the best earlier one (Chaudhry et al. 2018).
 
-    The mean over j < T - 1 of max over i < T - 1 of R[i, j], less R[T-1, j].
+    The mean over j < T - 1 of (max over i < T - 1 of R[i, j]) - R[T-1, j]; usually >= 0.
     """
     found = _matrix(scores)
     return _mean((found[:-1].max(0) - found[-1])[:-1])
 
 
 def metrics(scores: ArrayLike, initial: ArrayLike) -> dict[str, float]:
-    """Returns all metrics by name; see each for its definition.
+    """Returns all metrics by name; the functions above define them.
 
     Lopez-Paz & Ranzato: Gradient Episodic Memory for Continual Learning. NeurIPS 2017. Chaudhry,
     Dokania, Ajanthan & Torr: Riemannian Walk for Incremental Learning. ECCV 2018.
@@ -201,7 +203,7 @@ def _matrix(scores: ArrayLike) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> float:
     if not np.isfinite(values).all():
-        raise ValueError(f'scores: an entry that is needed is not finite: {values.tolist()}')
+        raise ValueError(f'scores: the metric uses an entry that is not finite: {values.tolist()}')
     return float(values.mean())
 
 
@@ -209,27 +211,28 @@ def _mean(values: np.ndarray) -> float:
 
 
 class Learner(Protocol):
-    """What the runner needs of a learner."""
+    """The methods of a learner that `run` calls."""
 
     def learn(self, environment: str, budget: int) -> None:
-        """Goes on learning, in the environment of this id, for `budget` control steps."""
+        """Continues training, in the environment of this id, for `budget` control steps."""
 
     def policy(self, environment: str) -> Callable[[np.ndarray], np.ndarray]:
-        """Returns the present policy: observations (n, k) -> actions (n, a), without noise.
+        """Returns the current policy: observations (n, k) -> actions (n, a), without noise.
 
-        It is also asked before the first `learn`. Who must not be told the task ignores the id.
+        Also called before the first `learn`. A learner that should not know which task is tested
+        must ignore `environment`.
         """
 
 
 @runtime_checkable
 class Resumable(Protocol):
-    """What a learner also has if a run shall go on after an interruption."""
+    """The methods of a learner that can resume an interrupted run."""
 
     def save(self, folder: pathlib.Path) -> None:
-        """Writes everything that the future depends on into an empty folder."""
+        """Writes the complete state of the learner into an empty folder."""
 
     def load(self, folder: pathlib.Path) -> None:
-        """Takes over what `save` wrote there."""
+        """Restores the state that `save` wrote there."""
 
 
 def scores(
@@ -239,17 +242,17 @@ def scores(
     seed: int = 0,
     num_threads: int = 0,
 ) -> list[float]:
-    """Tests the present policy of a learner on all tasks.
+    """Tests the current policy of a learner on all tasks.
 
     Args:
       sequence: the tasks, or the name of a sequence.
-      learner: whose policy is tested.
-      episodes: of every task, the same ones whenever it is called with this seed.
-      seed: of the test seeds.
-      num_threads: threads that step the physics; 0 takes all cores.
+      learner: the learner; see `Learner`.
+      episodes: episodes per task; the same seed gives the same episodes.
+      seed: seed from which the test seeds are drawn.
+      num_threads: threads that step the physics; 0 uses all cores.
 
     Returns:
-      Mean returns over the step limit, (T,).
+      Mean return over the step limit for each task, (T,).
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
     seeds = test_seeds(episodes, seed)
@@ -269,29 +272,30 @@ def run(
     num_threads: int = 0,
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Has a learner learn one environment after the other; tests it on all before and after each.
+    """Trains a learner on one environment after the other; tests it on all before and after each.
 
-    After every stage the result is written. If there is one at `path` of the same settings, the run
-    goes on behind its last stage, provided that the learner is `Resumable`: what it saved lies beside
-    the result, in a folder of its name that ends in .stageN. A finished result is returned as it is.
+    The result is written after every stage. If the file at `path` holds an unfinished result with
+    the same settings, the run resumes after its last stage, provided that the learner is
+    `Resumable`: its state is in a folder next to the result, with the same name and the suffix
+    .stageN. A finished result is returned unchanged.
 
     Args:
-      sequence: the tasks, or their name.
+      sequence: the tasks, or the name of a sequence.
       learner: see `Learner`.
       budget: control steps for each task.
-      path: of the result; .json.
-      episodes: of every test.
-      seed: of the test seeds.
-      num_threads: threads that step the physics in tests; 0 takes all cores.
-      progress: show a bar.
+      path: file of the result, .json.
+      episodes: episodes per test and task.
+      seed: seed from which the test seeds are drawn.
+      num_threads: threads that step the physics in tests; 0 uses all cores.
+      progress: show a progress bar.
 
     Returns:
-      What the file holds: the settings 'sequence', 'ids', 'budget', 'episodes', 'seed'; 'initial',
-      scores before any training (T,); 'scores', R as far as it is known, a row per stage; and once
-      all are done 'metrics'.
+      The content of the file: the settings 'sequence', 'ids', 'budget', 'episodes', 'seed'; the
+      version 'trl_suite'; 'initial', scores before any training (T,); 'scores', the rows of R
+      so far, one per stage; and after the last stage 'metrics'.
 
     Raises:
-      ValueError: bad arguments, a result of other settings, or a learner that cannot go on.
+      ValueError: invalid arguments, a result with other settings, or a learner that cannot resume.
       OSError: a file cannot be read or written.
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
@@ -309,7 +313,7 @@ def run(
             if not isinstance(learner, Resumable):
                 raise ValueError(
                     f'{path} holds {done} of {len(sequence)} stages, and a {type(learner).__name__} '
-                    'has no load to go on from there; remove the file to begin anew'
+                    'cannot resume: it has no methods save and load; remove the file to start again'
                 )
             learner.load(_stage(path, done))
     test = (episodes, seed, num_threads)
@@ -332,7 +336,9 @@ def run(
             elif isinstance(learner, Resumable):
                 with _folder(_stage(path, done)) as folder:
                     learner.save(folder)
-            _write(path, result)  # from here on the stage counts, and the one before is not needed
+            _write(
+                path, result
+            )  # this completes the stage; the state of the one before is obsolete
             shutil.rmtree(_stage(path, done - 1), ignore_errors=True)
             bar.update()
     return result
@@ -344,12 +350,14 @@ def _stage(path: pathlib.Path, done: int) -> pathlib.Path:
 
 @contextlib.contextmanager
 def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary folder that takes the place of `path` once all went well."""
+    """Yields a temporary folder that replaces `path` if no exception is raised."""
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')
     part.mkdir()
     try:
         yield part
-        shutil.rmtree(path, ignore_errors=True)  # of a run that was cut before it wrote its result
+        shutil.rmtree(
+            path, ignore_errors=True
+        )  # left by a run interrupted before it wrote its result
         os.replace(part, path)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -367,7 +375,7 @@ def _read(path: pathlib.Path, expected: dict[str, Any]) -> dict[str, Any]:
         whole = all(len(row) == tasks for row in result['scores'])
         whole &= len(result['initial']) in (0, tasks) and len(result['scores']) <= tasks
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f'{path}: no result of a sequence ({error!r})') from None
+        raise ValueError(f'{path}: not a result of sequences.run ({error!r})') from None
     for name in _SETTINGS:
         if result.get(name) != expected[name]:
             raise ValueError(
@@ -375,5 +383,5 @@ def _read(path: pathlib.Path, expected: dict[str, Any]) -> dict[str, Any]:
                 f'{expected[name]}'
             )
     if not whole:
-        raise ValueError(f'{path}: rows of scores that are not of {tasks} tasks')
+        raise ValueError(f'{path}: the shape of initial or scores does not fit {tasks} tasks')
     return result

@@ -1,4 +1,4 @@
-"""The front door: an id, a family and task, or a free combination -> an environment."""
+"""Makes environments: by id (`make`), by family and task (`load`), or by parts (`build`)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def make(
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
-    """Makes an environment by its id in the paper's manner or by an alias ('plaid/dog_gaps').
+    """Makes an environment by its id, named as in the papers, or by an alias ('plaid/dog_gaps').
 
     Arguments and errors are those of `load`.
     """
@@ -76,7 +76,7 @@ def reference_policy(id: str) -> policies.Policy:
 
     Raises:
       ValueError: unknown id; the message has the closest matches.
-      FileNotFoundError: none is shipped for it; the message has the closest that have one.
+      FileNotFoundError: no policy is shipped for it; the message has the closest ids with a policy.
     """
     return policies.reference(find(id).id)
 
@@ -90,7 +90,7 @@ def build(
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
 ) -> Environment:
-    """Builds a combination that the catalogue does not name.
+    """Builds an environment from parts, for combinations that have no id.
 
     Args:
       character, actuation, terrain, task, clip: as for `combine`.
@@ -98,7 +98,7 @@ def build(
       environment_kwargs: as for `load`.
 
     Raises:
-      ValueError: unknown names, options, or parts that do not fit each other.
+      ValueError: unknown names or options, or parts that are incompatible.
     """
     spec = combine(character, actuation, terrain, task, clip)
     return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
@@ -111,26 +111,26 @@ def combine(
     task: str | TaskType | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
 ) -> EnvSpec:
-    """Returns the data of a combination: what `VectorEnvironment` and Gymnasium take.
+    """Returns the `EnvSpec` of a combination, which `VectorEnvironment` and Gymnasium accept.
 
     Args:
       character: name in `trl_suite.characters.CHARACTERS`, or a `CharacterSpec` of the user's own.
-      actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
-        joints by itself and takes none.
-      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
-        dimensions as the character has. By default level ground.
+      actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'. Not for the task
+        'gait', whose controller computes the torques.
+      terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; planar for a
+        planar character, otherwise three-dimensional. By default level ground.
       task: title of a task type: 'imitation'; 'footsteps', for characters with a right and a left
-        foot; in three dimensions 'goal_navigation' or 'soccer' (above a footstep controller), or
+        foot; in three dimensions 'goal_navigation' or 'soccer' (with a footstep controller), or
         'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
-        needs neither clip nor controller. Or a `TaskType` of the user's; or a class or function, called
-        as task(character, arena, actuation_model=...), with clip=... if one is given, and with the
-        task's options by keyword; it returns a `Task`.
-      clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
-        footsteps in three dimensions the same of a library of steps, `Steps`. By default the
-        character's own. A gait or a walk takes none.
+        needs neither clip nor controller. Or a custom `TaskType`; or a class or function that is
+        called as task(character, arena, actuation_model=...), with clip=... if one is given, and
+        with the task's options as keyword arguments, and returns a `Task`.
+      clip: the reference motion. For imitation: name of a clip, path of an .npz, or a `Clip`; for
+        footsteps in three dimensions: name or path of a library of steps, or a `Steps`. By default
+        the character's own. The tasks 'gait' and 'walk' have no reference motion.
 
     Raises:
-      ValueError: unknown names, or parts that do not fit each other.
+      ValueError: unknown names, or parts that are incompatible.
     """
     own: dict[str, Any] = {}
     if not isinstance(character, str):
@@ -142,7 +142,7 @@ def combine(
         title, type_ = task, _type(task, figure)
         actuation = _actuation(type_, actuation)
         if type_.motion is None and clip is not None:
-            raise ValueError(f'the task {title!r} tracks nothing: it takes no clip')
+            raise ValueError(f'the task {title!r} has no reference motion: it takes no clip')
         if clip is None and type_.motion is not None:
             clip = _own_motion(figure, type_.motion)
     elif isinstance(task, TaskType):
@@ -155,7 +155,7 @@ def combine(
         title, type_ = str(getattr(task, '__name__', 'task')), None
         own['task_type'], actuation = task, _actuation(None, actuation)
     else:
-        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
+        raise TypeError(f'task is {task!r}; expected a title, a TaskType, or a class or function')
     if terrain is None:
         terrain = 'plane' if figure.spatial else 'flat'
     if clip is not None and not isinstance(clip, str):
@@ -171,7 +171,7 @@ def combine(
         task_type=title if type_ is None else type_.name,
         clip=clip,
         options=MappingProxyType({} if type_ is None else dict(type_.options)),
-        description='A combination of the user.',
+        description='A user-defined combination.',
         own=MappingProxyType(own),
     )
     return spec.with_terrain(terrain)
@@ -188,10 +188,10 @@ def _type(title: str, character: characters.CharacterSpec) -> TaskType:
 
 
 def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> None:
-    """Checks that a task type is for characters of these dimensions.
+    """Checks that task type and character are both planar or both three-dimensional.
 
     Raises:
-      ValueError: it is not.
+      ValueError: they are not.
     """
     if character.spatial != type_.spatial:
         raise ValueError(
@@ -201,7 +201,7 @@ def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> N
 
 
 def _actuation(type_: TaskType | None, actuation: str | None) -> str:
-    """Returns the actuation model of a task type, by default position control if it may be."""
+    """Returns the checked actuation model; by default 'position', if the task type allows it."""
     known = actuation_models.ACTUATIONS
     if type_ is not None and type_.actuations is not None:
         known = type_.actuations
@@ -214,7 +214,7 @@ def _actuation(type_: TaskType | None, actuation: str | None) -> str:
 
 
 def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
-    """Returns the name of a character's own clip, or of its library of steps."""
+    """Returns the name of a character's default clip, or of its library of steps."""
     name = character.name
     if kind is motion.Clip:
         if character.clip is None:
@@ -234,7 +234,7 @@ def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
 def build_environment(
     spec: EnvSpec, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
 ) -> Environment:
-    """Builds an environment from its data; see `load` for the arguments."""
+    """Builds an environment from its spec; see `load` for the other arguments."""
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
     for name in environment_kwargs:
         if name not in known:

@@ -1,4 +1,4 @@
-"""Controllers between agent and joints: gait state machines and the dynamics they need."""
+"""Controllers between agent and joints: gait state machines, and footstep controllers."""
 
 from trl_suite.controllers.gait import Gait
 from trl_suite.controllers.machine import CONTROL_TIMESTEP

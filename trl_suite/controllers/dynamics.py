@@ -1,8 +1,9 @@
 """The equations of motion of a planar character, in compiled functions of one simulation.
 
-What stable PD, gravity compensation and virtual forces need: joint-space inertia, bias forces,
-Jacobians, world angles, the centre of mass. Degrees of freedom are in link order: x, z, pitch, then
-the joints; angles are positive nose up.
+For stable PD, gravity compensation and virtual forces: joint-space inertia, Jacobians, world
+angles,
+velocity of the centre of mass. Degrees of freedom are in link order: x, z, pitch, then the joints;
+positive pitch is nose up.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ class Skeleton(NamedTuple):
 
     Attributes:
       qpos, dof: addresses in qpos and in qvel, (D,).
-      joint: numbers in the model, (D,).
-      entry: where each entry of the inertia lies among those that MuJoCo stores, -1 where it is
-        always zero, (D, D).
-      body: which one it moves, (D,).
-      subtree_mass: of that body and what hangs on it, (D,) kg.
-      moves: whether it turns a body, (B, D) bool.
+      joint: joint ids, (D,).
+      entry: index of each entry of the inertia matrix among those that MuJoCo stores, -1 where it
+        is always zero, (D, D).
+      body: id of the body that it moves, (D,).
+      subtree_mass: mass of this body and its descendants, (D,) kg.
+      moves: whether it rotates a body, (B, D) bool.
       links: body ids in link order, the root first, (L,).
-      mass: of the whole character, kg.
+      mass: total mass, kg.
     """
 
     qpos: np.ndarray
@@ -45,7 +46,7 @@ class Skeleton(NamedTuple):
 
 
 class Mechanics(NamedTuple):
-    """Fields of the physics that only dynamics need, each (n, ...); see `engine.World`."""
+    """Fields of the physics that only these functions need, each (n, ...); see `engine.World`."""
 
     M: np.ndarray
     qfrc_bias: np.ndarray
@@ -53,7 +54,7 @@ class Mechanics(NamedTuple):
     site_xpos: np.ndarray
 
 
-# What a world must bind beyond the fields that every task reads.
+# Further fields that a world must bind.
 FIELDS = Mechanics._fields
 
 
@@ -65,7 +66,8 @@ def skeleton(character: Character, world: World) -> Skeleton:
     qpos, dof = world.joint_addresses(names)
     links = world.body_ids([body.full_identifier for body in character.bodies])
     model = world.models[0]
-    # MuJoCo stores a triangle by simulations; its order is by depth, so any of a pair may be the later.
+    # MuJoCo stores the lower triangle by rows, in the order of its own degrees of freedom, so that
+    # either of a pair may be the row.
     places = np.full((model.nv, model.nv), -1)
     for env_id in range(model.nv):
         start = model.M_rowadr[env_id]
@@ -74,7 +76,7 @@ def skeleton(character: Character, world: World) -> Skeleton:
     joint, body = model.dof_jntid[dof].astype(int), model.dof_bodyid[dof].astype(int)
     hinge = np.arange(len(names)) >= 2  # all but root_x and root_z
     moves = np.zeros((model.nbody, len(names)), bool)
-    for link in links:  # the joints on its way to the root turn it
+    for link in links:  # rotated by all hinges between it and the world
         above = link
         while above:
             moves[link] |= (body == above) & hinge
@@ -93,19 +95,19 @@ def skeleton(character: Character, world: World) -> Skeleton:
 
 
 def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what the world angles of links are made of, but for the angles of their own joints.
+    """Returns the linear map from degrees of freedom to world angles, less the joints' own angles.
 
     Args:
       joints: numbers of joints in link order, (k,).
-      skeleton: of the character.
-      world: where it was compiled.
+      skeleton: skeleton of the character.
+      world: the compiled world.
 
     Returns:
-      Coefficients of all degrees of freedom, (k, D), and constants, (k,): their sum is the world
-      angle of the link that hangs on the joint minus the joint's own angle.
+      Coefficients of all degrees of freedom, (k, D), and constants, (k,): coefficients times qpos
+      plus constant is the world angle of the joint's link minus the joint's own angle.
     """
     model = world.models[0]
-    # Turn of each body against its parent at rest, rad; about -y, hence the sign.
+    # Rotation of each body relative to its parent at rest, rad; about -y, hence the sign.
     rest = -2 * np.arctan2(model.body_quat[:, 2], model.body_quat[:, 0])
     coefficients = np.zeros((len(joints), len(skeleton.dof)))
     constants = np.zeros(len(joints))
@@ -119,7 +121,7 @@ def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndar
     return coefficients, constants
 
 
-# Of simulation i.
+# Functions of simulation i.
 
 
 @compiled
@@ -161,9 +163,10 @@ def write_jacobian(
     i: int, body: int, x: float, z: float, env_id: int, skeleton: Skeleton, xanchor: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes d(x, z) / d(degrees of freedom) of a point of a body into two simulations of out[i], (., D).
+    """Writes d(x, z) / d(degrees of freedom) of a point of a body to two rows of out[i], (., D).
 
-    Of slides other than those of the root it is 0.
+    The rows are `env_id` and the next one. The columns of slides other than those of the root are
+    0.
     """
     for k in range(len(skeleton.dof)):
         joint, moves = skeleton.joint[k], skeleton.moves[body, k]
@@ -174,9 +177,10 @@ def write_jacobian(
 
 @compiled
 def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
-    """Solves n equations matrix[i] x = vector[i] by elimination; both are overwritten.
+    """Solves matrix[i] x = vector[i] (n equations) by elimination; x overwrites vector[i].
 
-    Pivoting is partial. The pivots and the order of operations are those of LAPACK's dgetf2 and dgetrs.
+    With partial pivoting; matrix[i] is overwritten too. The pivots and the order of operations are
+    those of LAPACK's dgetf2 and dgetrs.
     """
     for k in range(n):
         pivot = k

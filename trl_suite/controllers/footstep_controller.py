@@ -1,4 +1,4 @@
-"""Low-level controllers that place the feet: loaded, checked, and called for many bodies at once.
+"""Low-level footstep controllers: loading, checks, and batched calls.
 
 from trl_suite import policies
 from trl_suite.controllers import footstep_controller
@@ -7,9 +7,9 @@ controller = footstep_controller.load(policies.load('mine.npz'))
 controller = footstep_controller.load('mine.npz')  # the same
 controller = footstep_controller.load(lambda observation: my_network(observation))  # or any function
 
-A controller takes the observations of `trl_suite.tasks.footsteps.spatial.SpatialFootsteps`, (n, 125) without a
-terrain map, and gives actions in [-1, 1], (n, 17): every 1/30 s, without memory of its own, as the
-phase is in the observation.
+A controller is called every 1/30 s. It takes observations of
+`trl_suite.tasks.footsteps.spatial.SpatialFootsteps`, (n, 125) without a terrain map, and returns
+actions in [-1, 1], (n, 17). It must be stateless; the observation includes the phase.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Function = Callable[[np.ndarray], Any]
 
 
 class Controller:
-    """A low-level controller whose answers are checked.
+    """A low-level controller with checked actions.
 
     Attributes:
-      name: for messages.
-      policy: what it was read from; None if it is a function.
+      name: name for messages.
+      policy: the `Policy`; None if the controller is another function.
     """
 
     def __init__(self, function: Function, name: str) -> None:
@@ -40,13 +40,13 @@ class Controller:
         self.policy = function if isinstance(function, policies.Policy) else None
 
     def check(self, task: Any) -> None:
-        """Checks that observation and action of a footstep task are what the controller knows.
+        """Checks that observations and actions of a footstep task fit the controller.
 
-        Of a function nothing can be known before it is called. A body other than the one that the
-        controller was trained with is a warning: it may still walk.
+        Functions other than policies can only be checked when they are called. If a policy was
+        trained with another body, a warning is issued, since it may still work.
 
         Raises:
-          ValueError: they are not; the message has both.
+          ValueError: they do not fit; the message has both.
         """
         self._size = len(task.action_map)
         if self.policy is None:
@@ -64,24 +64,24 @@ class Controller:
         """Returns actions, (n, actions), for observations (n, size).
 
         Raises:
-          ValueError: the controller gives no array of numbers, another shape, or anything but
-            finite numbers; the message names the simulation.
+          ValueError: the controller returns anything but an array of numbers, the wrong shape, or
+            numbers that are not finite; the message then has the row.
         """
         answer = self._function(observation)
         try:
             action = np.asarray(answer, dtype=float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f'controller {self.name} gives no numbers: {error}') from None
+            raise ValueError(f'controller {self.name} does not return numbers: {error}') from None
         n, size = len(observation), self._size
         if action.ndim != 2 or len(action) != n or size not in (None, action.shape[1]):
             raise ValueError(
-                f'controller {self.name} gives actions of shape {action.shape}; expected '
-                f'({n}, {"k" if size is None else size}), one simulation for each body'
+                f'controller {self.name} returns actions of shape {action.shape}; expected '
+                f'({n}, {"k" if size is None else size}), one row for each observation'
             )
         if not np.isfinite(action).all():
             env_id = int(np.argwhere(~np.isfinite(action))[0, 0])
             raise ValueError(
-                f'controller {self.name} gives no finite action for simulation {env_id}'
+                f'controller {self.name} returns an action that is not finite for observation {env_id}'
             )
         return action
 
@@ -90,11 +90,11 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
     """Returns a low-level controller.
 
     Args:
-      source: a `Policy`, the path of one (a PathLike, or a string that ends in .npz), or any function
-        from observations (n, size) to actions (n, k).
+      source: a `Controller`, a `Policy`, the path of a policy, or any function from observations
+        (n, size) to actions (n, k).
 
     Raises:
-      ValueError: a broken file; see `policies.load`.
+      ValueError: a corrupt file; see `policies.load`.
       FileNotFoundError: there is no such file.
     """
     if isinstance(source, Controller):

@@ -1,4 +1,4 @@
-"""Gaits of planar characters, in any world.
+"""Gaits of planar characters, for use in any world.
 
     gait = Gait(character, ground_body, root)  # before the model is compiled
     gait.bind(world)
@@ -7,7 +7,7 @@
     while ...:
         world.ctrl[...] = gait.torques(env_ids)
         world.step(...)                        # CONTROL_TIMESTEP
-        ended = gait.advance(env_ids)          # whose cycle is over: apply the next one
+        ended = gait.advance(env_ids)          # whether cycles are over: then apply the next ones
 
 A compiled loop calls the functions of `trl_suite.controllers.gaits` with `gait.rules` instead.
 """
@@ -29,18 +29,18 @@ from trl_suite.kinematics.planar import PlanarState
 from trl_suite.util import errors
 from trl_suite.util.compiled import packed
 
-_LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift carries, beside the root
+_LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift supports, in addition to the root
 
 
 class Gait:
     """One state machine in every simulation of a world.
 
     Attributes:
-      parameters: the character's vectors.
+      parameters: parameters of the character's gait.
       number: joint -> its number.
       link: link -> its number.
-      state: of the machines, after `bind`.
-      rules: all that compiled functions work on, after `bind`.
+      state: state of the machines, after `bind`.
+      rules: data for compiled functions, after `bind`.
     """
 
     state: GaitState
@@ -49,17 +49,18 @@ class Gait:
     def __init__(
         self, character: Character, ground_body: str, root: Any, gait: Parameters | None = None
     ) -> None:
-        """Adds a contact sensor for every link, and a site under every foot that pushes.
+        """Adds a contact sensor for every link, and for a bound a site under every foot.
 
         Args:
           character: an attached character with root joints. Its actuators take torques, in joint
             order; the gaits were tuned for joints without damping and armature.
-          ground_body: name of the body that carries the ground; 'world' for a ground of no body.
+          ground_body: name of the body that has the ground geoms; 'world' if they have no body.
           root: MJCF element of the arena.
-          gait: parameters; by default those of the character's name.
+          gait: parameters; by default those for the character's name.
 
         Raises:
-          ValueError: no gait drives this character, or it lacks a joint or a foot of the gait.
+          ValueError: there is no gait for this character, or it lacks a joint or a foot of the
+            gait.
         """
         self.character = character
         self.parameters = gait = gait or parameters.load(character.spec.name)
@@ -88,14 +89,14 @@ class Gait:
             )  # fmt: skip
 
     def bind(self, world: World) -> None:
-        """Resolves names in a compiled world, which has bound `dynamics.FIELDS`; makes room."""
+        """Resolves names in a compiled world, which must have bound `dynamics.FIELDS`."""
         self.world, gait = world, self.parameters
         spec, scope = self.character.spec, f'{self.character.mjcf_model.model}/'
         skeleton = dynamics.skeleton(self.character, world)
         joints = spec.joints.values()
         legs = np.array([[self.number[name] for name in leg] for leg in gait.legs])
         turn, constant = dynamics.frame(legs[:, 0], skeleton, world)
-        contacts = world.sensor_addresses(self._sensors)  # neighbours, in link order
+        contacts = world.sensor_addresses(self._sensors)  # consecutive, in link order
         machine = Machine(
             kind=KINDS.index(gait.kind),
             kp=np.array([joint.kp for joint in joints], float),
@@ -134,40 +135,40 @@ class Gait:
         return packed(self.rules)
 
     def _places(self, legs: np.ndarray) -> np.ndarray:
-        """Which parameter of a state each joint follows, by stance; see `Machine.place`."""
+        """Returns `Machine.place`, the parameter of a state for the target of each joint."""
         gait = self.parameters
         own = [name.split('.')[-1] for name in gait.names[gait.misc :]]
         place = np.full((2, len(self.number)), -1)
         for name, joints in gait.targets.items():
             place[:, [self.number[joint] for joint in joints]] = own.index(name)
-        if gait.kind == 'stride':  # the legs have changed places
+        if gait.kind == 'stride':  # in left stance the legs are exchanged
             place[1, legs[::-1]] = place[0, legs]
         return place
 
     @property
     def hips(self) -> tuple[str, ...]:
-        """Joints whose targets are angles in the world."""
+        """Joints whose targets are world angles."""
         return tuple(leg[0] for leg in self.parameters.legs)
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """What ends each state, in words."""
+        """The condition that ends each state, in words."""
         timed, feet = 'after TransTime', self.parameters.feet
         if self.parameters.kind == 'bound':
             hind, fore = (f'{foot} touches the ground' for foot in feet)
             return timed, fore, timed, f'{hind}: end of the cycle'
         if self.parameters.kind == 'stride':
             foot = f"the swing leg's {feet[0].split('_')[-1]} touches the ground"
-            return *3 * (timed,), f'{foot}: end of the cycle, the legs change places'
+            return *3 * (timed,), f'{foot}: end of the cycle, stance and swing leg are exchanged'
         leg = feet[0]
         return (
-            f'{leg} touches the ground: end of the cycle', 'root turns upwards',
+            f'{leg} touches the ground: end of the cycle', 'root starts to rise',
             f'{leg} leaves the ground',
-            f'root turns downwards; if {leg} touches the ground first, back to UpStance',
+            f'root starts to fall; if {leg} touches the ground first, the next state is UpStance',
         )  # fmt: skip
 
     def begin(self, env_ids: np.ndarray) -> None:
-        """Puts machines at the start of their first cycle, with the default gait."""
+        """Resets state machines to the start of their first cycle, with the default parameters."""
         gaits.begin_all(env_ids, self.parameters.action_offset, self._pack)
 
     def apply(self, env_ids: np.ndarray, vectors: np.ndarray) -> None:
@@ -180,7 +181,7 @@ class Gait:
         return self.rules.scratch.torque[env_ids]
 
     def advance(self, env_ids: np.ndarray) -> np.ndarray:
-        """Moves machines on after a control step; returns whose cycle has ended, (m,) bool.
+        """Advances machines after a control step; returns whether cycles have ended, (m,) bool.
 
         A machine whose cycle has ended stays in its last state until `apply`.
         """

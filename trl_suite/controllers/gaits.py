@@ -1,7 +1,7 @@
 """The gaits: the bound of dog and goat, the stride of raptor and biped, the hopper's hop.
 
-Compiled functions of simulation i; sources: see `trl_suite.controllers.machine`. The feedback of
-bipeds is after Yin, Loken, van de Panne (2007).
+Compiled functions of simulation i; sources: see `trl_suite.controllers.machine`. The balance
+feedback of the stride follows Yin, Loken, van de Panne (2007).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from trl_suite.controllers.machine import (
 )
 from trl_suite.util.compiled import compiled, compiled_loop
 
-REGULARISATION = 1e-4  # of the contact forces that carry the weight
+REGULARISATION = 1e-4  # of the contact forces that support the weight
 LAST = STATES - 1
 
 # Bound: back stance, extend, front stance, gather; one hind and one fore leg, in this order.
-# Parameters: TransTime, Cv, and pushes of hind foot and fore foot.
+# Parameters: TransTime, Cv, and virtual forces of hind foot and fore foot.
 
 
 @compiled
 def bound_ends(i: int, gait: GaitRules) -> bool:
-    """Whether a state is over: by time, or as the foot lands that comes next."""
+    """Returns whether a state is over: by time, or because the next foot has landed."""
     number = gait.state.number[i]
     if number == 0 or number == 2:
         return gait.state.phase[i] >= 1.0
@@ -46,7 +46,7 @@ def bound_ends(i: int, gait: GaitRules) -> bool:
 
 @compiled
 def bound_torques(i: int, gait: GaitRules) -> None:
-    """PD, with legs that swing further the faster it runs and that push on the ground."""
+    """Writes torques: stable PD, swing legs with speed feedback, virtual forces on the ground."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     lead = state.vector[i, 1] * com_speed(i, gait.skeleton, gait.mechanics.M, gait.physics.qvel)
     for leg in range(2):
@@ -58,7 +58,8 @@ def bound_torques(i: int, gait: GaitRules) -> None:
         stand(i, gait)
         if machine.holds_weight:
             add_weight(i, gait)
-        # A force on the body is its opposite on the ground, from one foot by state.
+        # A force on the body is the opposite force on the ground, by the hind or fore foot per
+        # state.
         leg = 0 if state.number[i] < 2 else 1
         ahead, up = state.vector[i, 2 + 2 * leg], state.vector[i, 3 + 2 * leg]
         support = gait.scratch.support
@@ -70,7 +71,7 @@ def bound_torques(i: int, gait: GaitRules) -> None:
 
 @compiled
 def stand(i: int, gait: GaitRules) -> None:
-    """Writes the Jacobians of the feet; they are 0 in the air."""
+    """Writes the Jacobians of the feet; 0 for feet in the air."""
     machine, support = gait.machine, gait.scratch.support
     for leg in range(2):
         if touches(i, machine.feet[leg], gait):
@@ -85,11 +86,13 @@ def stand(i: int, gait: GaitRules) -> None:
 
 @compiled
 def add_weight(i: int, gait: GaitRules) -> None:
-    """Adds the torques that hold the body against gravity, with the feet on the ground."""
+    """Adds torques that compensate gravity by the feet on the ground."""
     skeleton, scratch = gait.skeleton, gait.scratch
     com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
     support, grip, force = scratch.support, scratch.matrix, scratch.vector
-    for env_id in range(4):  # forces that carry the root, the first three degrees of freedom
+    for env_id in range(
+        4
+    ):  # rows: forces that support the root, the first three degrees of freedom
         for column in range(4):
             grip[i, env_id, column] = 0.0
             for k in range(3):
@@ -107,13 +110,13 @@ def add_weight(i: int, gait: GaitRules) -> None:
         scratch.torque[i, joint] += -weight(i, k, skeleton, com, anchors) - carried
 
 
-# Stride: one step of a run per cycle; stance and swing leg then change places. Contact, down,
-# passing, up; parameters: TransTime, Cv, Cd, and of a state first the root's pitch.
+# Stride: one step per cycle; stance and swing leg are then exchanged. States: contact, down,
+# passing, up. Parameters: TransTime, Cv, Cd; the first parameter of a state is the root's pitch.
 
 
 @compiled
 def stride_ends(i: int, gait: GaitRules) -> bool:
-    """Whether a state is over: by time, the last one as the swing foot lands."""
+    """Returns whether a state is over: by time, the last one when the swing foot lands."""
     if gait.state.number[i] < LAST:
         return gait.state.phase[i] >= 1.0
     return touches(i, gait.machine.feet[1 - gait.state.stance[i]], gait)
@@ -121,7 +124,7 @@ def stride_ends(i: int, gait: GaitRules) -> bool:
 
 @compiled
 def stride_torques(i: int, gait: GaitRules) -> None:
-    """PD, with a swing leg that keeps the balance and a stance hip that keeps the root upright."""
+    """Writes torques: stable PD, balance feedback by the swing hip, root pitch by the stance hip."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     skeleton, physics = gait.skeleton, gait.physics
     stance = state.stance[i]
@@ -143,13 +146,14 @@ def stride_torques(i: int, gait: GaitRules) -> None:
     limit(i, gait)
 
 
-# Hop: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter: MagicGain.
+# Hop. States: descent, down stance, up stance, ascent; a cycle ends at touch-down. Parameter:
+# MagicGain.
 DESCENT, DOWN, UP, ASCENT = range(STATES)
 
 
 @compiled
 def hop_advance(i: int, gait: GaitRules) -> bool:
-    """Moves the hopper on; returns whether it lands."""
+    """Advances the hopper's state; returns whether it lands, which ends the cycle."""
     state = gait.state
     landed = touches(i, gait.machine.feet[0], gait)
     number, following = state.number[i], state.number[i]
@@ -171,7 +175,7 @@ def hop_advance(i: int, gait: GaitRules) -> bool:
 
 @compiled
 def hop_torques(i: int, gait: GaitRules) -> None:
-    """PD, with a hip that keeps the root upright and a leg that pushes, on the ground."""
+    """Writes torques: stable PD; on the ground, root pitch by the hip, weight by the leg."""
     machine, state, torque = gait.machine, gait.state, gait.scratch.torque
     skeleton, qpos, qvel = gait.skeleton, gait.physics.qpos, gait.physics.qvel
     hip, leg = machine.legs[0, 0], machine.legs[0, 1]
@@ -191,11 +195,11 @@ def hop_torques(i: int, gait: GaitRules) -> None:
 
 @compiled
 def apply(i: int, gait: GaitRules) -> None:
-    """Begins a cycle with the parameters in the state's vector."""
+    """Begins a cycle with the parameters in `state.vector`."""
     machine, state = gait.machine, gait.state
     for place in machine.absolute:
         state.vector[i, place] = abs(state.vector[i, place])
-    # A hopper's cycle ends where it lands, and the next begins there; only the first is in the air.
+    # A hopper's cycle begins at touch-down, except the first one, which begins in the air.
     state.number[i] = DOWN if machine.kind == HOP and not state.airborne[i] else 0
     state.airborne[i] = False
     state.phase[i] = 0.0
@@ -215,7 +219,7 @@ def act(i: int, gait: GaitRules) -> None:
 
 @compiled
 def advance(i: int, gait: GaitRules) -> bool:
-    """Moves a machine on after a control step; returns whether its cycle has ended.
+    """Advances a state machine after a control step; returns whether its cycle has ended.
 
     A machine whose cycle has ended stays in its last state until `apply`.
     """
@@ -238,7 +242,7 @@ def advance(i: int, gait: GaitRules) -> bool:
 
 @compiled
 def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
-    """Puts a machine at the start of its first cycle, with a gait (P,)."""
+    """Resets a state machine to the start of its first cycle, with parameters (P,)."""
     state = gait.state
     state.stance[i] = 0
     state.rising[i], state.airborne[i] = False, True
@@ -247,7 +251,7 @@ def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
     for k in range(len(vector)):
         state.vector[i, k] = vector[k]
     apply(i, gait)
-    state.airborne[i] = True  # the first action waits for the ground
+    state.airborne[i] = True  # `apply` has cleared it; the first action must begin in the air, too
 
 
 # Loops over simulations; they take packs.
@@ -255,7 +259,7 @@ def begin(i: int, vector: np.ndarray, gait: GaitRules) -> None:
 
 @compiled_loop
 def begin_all(env_ids: np.ndarray, vector: np.ndarray, gait: GaitRules) -> None:
-    """Puts machines at the start of their first cycle."""
+    """Resets state machines to the start of their first cycle."""
     for i in env_ids:
         begin(i, vector, gait)
 
@@ -278,6 +282,6 @@ def act_all(env_ids: np.ndarray, gait: GaitRules) -> None:
 
 @compiled_loop
 def advance_all(env_ids: np.ndarray, gait: GaitRules, ended: np.ndarray) -> None:
-    """Moves machines on; writes whose cycle has ended, (m,)."""
+    """Advances state machines; writes whether their cycles have ended, (m,)."""
     for env_id in range(len(env_ids)):
         ended[env_id] = advance(env_ids[env_id], gait)

@@ -1,7 +1,8 @@
-"""What all gaits share: state machines that drive a planar character by stable PD.
+"""Common parts of all gaits: state machines that control a planar character by stable PD.
 
-Four states are visited in order; time or a contact ends each. On entry to a state its targets are
-set; feedback moves single targets in every control step. Compiled functions of simulation i.
+A cycle has four states; each ends after a time or at a contact. On entry to a state its joint
+targets are set; feedback adjusts some of them in every control step. Compiled functions of
+simulation i.
 
 Source: the controllers of Terrain RL Simulator (2018), of Peng, Berseth, van de Panne (2016); stable
 PD after Tan, Liu, Turk (2011).
@@ -19,9 +20,9 @@ from trl_suite.controllers.parameters import KINDS
 from trl_suite.kinematics.planar import PlanarState
 from trl_suite.util.compiled import compiled, compiled_inline
 
-CONTROL_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate and fall below 300 Hz
+CONTROL_TIMESTEP = 1 / 600  # s; gaits were tuned at this rate, and characters fall below 300 Hz
 STATES = 4
-TRANSITION = 0  # place of the duration of timed states among the parameters of `BOUND` and `STRIDE`
+TRANSITION = 0  # index of TransTime, the duration of timed states, in `BOUND` and `STRIDE`
 BOUND, STRIDE, HOP = range(len(KINDS))
 
 
@@ -31,21 +32,21 @@ class Machine(NamedTuple):
     Attributes:
       kind: `BOUND`, `STRIDE` or `HOP`.
       kp, kd: gains of the joints, (J,).
-      limits: of their torques, (J,) N m (prismatic: N).
-      rest: targets of joints that no state moves, (J,) rad.
-      misc: how many parameters come before those of the states.
-      per_state: how many parameters each state has.
-      absolute: places of the parameters whose sign does not count.
-      place: which parameter of a state is the target of a joint while the right or the left leg
-        stands, -1 for those that no state moves, (2, J). Other gaits use the first simulation.
+      limits: torque limits, (J,) N m (prismatic: N).
+      rest: targets of joints that no state sets, (J,) rad.
+      misc: number of parameters before those of the states.
+      per_state: number of parameters of each state.
+      absolute: indices of parameters of which the absolute value is used.
+      place: index of the parameter of a state that is the target of a joint, for right and left
+        stance; -1 if no state sets it, (2, J). Gaits other than `STRIDE` use the first row only.
       legs: joints of each leg, the hip first, (F, K). The targets of hips are world angles.
-      feet: links that step, one for each leg, (F,).
-      soles: sites under them, (F,); of a bound only.
-      turn, constant: world angle of what hangs on the hips, without their own angles; see
+      feet: links that touch the ground, one for each leg, (F,).
+      soles: sites under them, (F,); for a bound only.
+      turn, constant: map to the world angles of thighs without the hips' own angles, see
         `dynamics.frame`; (F, D) and (F,).
       contact: address of the contact sensor of the first link; the others follow.
       holds_weight: whether legs on the ground compensate gravity.
-      lift: force of the hopper's leg on the ground, N.
+      lift: generalised force of the hopper's leg on the ground when it is vertical, N.
     """
 
     kind: int
@@ -68,16 +69,16 @@ class Machine(NamedTuple):
 
 
 class GaitState(NamedTuple):
-    """Where the machine of each of n simulations is.
+    """State of the machines of n simulations.
 
     Attributes:
       vector: parameters of the current cycle, (n, P).
-      number: of the state, (n,).
-      phase: share of the state's time that is over, (n,).
-      target: of the joints, (n, J) rad (prismatic: m).
-      stance: 0 where the right leg of a stride stands, 1 the left, (n,).
+      number: number of the current state, (n,).
+      phase: elapsed fraction of the duration of the state, (n,).
+      target: joint targets, (n, J) rad (prismatic: m).
+      stance: stance leg of a stride, 0 right, 1 left, (n,).
       rising: whether the hopper's root was moving up at the last control step, (n,).
-      airborne: whether it has not landed since the start, so that the first action waits, (n,).
+      airborne: whether the next cycle begins in the air, as the first one does, (n,).
     """
 
     vector: np.ndarray
@@ -90,11 +91,11 @@ class GaitState(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room to calculate in.
+    """Preallocated memory for intermediate results.
 
     Attributes:
-      torque: of the joints, the result of a control step, (n, J).
-      matrix, vector: of linear equations, (n, D, D) and (n, D).
+      torque: joint torques, the result of a control step, (n, J).
+      matrix, vector: systems of linear equations, (n, D, D) and (n, D).
       support: Jacobians of two feet, (n, 4, D).
     """
 
@@ -105,7 +106,7 @@ class Scratch(NamedTuple):
 
 
 class GaitRules(NamedTuple):
-    """All that gaits work on."""
+    """Data for the compiled functions of gaits."""
 
     skeleton: Skeleton
     physics: PlanarState
@@ -117,20 +118,20 @@ class GaitRules(NamedTuple):
 
 @compiled_inline
 def touches(i: int, link: int, gait: GaitRules) -> bool:
-    """Whether a link touches the ground."""
+    """Returns whether a link touches the ground."""
     return gait.physics.sensordata[i, gait.machine.contact + link] > 0.0
 
 
 @compiled_inline
 def of_state(i: int, k: int, gait: GaitRules) -> float:
-    """Returns parameter k of the state that a machine is in."""
+    """Returns parameter k of the current state."""
     first = gait.machine.misc + gait.state.number[i] * gait.machine.per_state
     return gait.state.vector[i, first + k]
 
 
 @compiled
 def enter(i: int, gait: GaitRules) -> None:
-    """Sets the joint targets of the state that a machine is in."""
+    """Sets the joint targets of the current state."""
     machine, state = gait.machine, gait.state
     for k in range(len(machine.kp)):
         place = machine.place[state.stance[i], k]
@@ -163,12 +164,12 @@ def write_local_targets(i: int, gait: GaitRules, out: np.ndarray) -> None:
 
 @compiled
 def stable_pd(i: int, free: int, gait: GaitRules) -> None:
-    """Writes the torques of proportional-derivative control that looks one control step ahead.
+    """Writes the torques of stable PD control, which predicts one control step ahead.
 
     Args:
       i: number of the simulation.
-      free: a joint that is left free; J for none.
-      gait: all about it.
+      free: number of a joint without torque; J for none.
+      gait: the data.
     """
     skeleton, machine, scratch = gait.skeleton, gait.machine, gait.scratch
     qpos, qvel = gait.physics.qpos, gait.physics.qvel
@@ -193,7 +194,7 @@ def stable_pd(i: int, free: int, gait: GaitRules) -> None:
 
 @compiled
 def limit(i: int, gait: GaitRules) -> None:
-    """Keeps the torques within the limits."""
+    """Clips the torques to their limits."""
     torque, limits = gait.scratch.torque, gait.machine.limits
     for k in range(len(limits)):
         torque[i, k] = min(max(torque[i, k], -limits[k]), limits[k])

@@ -1,36 +1,36 @@
-"""What a gait is as numbers: parameter vectors, base actions, and which of them an agent sets.
+"""Parameters of gaits: vectors, base actions, and which parameters an action sets.
 
 One JSON file per character:
 
-    kind                     'bound', 'stride' or 'hop', see `trl_suite.controllers.gaits`; what the
-                             first parameters mean goes by the kind
-    legs                     joints of each leg, the hip first: of a bound the hind leg and the fore
-                             leg, down to the joint of the foot, of a stride right and left
-    feet                     links that step, one for each leg
-    misc, state_parameters   names; a vector is [misc..., of state 0..., of state 1..., ...]
-    targets                  of which joints the parameters of a state are targets; of a stride while
-                             the right leg stands
-    states                   names, in the order of visit
-    fixed                    parameters that are no part of an action
-    absolute                 parameters whose sign does not count
-    target_speed             m/s, of the reward
+    kind                     'bound', 'stride' or 'hop', see `trl_suite.controllers.gaits`; the
+                             meaning of the first parameters depends on it
+    legs                     joints of each leg, the hip first: for a bound the hind leg and the
+                             fore leg, down to the joint of the foot, for a stride right and left
+    feet                     links that touch the ground, one for each leg
+    misc, state_parameters   names; a vector is [misc..., those of state 0, those of state 1, ...]
+    targets                  parameter of a state -> joints whose target it is; for a stride, in
+                             right stance
+    states                   names, in their order in a cycle
+    fixed                    parameters that actions do not set
+    absolute                 parameters of which the absolute value is used
+    target_speed             m/s, for the reward
     sets                     name -> vector
-    base_actions             [set, set, blend]: the gaits that the papers' mixture of experts mixed
-    action_offset                   action 0: a set by name, or a base action by number
-    search_scale             by name, without state: standard deviations for a search
-    start                    the pose of the first instant: height of the root m, pitch rad, velocity
-                             of the root (m/s, m/s, rad/s), and angle and rate of each joint
+    base_actions             [set, set, blend]: the actions of the papers' mixture of experts
+    action_offset            action 0: name of a set, or index of a base action
+    search_scale             name without state -> standard deviation for a search
+    start                    initial state: height of the root m, pitch rad, velocity of the root
+                             (m/s, m/s, rad/s), and angle and rate of each joint
 
-and, where a character is an exception:
+and optionally, for exceptions:
 
-    gravity_compensation     false: legs of a bound on the ground do not carry the weight
+    gravity_compensation     false: legs of a bound on the ground do not support the weight
     forward_only             true: a root that moves backwards is a fall
-    backward_reward          false: a cycle backwards earns nothing
-    reward                   weights of the terms 'speed' and 'stumble', 0.8 and 0.2
-    observe_pitch            true: pitch and its rate take the place of the last link's z and its rate
+    backward_reward          false: the reward of a cycle with negative speed is 0
+    reward                   weights of the terms 'speed' and 'stumble', by default 0.8 and 0.2
+    observe_pitch            true: pitch and its rate replace z of the last link and its rate
 
-Source of the figures: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
-Panne (2016); the sets 'tuned' of biped2d_simbicon and goat are our own.
+Source of the values: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
+Panne (2016); the sets 'tuned' of biped2d_simbicon and goat were found for this suite.
 """
 
 from __future__ import annotations
@@ -57,27 +57,28 @@ class Parameters:
       character: name of the character.
       kind: one of `KINDS`.
       legs: joints of each leg, the hip first.
-      feet: links that step, one for each leg.
+      feet: links that touch the ground, one for each leg.
       targets: parameter of a state -> the joints whose target it is.
-      names: of the P parameters, 'Cv' or 'Gather.Hip'.
-      misc: how many come before those of the states.
-      states: names.
-      actions: places of the a parameters that an agent sets.
-      absolute: places of those whose sign does not count.
+      names: names of the P parameters, e.g. 'Cv' or 'Gather.Hip'.
+      misc: number of parameters before those of the states.
+      states: names of the states.
+      actions: indices of the a parameters that an action sets.
+      absolute: indices of parameters of which the absolute value is used.
       target_speed: m/s.
-      sets: name -> (P,).
-      base_actions: (8 or so, P).
-      blends: of each base action: a set, another, and the other's share.
-      action_offset: what action 0 means, (P,).
-      action_scale: largest deviation of a base action from the action_offset, (P,); what action 1 adds. So
-        every base action lies in [-1, 1].
+      sets: name -> vector, (P,).
+      base_actions: vectors of the base actions, (B, P).
+      blends: for each base action, two sets and the share of the second.
+      action_offset: vector at action 0, (P,).
+      action_scale: largest deviation of a base action from action_offset, (P,), the change per unit
+        action: all base actions are in [-1, 1].
       search_scale: standard deviation for a search, (P,).
-      start: the pose of the first instant, see the module.
-      gravity_compensation: whether legs of a bound on the ground carry the weight.
+      start: initial state, see the module.
+      gravity_compensation: whether legs of a bound on the ground support the weight.
       forward_only: whether moving backwards is a fall.
-      backward_reward: whether a cycle backwards earns anything.
+      backward_reward: whether the reward of a cycle with negative speed can be positive.
       reward: weights of the reward terms, by name.
-      observe_pitch: whether pitch and its rate are observed in place of the last link's z.
+      observe_pitch: whether pitch and its rate are observed instead of z of the last link and its
+        rate.
     """
 
     character: str
@@ -105,17 +106,17 @@ class Parameters:
     observe_pitch: bool
 
     def vector(self, action: np.ndarray) -> np.ndarray:
-        """Returns the parameters (n, P) that actions (n, a) mean: action_offset + action_scale * action."""
+        """Returns parameters (n, P) for actions (n, a): action_offset + action_scale * action."""
         vectors = np.tile(self.action_offset, (len(action), 1))
         vectors[:, self.actions] += self.action_scale[self.actions] * action
         return vectors
 
     def action(self, vector: np.ndarray) -> np.ndarray:
-        """Returns the actions (..., a) that mean parameters (..., P), as far as actions can."""
+        """Returns actions (..., a) for parameters (..., P); fixed parameters are ignored."""
         return (vector - self.action_offset)[..., self.actions] / self.action_scale[self.actions]
 
     def place(self, name: str) -> int:
-        """Returns where a parameter lies."""
+        """Returns the index of a parameter."""
         return self.names.index(name)
 
 
@@ -130,7 +131,7 @@ def load(character: str) -> Parameters:
     """Returns the parameters of a character's gait.
 
     Raises:
-      ValueError: the character has none.
+      ValueError: the character has no gait.
     """
     if character not in available():
         raise ValueError(errors.unknown('character with a gait', character, available()))
@@ -139,7 +140,7 @@ def load(character: str) -> Parameters:
 
 
 def read(data: dict[str, Any]) -> Parameters:
-    """Makes parameters from what a file holds.
+    """Makes parameters from the content of a file.
 
     Raises:
       ValueError: a vector has another length, a name is unknown, or legs and feet do not fit.
@@ -148,7 +149,7 @@ def read(data: dict[str, Any]) -> Parameters:
         raise ValueError(errors.unknown('kind of gait', data['kind'], KINDS))
     legs = tuple(tuple(leg) for leg in data['legs'])
     if len({len(leg) for leg in legs}) != 1 or len(legs) != len(data['feet']):
-        raise ValueError('legs need as many joints each, and a foot each')
+        raise ValueError('legs: expected the same number of joints for all, and one foot for each')
     for name in data['targets']:
         if name not in data['state_parameters']:
             raise ValueError(errors.unknown('parameter of a state', name, data['state_parameters']))

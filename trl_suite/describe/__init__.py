@@ -1,4 +1,4 @@
-"""An environment in words and tables, made from its data and from what it was built into.
+"""Describes an environment in text and tables, from its `EnvSpec` and the built environment.
 
 from trl_suite import describe, suite
 
@@ -6,8 +6,8 @@ spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
 for title, text in describe.sections(spec, suite.make(spec.id)):  # as `trl-suite info` prints it
     print(title, text)
 
-Sections of every environment are in `common`, those of a task type in `trl_suite.tasks`;
-`differences` says where the original is otherwise.
+Sections that all environments share are in `common`, those of a task type in `trl_suite.tasks`;
+`differences` lists the differences from the original.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
     for title, parts_ in parts(spec, environment):
         yield title, tables.text(parts_)
     yield (
-        'Differs from the original (reasons in docs/differences.md)',
+        'Differences from the original (reasons in docs/differences.md)',
         '\n'.join(f'  - {text}' for text in differences_of(spec)),
     )
 
 
 def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
-    """Yields sections of paragraphs and tables: all of `sections` but the differences.
+    """Yields sections of paragraphs and tables: all of `sections` except the differences.
 
     Args:
-      spec: of the environment.
-      environment: built from it, or from one that differs by its terrain only.
+      spec: spec of the environment.
+      environment: built from it, or from a spec that differs only in its terrain.
     """
     type_, task = task_type(spec), environment.task
-    if type_ is None:  # one of the user's
+    if type_ is None:  # a user's class or function makes the task
         yield common.observation(environment, PLANAR_BLOCKS)
         yield description.action(environment)
         yield description.time(spec, task)

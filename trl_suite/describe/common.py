@@ -1,4 +1,4 @@
-"""Sections that every environment has: character, observation, terrain."""
+"""Sections that all environments share: character, observation, terrain."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trl_suite.util.tables import Section, Table, section
 
 
 def character(environment: Environment, joints: tuple[str, Iterable[object]]) -> Iterator[Section]:
-    """Yields the character of a task, and its links with one more column for its joints."""
+    """Yields sections on a task's character and its links; `joints` is a column of the table."""
     figure: Any = environment.task.character  # type: ignore[attr-defined]
     spec = figure.spec
     yield section(f'Character: {spec.name}', spec.description, figures(figure))
@@ -24,12 +24,12 @@ def character(environment: Environment, joints: tuple[str, Iterable[object]]) ->
 
 
 def figures(figure: characters.Character) -> str:
-    """Returns the whole-body figures of a character in one line."""
+    """Returns mass, standing height and size of a character in one line."""
     spec = figure.spec
     own = characters.CHARACTERS.get(spec.name) is not spec
     found = characters.body_figures(characters.make(spec)) if own else _figures(spec.name)
     return (
-        f'{found["mass"]:.4g} kg, stands {found["standing_height"]:.3g} m high at the root, '
+        f'{found["mass"]:.4g} kg, root at a height of {found["standing_height"]:.3g} m when standing, '
         f'{len(spec.links)} links, {len(spec.joints)} joints'
     )
 
@@ -44,8 +44,8 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
 
     Args:
       figure: the character.
-      physics: in which it has been compiled.
-      last: title of one more column, and what is in it for each joint.
+      physics: physics with the compiled character.
+      last: title of the last column, and its entry for each joint.
     """
     masses = floats(physics.bind(figure.bodies).mass)
     own = figure.spec.root_weight if last[0] == REWARD_WEIGHT else ''

@@ -1,38 +1,38 @@
-"""What differs from the original, in sentences; docs/differences.md has the reasons."""
+"""Differences from the original, in sentences; docs/differences.md has the reasons."""
 
 from __future__ import annotations
 
 from trl_suite.registry.build import character_of, task_type
 from trl_suite.registry.spec import EnvSpec
 
-COMPLETION = 'not in the registry of the original: a combination that its papers name or imply'
+COMPLETION = 'not registered in the original: a combination that its papers name or imply'
 ACTUATION = {
     'position': 'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
     'torque': 'joints have passive damping and an armature of 0.01 kg m^2; action 1 is 0.75 of the limit',
-    'velocity': 'joints have an armature of 0.01 kg m^2; the damping gain is the servo',
+    'velocity': 'joints have an armature of 0.01 kg m^2; the velocity gain is the damping gain kd',
     'muscle': "MuJoCo's muscle curves fitted to the original's, rigid tendons, constant moment arms",
 }
 _OVERLAPS = (
-    'what stands on the ground has vertical faces, and where it overlaps the higher one counts; faces of the '
-    'original slope over 0.2 m, and the later one counts'
+    'obstacles have vertical faces, and where two overlap the higher one counts; in the original, faces '
+    'slope over 0.2 m, and the obstacle placed later counts'
 )
 _BELTS = (
-    'a belt is one box whose surface moves; that of the original is a row of boxes that move and re-enter '
-    'behind'
+    'a belt is one box with a moving surface; in the original it is a sequence of moving boxes that '
+    'reappear at the other end'
 )
 TERRAIN = {
     'conveyor3d': _BELTS,
     'conveyor3d_wide': _BELTS,
     'dynamic_obstacles3d': (
-        'moving boxes have an inertia of 10^6 kg: they push, carry, and are not stopped; those of the original '
-        'are kinematic, and of 1 kg to whom they meet'
+        'moving boxes have an armature of 10^6 kg: they push and carry, and cannot be stopped; in the '
+        'original they are kinematic, and have a mass of 1 kg in contacts'
     ),
     'mixed_humanoid': 'the terrain is inferred: slopes_mixed_humanoid without slopes',
     'obstacles3d': _OVERLAPS,
     'pillars3d': _OVERLAPS,
     'stairs3d': (
-        'treads have vertical faces and run on to both sides; those of the original slope over 0.2 m and '
-        'change 1 m beside the start'
+        'treads have vertical faces and extend to both sides; in the original, faces slope over 0.2 m and '
+        'treads change 1 m to the side of the start'
     ),
 }
 

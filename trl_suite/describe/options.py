@@ -1,4 +1,4 @@
-"""What `task_kwargs` may hold: name, default and meaning of every option of an environment."""
+"""The options in `task_kwargs`: name, default, unit and meaning of each."""
 
 from __future__ import annotations
 
@@ -16,25 +16,23 @@ _EVERYWHERE = (
         'rewards, observations, failures',
         '-',
         '',
-        'functions of your own, see docs/make_your_own.md',
+        'custom functions, see docs/make_your_own.md',
     ),
-    ('random', '-', '', 'seed; by default another one every time'),
-    ('time_limit', '-', 's', 'simulated time after which an episode is cut'),
+    ('random', '-', '', 'seed; by default drawn from the operating system'),
+    ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
 )
 
 
 def options(spec: EnvSpec) -> Section:
-    """Returns what may be set of an environment."""
+    """Returns the table of an environment's options."""
     cells: list[tuple[object, ...]] = [
         (option.name, _shown(option.default), option.unit, option.meaning)
         for option in sorted(task_options(spec))
         if option.actuation in (None, spec.actuation)
     ]
     cells += _EVERYWHERE
-    cells.append(('step_limit', spec.step_limit, '', 'steps after which an episode is cut'))
-    return section(
-        'Options, by task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells)
-    )
+    cells.append(('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'))
+    return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
 
 
 def _shown(value: Any) -> str:

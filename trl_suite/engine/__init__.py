@@ -1,4 +1,4 @@
-"""Simulations as arrays: the only place that calls MuJoCo for tasks."""
+"""Simulations as arrays: tasks and controllers call MuJoCo only through this package."""
 
 from trl_suite.engine.world import BatchWorld, PhysicsWorld, World, light_model
 

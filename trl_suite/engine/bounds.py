@@ -1,11 +1,12 @@
-"""Where the engine looks for geoms: bounds of the geoms of bodies that do not move.
+"""Bounding volumes, used by collision detection, of the geoms of static bodies.
 
-Who writes `geom_pos`, `geom_size` or `geom_quat` must call `mj_setConst`, or bodies fall through. For
-geoms of bodies without joints it changes no more than their bounds, the bounding volumes of their
-bodies, and marks of frames that coincide; it computes all inertias anew besides, which takes most of
-its time. `refresh` writes these bounds alone.
+After writing `geom_pos`, `geom_size` or `geom_quat` one must call `mj_setConst`, otherwise other
+bodies fall through these geoms. For geoms of bodies without joints, it only changes their bounds,
+the bounding volume hierarchies of their bodies, and the flags of coinciding frames
+(`geom_sameframe`); but it also recomputes all inertias, which takes most of its time. `refresh`
+writes only these bounds.
 
-Source: MuJoCo 3.17, `mj_setConst`; tests compare the two, number by number.
+Source: MuJoCo 3.17, `mj_setConst`; tests compare all numbers of the two.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ _NONE, _BODY, _INERTIA, _BODY_ROTATION, _INERTIA_ROTATION = (
     int(getattr(mujoco.mjtSameFrame, f'mjSAMEFRAME_{name}'))
     for name in ('NONE', 'BODY', 'INERTIA', 'BODYROT', 'INERTIAROT')
 )
-_SAME = 1e-6  # difference up to which frames coincide
+_SAME = 1e-6  # tolerance within which frames coincide
 
 
 class Geoms(NamedTuple):
-    """What bounds are computed from and what they are, fields of one MjModel under their names."""
+    """Inputs and outputs of the bounds: fields of one MjModel, by their MuJoCo names."""
 
     geom_type: np.ndarray
     geom_pos: np.ndarray
@@ -48,16 +49,16 @@ class Geoms(NamedTuple):
 
 
 def geoms(model: mujoco.MjModel) -> Geoms:
-    """Returns the fields of a model, which are views."""
+    """Returns views of the fields of a model."""
     return Geoms(*(getattr(model, name) for name in Geoms._fields))
 
 
 @compiled
 def refresh(body: int, geoms: Geoms) -> None:
-    """Brings the bounds of the geoms of a body up to date.
+    """Updates the bounds of the geoms of a body.
 
-    The body and its ancestors have no joints. Its geoms are boxes, planes or height fields; sizes of
-    the latter two have not changed.
+    The body and its ancestors must have no joints. Its geoms must be boxes, planes or height
+    fields; the sizes of planes and height fields must be unchanged.
     """
     first = geoms.body_geomadr[body]
     for geom in range(first, first + geoms.body_geomnum[body]):
@@ -72,7 +73,7 @@ def refresh(body: int, geoms: Geoms) -> None:
             geom, body, geoms.geom_pos, geoms.geom_quat, geoms.body_ipos, geoms.body_iquat
         )
     start = geoms.body_bvhadr[body]
-    # Children come after their parents.
+    # From the last node to the first: children are stored after their parents.
     for node in range(start + geoms.body_bvhnum[body] - 1, start - 1, -1):
         geom = geoms.bvh_nodeid[node]
         if geom >= 0:
@@ -84,14 +85,14 @@ def refresh(body: int, geoms: Geoms) -> None:
 
 @compiled_loop
 def refresh_all(bodies: np.ndarray, geoms: Geoms) -> None:
-    """Brings the bounds of the geoms of bodies up to date; takes a pack."""
+    """Updates the bounds of the geoms of bodies; takes a pack."""
     for body in bodies:
         refresh(body, geoms)
 
 
 @compiled
 def _bound_geom(node: int, geom: int, body: int, geoms: Geoms) -> None:
-    """Bounds a geom in the inertial frame of its body."""
+    """Writes the bounding box of a geom, in the inertial frame of its body, to a leaf node."""
     own, frame = geoms.geom_quat, geoms.body_iquat
     w, x, y, z = _product(
         frame[body, 0], -frame[body, 1], -frame[body, 2], -frame[body, 3],
@@ -115,7 +116,7 @@ def _bound_geom(node: int, geom: int, body: int, geoms: Geoms) -> None:
 
 @compiled
 def _bound_children(node: int, left: int, right: int, bounds: np.ndarray) -> None:
-    """Bounds what the bounds of two nodes hold."""
+    """Writes the union of the bounding boxes of two child nodes to their parent node."""
     for k in range(3):
         low = min(bounds[left, k] - bounds[left, 3 + k], bounds[right, k] - bounds[right, 3 + k])
         high = max(bounds[left, k] + bounds[left, 3 + k], bounds[right, k] + bounds[right, 3 + k])
@@ -126,7 +127,7 @@ def _bound_children(node: int, left: int, right: int, bounds: np.ndarray) -> Non
 def _frame(
     geom: int, body: int, pos: np.ndarray, quat: np.ndarray, ipos: np.ndarray, iquat: np.ndarray
 ) -> int:
-    """Which frame of its body that of a geom coincides with."""
+    """Returns which frame of its body the frame of a geom coincides with, as mjtSameFrame."""
     at_body, at_inertia, plus, minus, same, opposite = True, True, True, True, True, True
     for k in range(3):
         at_body &= abs(pos[geom, k]) < _SAME
@@ -148,7 +149,7 @@ def _frame(
 def _product(
     aw: float, ax: float, ay: float, az: float, bw: float, bx: float, by: float, bz: float
 ) -> tuple[float, float, float, float]:
-    """The product of two quaternions."""
+    """Returns the product of two quaternions."""
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -161,7 +162,7 @@ def _product(
 def _rotated(
     w: float, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """A vector (a, b, c) rotated by a quaternion."""
+    """Returns a vector (a, b, c) rotated by a quaternion."""
     return (
         (w * w + x * x - y * y - z * z) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
         2 * (x * y + w * z) * a + (w * w - x * x + y * y - z * z) * b + 2 * (y * z - w * x) * c,

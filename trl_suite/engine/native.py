@@ -1,4 +1,4 @@
-"""MuJoCo's own functions, called from compiled code by their addresses in the loaded library."""
+"""MuJoCo's C functions, called from compiled code by their addresses in the loaded library."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 
 from trl_suite.util.compiled import Compiled, compiled, compiled_loop
 
-# Of void f(const mjModel*, mjData*); the order of `Engine.functions`.
+# Functions of type void f(const mjModel*, mjData*), in the order of `Engine.functions`.
 NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData')
 STEP, STEP1, STEP2, FORWARD, RESET = range(len(NAMES))
 _PATTERNS = ('libmujoco.so*', 'libmujoco*.dylib', 'mujoco.dll')
 _TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-# Bad position, velocity and acceleration are neighbours among the warnings.
+# The warnings of bad position, velocity and acceleration have consecutive numbers.
 _BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-_WARNING_STRIDE = 8  # bytes; a warning is two ints, the second of which counts
+_WARNING_STRIDE = 8  # bytes; mjWarningStat has two ints, the second of which is the counter
 
 
 class Engine(NamedTuple):
@@ -29,13 +29,13 @@ class Engine(NamedTuple):
     Attributes:
       functions: addresses of MuJoCo's functions, in the order of `NAMES`.
       models, data: addresses of the mjModel and mjData of each simulation, (n,).
-      warnings: addresses of the counter of the first warning of each simulation, (n,).
-      fields: addresses of fields in each mjData, (n, F); none where arrays are views of them.
+      warnings: address of the counter of the first warning of each simulation, (n,).
+      fields: addresses of fields in each mjData, (n, F); F = 0 if the arrays are views of them.
       arrays: addresses of the arrays (n, ...) that mirror these fields, (F,).
-      sizes: numbers in each field, (F,).
-      written: how many fields, the first ones, tasks may write.
+      sizes: number of elements of each field, (F,).
+      written: number of fields that tasks may write; these come first.
       time: simulated time, (n,) s.
-      steps: physics steps that were taken since the world was made, (n,).
+      steps: physics steps since the world was made, (n,).
       timestep: duration of a physics step, s.
     """
 
@@ -57,7 +57,7 @@ def addresses() -> tuple[int, ...]:
     """Returns the addresses of MuJoCo's functions, in the order of `NAMES`.
 
     Raises:
-      ImportError: the library beside the Python package is missing, or is another version.
+      ImportError: the library is not in the folder of the Python package, or has another version.
     """
     folder = pathlib.Path(mujoco.__file__).parent
     found = sorted(path for pattern in _PATTERNS for path in folder.glob(pattern))
@@ -72,10 +72,10 @@ def addresses() -> tuple[int, ...]:
 
 
 def check_version(found: str, expected: str, path: str) -> None:
-    """Checks that a library is the one that the Python package was built for.
+    """Checks that the versions of the library and of the Python package are equal.
 
     Raises:
-      ImportError: it is not; its structures may have another layout.
+      ImportError: they differ, so that structures may have another layout.
     """
     if found != expected:
         raise ImportError(
@@ -84,7 +84,7 @@ def check_version(found: str, expected: str, path: str) -> None:
         )
 
 
-# What only Numba can express: calls and copies by address. The Python functions do the same.
+# Calls and copies by address, which need Numba intrinsics; the Python functions do the same.
 
 
 def _call_native() -> Callable[..., Any]:
@@ -114,7 +114,7 @@ def _call(function: int, model: int, data: int) -> None:
 
 
 def _pointer(kind: str) -> Any:
-    """Returns an intrinsic that turns an address into a pointer to numbers of a kind."""
+    """Returns an intrinsic that converts an address to a pointer to numbers of type `kind`."""
     from numba import types
     from numba.extending import intrinsic
 
@@ -168,12 +168,12 @@ _copy_numbers = Compiled(_copy, _copy_native)
 _count_at = Compiled(_count, _count_native)
 
 
-# Row functions: of simulation i.
+# Functions of simulation i.
 
 
 @compiled
 def write(i: int, engine: Engine) -> None:
-    """Gives the physics what tasks may have written into the arrays."""
+    """Copies the fields that tasks may write from the arrays to the physics."""
     for k in range(min(engine.written, len(engine.sizes))):
         size = engine.sizes[k]
         _copy_numbers(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
@@ -181,7 +181,7 @@ def write(i: int, engine: Engine) -> None:
 
 @compiled
 def read(i: int, engine: Engine) -> None:
-    """Brings the arrays up to date with the physics."""
+    """Copies all fields from the physics to the arrays."""
     for k in range(len(engine.sizes)):
         size = engine.sizes[k]
         _copy_numbers(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
@@ -191,8 +191,8 @@ def read(i: int, engine: Engine) -> None:
 def step(i: int, nstep: int, engine: Engine) -> None:
     """Advances a simulation by `nstep` physics steps.
 
-    In the order of dm_control's `legacy_step`: finish the open step, run the others, and begin the
-    next, so that positions and velocities of bodies belong to the new state.
+    In the order of dm_control's `legacy_step`: `mj_step2` for the current step, `mj_step` for the
+    others, then `mj_step1`, so that positions and velocities of bodies belong to the new state.
     """
     model, data = engine.models[i], engine.data[i]
     write(i, engine)
@@ -200,7 +200,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     for _ in range(nstep - 1):
         call(engine.functions[STEP], model, data)
     call(engine.functions[STEP1], model, data)
-    for _ in range(nstep):  # as MuJoCo does, number by number
+    for _ in range(nstep):  # one addition per step, for the same rounding as in MuJoCo
         engine.time[i] += engine.timestep
     engine.steps[i] += nstep
     read(i, engine)
@@ -208,7 +208,7 @@ def step(i: int, nstep: int, engine: Engine) -> None:
 
 @compiled
 def forward(i: int, engine: Engine) -> None:
-    """Recomputes everything that depends on a written state."""
+    """Recomputes all quantities that depend on the state, after the state was written."""
     write(i, engine)
     call(engine.functions[FORWARD], engine.models[i], engine.data[i])
     read(i, engine)
@@ -216,7 +216,7 @@ def forward(i: int, engine: Engine) -> None:
 
 @compiled
 def reset(i: int, engine: Engine) -> None:
-    """Puts a simulation into the model's initial state, warnings cleared."""
+    """Resets a simulation to the model's initial state and clears its warnings."""
     call(engine.functions[RESET], engine.models[i], engine.data[i])
     engine.time[i] = 0.0
     read(i, engine)
@@ -224,7 +224,7 @@ def reset(i: int, engine: Engine) -> None:
 
 @compiled
 def diverged(i: int, engine: Engine) -> bool:
-    """Whether a simulation met a non-finite or huge state since its reset."""
+    """Returns whether a simulation has had a non-finite or huge state since its reset."""
     for k in range(_BAD[0], _BAD[1]):
         if _count_at(engine.warnings[i] + _WARNING_STRIDE * k) > 0:
             return True
@@ -243,21 +243,21 @@ def step_all(env_ids: np.ndarray, nstep: int, engine: Engine) -> None:
 
 @compiled_loop
 def forward_all(env_ids: np.ndarray, engine: Engine) -> None:
-    """Recomputes what depends on the written states of simulations."""
+    """Recomputes all quantities that depend on the states of simulations."""
     for i in env_ids:
         forward(i, engine)
 
 
 @compiled_loop
 def reset_all(env_ids: np.ndarray, engine: Engine) -> None:
-    """Puts simulations into the initial state."""
+    """Resets simulations to the model's initial state."""
     for i in env_ids:
         reset(i, engine)
 
 
 @compiled_loop
 def read_all(env_ids: np.ndarray, engine: Engine) -> None:
-    """Brings the arrays up to date for some simulations."""
+    """Copies all fields of some simulations from the physics to the arrays."""
     for i in env_ids:
         read(i, engine)
 

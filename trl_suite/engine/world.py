@@ -1,8 +1,8 @@
-"""n simulations as arrays: the whole seam between tasks and physics.
+"""n simulations as arrays: the complete interface between tasks and physics.
 
-Every array of a `World` has a leading axis of n simulations. Tasks read these arrays and call a few
-verbs; they never touch the engine otherwise, so one implementation of a task serves the single
-environment (n = 1, over one `dm_control` Physics) and a batch.
+Every array of a `World` has a leading axis of n simulations. Tasks access the engine only through
+these arrays and a few methods, so that one implementation of a task works for the single
+environment (n = 1, over one `dm_control` Physics) and for a batch.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from trl_suite.util.compiled import packed
 WRITABLE = (
     'qpos', 'qvel', 'act', 'ctrl', 'qacc_warmstart', 'mocap_pos', 'mocap_quat', 'xfrc_applied',
 )  # fmt: skip
-# Read by every task. A batch copies fields out after every step, so it binds others on request.
+# Fields that every task reads. A batch copies its fields after every step: others are optional.
 READABLE = ('xpos', 'xipos', 'cvel', 'subtree_com', 'sensordata', 'ten_length')
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that continues a trajectory bit for bit
-CHUNKS = 4  # parts per thread into which env_ids are cut, since some take longer than others
-LEAST = 4  # simulations in a part
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # restores a trajectory bit for bit
+CHUNKS = 4  # parts per thread into which env_ids are split, since some take longer than others
+LEAST = 4  # simulations per part
 
 
 class World:
-    """n simulations: what tasks may read, write and ask.
+    """n simulations: arrays that tasks read and write, and methods that they call.
 
     Attributes:
       n: number of simulations.
-      models: the MjModel of each; write terrain there, then call `set_const`.
+      models: the MjModel of each simulation; write terrain there, then call `set_const`.
       engine: the same simulations for compiled functions, see `trl_suite.engine.native`.
-      pack: of `engine`, for loops over simulations.
-      qpos, qvel, ...: the fields of MjData named in `WRITABLE` and `READABLE`, and what else was
-        asked for, shape (n, ...); all but the writable read-only.
+      pack: `engine` as a pack, for loops over simulations.
+      qpos, qvel, ...: the fields of MjData named in `WRITABLE` and `READABLE`, and further ones on
+        request, shape (n, ...); those not in `WRITABLE` are read-only.
     """
 
     qpos: np.ndarray
@@ -57,7 +57,7 @@ class World:
     subtree_com: np.ndarray
     sensordata: np.ndarray
     ten_length: np.ndarray
-    # Bound only for tasks that ask for them.
+    # Bound only on request.
     M: np.ndarray
     qfrc_bias: np.ndarray
     xanchor: np.ndarray
@@ -76,10 +76,10 @@ class World:
         """Binds the arrays; see the subclasses.
 
         Args:
-          models: of each simulation.
-          data: of each simulation.
-          fields: of MjData, beside those of `WRITABLE` and `READABLE`.
-          live: whether the arrays are views of the one simulation's data, not copies.
+          models: one for each simulation.
+          data: one for each simulation.
+          fields: further fields of MjData, in addition to `WRITABLE` and `READABLE`.
+          live: whether the arrays are views of the data of a single simulation, not copies.
           num_threads: threads that step and reset simulations.
         """
         self.n, self.models = len(models), models
@@ -101,7 +101,7 @@ class World:
                 array.flags.writeable = False
             setattr(self, name, array)
         mirrored = () if live else names
-        self._mirrors = arrays  # kept alive for the addresses of them
+        self._mirrors = arrays  # kept alive, since `engine` holds their addresses
         self.engine = native.Engine(
             functions=np.array(native.addresses()),
             models=np.array([model._address for model in models]),
@@ -119,27 +119,27 @@ class World:
         )
         self.pack = packed(self.engine)
 
-    # The verbs; env_ids are sorted numbers of simulations, without repeats.
+    # Methods for tasks; env_ids are sorted numbers of simulations, without repeats.
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
         """Advances some or all simulations by `nstep` physics steps; velocities are then current."""
         native.step_all(self.all_ids if env_ids is None else env_ids, nstep, self.pack)
 
     def forward(self, env_ids: np.ndarray) -> None:
-        """Recomputes everything that depends on a written state."""
+        """Recomputes all quantities that depend on the state, after the state was written."""
         native.forward_all(env_ids, self.pack)
 
     def reset(self, env_ids: np.ndarray) -> None:
-        """Puts simulations into the model's initial state, warnings cleared."""
+        """Resets simulations to the model's initial state and clears their warnings."""
         native.reset_all(env_ids, self.pack)
 
     def set_const(self, env_id: int) -> None:
-        """Makes edits of the static geoms of a simulation take effect.
+        """Applies changes to the static geoms of a simulation.
 
-        Without it bodies fall through them.
+        Without this call, bodies fall through changed geoms.
         """
         scratch = getattr(self._local, 'scratch', None)
-        if scratch is None:  # for each thread: mj_setConst overwrites the state of its data
+        if scratch is None:  # one per thread: mj_setConst overwrites the state of its MjData
             scratch = self._local.scratch = mujoco.MjData(self.models[0])
         mujoco.mj_setConst(self.models[env_id], scratch)
 
@@ -151,7 +151,7 @@ class World:
         return state
 
     def set_state(self, env_id: int, state: np.ndarray) -> None:
-        """Restores one simulation so that it continues bit for bit; its warnings are cleared."""
+        """Restores one simulation, bit for bit, and clears its warnings."""
         model, data = self.models[env_id], self._data[env_id]
         mujoco.mj_setState(model, data, state, STATE)
         data.warning.number[:] = 0
@@ -160,11 +160,11 @@ class World:
         native.read_all(np.array([env_id]), self.pack)
 
     def any_diverged(self) -> bool:
-        """Whether `diverged` holds for any simulation."""
+        """Returns whether `diverged` is true for any simulation."""
         return bool(self.diverged().any())
 
     def diverged(self) -> np.ndarray:
-        """Returns which simulations met a non-finite or huge state since their reset, (n,)."""
+        """Returns which simulations have had a non-finite or huge state since their reset, (n,)."""
         found = np.empty(self.n, bool)
         native.diverged_all(self.pack, found)
         return found
@@ -175,14 +175,14 @@ class World:
         return self.engine.time
 
     def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
-        """Has the threads do some work, each for a part of the simulations.
+        """Calls a function on the threads, each time for a part of the simulations.
 
         Args:
-          work: is called with parts of env_ids; what it does must not depend on how they are cut.
+          work: called with parts of env_ids; its results must not depend on how these are split.
           env_ids: sorted numbers of simulations.
 
         Raises:
-          Exception: the first one that the work raised; the other parts are finished.
+          Exception: the first exception that `work` raised, after all parts have finished.
         """
         threads = min(self._num_threads, max(1, len(env_ids) // LEAST))
         if threads == 1 or not len(env_ids):
@@ -194,7 +194,7 @@ class World:
         running = [self._pool.submit(work, part) for part in parts]
         try:
             concurrent.futures.wait(running)
-        except BaseException:  # a keyboard interrupt: nothing may go on behind the caller's back
+        except BaseException:  # a keyboard interrupt: no work may continue after this method ends
             for each in running:
                 each.cancel()
             concurrent.futures.wait(running)
@@ -203,19 +203,19 @@ class World:
             each.result()
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stops the threads."""
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
 
     def posed(self, qpos: np.ndarray, pose: np.ndarray) -> mujoco.MjData:
-        """Returns data of the first model in a pose, with the places of its bodies and geoms.
+        """Returns new data of the first model in a pose, with positions of bodies and geoms.
 
-        It is apart from the simulations: for what is measured once.
+        It is independent of the simulations.
 
         Args:
-          qpos: addresses in qpos, (k,); elsewhere the model's reference stays.
-          pose: values there, (k,).
+          qpos: addresses in qpos, (k,); the other entries have the model's initial values.
+          pose: values at these addresses, (k,).
         """
         model = self.models[0]
         data = mujoco.MjData(model)
@@ -233,9 +233,9 @@ class World:
         return self._ids(mujoco.mjtObj.mjOBJ_GEOM, names)
 
     def joint_addresses(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where joints begin in qpos and in qvel."""
+        """Returns the first address of each joint in qpos and in qvel."""
         ids, model = self._ids(mujoco.mjtObj.mjOBJ_JOINT, names), self.models[0]
-        # As numpy's own index type: it need not be cast in every step.
+        # Of NumPy's index type, so that it is not cast in every step.
         return model.jnt_qposadr[ids].astype(int), model.jnt_dofadr[ids].astype(int)
 
     def sensor_addresses(self, names: Sequence[str]) -> np.ndarray:
@@ -257,15 +257,15 @@ class World:
 
 
 class PhysicsWorld(World):
-    """One simulation over a dm_control Physics, whose fields the arrays are views of."""
+    """One simulation of a dm_control Physics; the arrays are views of its fields."""
 
     def __init__(self, physics: mjcf.Physics, fields: Sequence[str] = ()) -> None:
-        # The raw pointers, not the physics: dm_control hands out weak proxies of it.
+        # Keep the raw pointers, not the physics: dm_control passes a weak proxy.
         super().__init__([physics.model.ptr], [physics.data.ptr], fields, live=True)
 
 
 class BatchWorld(World):
-    """n simulations, each with a model of its own, stepped on threads."""
+    """n simulations, each with its own copy of the model, stepped on threads."""
 
     def __init__(
         self, model: mujoco.MjModel, n: int, num_threads: int = 0, fields: Sequence[str] = ()
@@ -273,10 +273,10 @@ class BatchWorld(World):
         """Makes n simulations.
 
         Args:
-          model: what all of them share; copied once per simulation, so it should be light.
+          model: copied once per simulation, so it should be small; see `light_model`.
           n: number of simulations.
-          num_threads: threads that step them; 0 takes all cores.
-          fields: of MjData, to be bound beside those of `WRITABLE` and `READABLE`.
+          num_threads: threads that step them; 0 uses all cores.
+          fields: further fields of MjData, in addition to `WRITABLE` and `READABLE`.
         """
         models = [copy.copy(model) for _ in range(n)]
         threads = num_threads or os.cpu_count() or 1
@@ -289,10 +289,10 @@ def _address(array: np.ndarray) -> int:
 
 
 def light_model(root: mjcf.RootElement) -> mujoco.MjModel:
-    """Compiles a tree without textures and materials: the same physics, a hundredth of the size."""
+    """Compiles MJCF without textures and materials: the same physics, a hundredth of the size."""
     spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
     for item in (*spec.geoms, *spec.sites, *spec.tendons, *spec.skins):
-        item.material = ''  # one that is still referred to cannot be deleted
+        item.material = ''  # a material that is still referenced cannot be deleted
     for item in (*spec.materials, *spec.textures):
         spec.delete(item)
     return spec.compile()

@@ -1,1 +1,1 @@
-"""Tasks as environments: one with dm_env time steps, or many that step together."""
+"""Environments: a single one with dm_env time steps, or many simulations that step together."""

@@ -1,4 +1,4 @@
-"""A single environment: dm_env timesteps, fused substeps, save and restore, pickling."""
+"""A single environment: dm_env time steps, fused substeps, save and restore, pickling."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from trl_suite.tasks.task import Task
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
-_NO_SUBSTEPS = 'substeps run fused in C; use a plain composer.Environment with this task'
+_NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
 
 
 class Environment(composer.Environment):
     """`composer.Environment` with all substeps of a control step in one call.
 
-    What differs from composer: substeps run in C (`before_substep` and `after_substep` hooks are
-    refused), observation blocks bypass the observation updater, divergence ends the episode instead
-    of raising, and the full state can be saved and restored.
+    Differences from composer: substeps run in C (`before_substep` and `after_substep` hooks are
+    rejected), observation blocks bypass the observation updater, divergence ends the episode
+    instead of raising an exception, and the full state can be saved and restored.
 
-    `TimeStep.discount` is 0 where the task failed and 1 where the step or time limit cut the
-    episode, as dm_env has it.
+    As usual in dm_env, `TimeStep.discount` of the last step is 0 if the task failed and 1 if the
+    step or time limit ended the episode.
     """
 
     _task: Task
@@ -43,15 +43,15 @@ class Environment(composer.Environment):
         """Compiles the task.
 
         Args:
-          task: a task that nothing else uses.
-          step_limit: control steps after which an episode is cut.
-          time_limit: simulated time in s after which an episode is cut.
-          random: seed; drawn from the system if None.
-          flat_observation: give one vector, all blocks side by side, under the key 'observations'.
+          task: a task that no other environment uses.
+          step_limit: control steps after which an episode is truncated.
+          time_limit: simulated time in s after which an episode is truncated.
+          random: seed; drawn from the operating system if None.
+          flat_observation: return all blocks as one vector, under the key 'observations'.
 
         Raises:
-          ValueError: a limit that is not positive, a bad seed, or substep hooks.
-          TypeError: a seed that is no integer.
+          ValueError: a limit that is not positive, an invalid seed, or substep hooks.
+          TypeError: a seed that is not an integer.
         """
         if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
             raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
@@ -72,10 +72,11 @@ class Environment(composer.Environment):
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
         )
-        # The constructor has compiled already; composer would do it again at the first reset.
+        # The constructor has compiled the model; composer would compile it again at the first
+        # reset.
         self._mjcf_never_compiled = False
         self._parts = tuple(task.blocks.items())
-        # Whether anything but the task has hooks around a step; asking them each time takes longer.
+        # Whether an entity or the user has hooks around a step; calling none of them saves time.
         self._hooked = bool(
             self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
         )
@@ -92,7 +93,7 @@ class Environment(composer.Environment):
         self._hooked = True
 
     def _make_observation_updater(self) -> composer_observation.Updater:
-        # One substep: the updater must see a control step as a single update.
+        # One substep: the updater must count a control step as a single update.
         self._extra_observables = [
             name
             for name, item in self._task.observables.items()
@@ -101,7 +102,7 @@ class Environment(composer.Environment):
         return composer_observation.Updater(self._task.observables, 1, True, False)
 
     def reset(self) -> dm_env.TimeStep:
-        """Begins an episode.
+        """Begins an episode; returns its first time step.
 
         Raises:
           RuntimeError: after `close`.
@@ -115,13 +116,13 @@ class Environment(composer.Environment):
         return dm_env.restart(self._observe())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Takes one action.
+        """Takes one action; begins a new episode instead if the last time step ended one.
 
         Args:
-          action: numbers in [-1, 1] (clipped there), shape of `action_spec()`.
+          action: clipped to [-1, 1], shape of `action_spec()`.
 
         Raises:
-          ValueError: an action of another shape, or with NaN or infinity.
+          ValueError: an action of the wrong shape, or with NaN or infinity.
           RuntimeError: after `close`.
         """
         self._check_open()
@@ -189,7 +190,7 @@ class Environment(composer.Environment):
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """Where each observation block lies in the flat vector."""
+        """Slice of each observation block in the flat vector."""
         return dict(self._task.blocks)
 
     @property
@@ -203,16 +204,16 @@ class Environment(composer.Environment):
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in the last step beyond the time step: see the task's `info_arrays`."""
+        """Further results of the last step, by name: see the task's `info_arrays`."""
         return self._task.info_of(0)
 
     # State.
 
     def get_state(self) -> dict[str, Any]:
-        """Returns everything that the future depends on: physics, task, terrain, randomness.
+        """Returns the complete state: physics, task, terrain and random streams.
 
-        The dict holds arrays and plain values; it can be pickled and set on any environment built
-        in the same way.
+        The dict holds arrays and plain values; it can be pickled, and restored by any environment
+        that was built in the same way.
         """
         return {
             'made_for': self._task.signature,
@@ -224,10 +225,10 @@ class Environment(composer.Environment):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_state` returned; the future then repeats bit for bit.
+        """Restores a state from `get_state`; the same actions then give bit-identical results.
 
         Raises:
-          ValueError: the state belongs to another environment; this one is left as it was.
+          ValueError: the state belongs to another environment; this one is unchanged.
         """
         expected, found = self._task.signature, state.get('made_for')
         if found != expected:
@@ -247,8 +248,8 @@ class Environment(composer.Environment):
     def __reduce__(self) -> tuple[Any, ...]:
         if self.recipe is None:
             raise TypeError(
-                'this environment was not made by trl_suite.suite, so nothing tells how to build '
-                'it again; pickle env.get_state() instead'
+                'this environment was not made by trl_suite.suite, so it cannot be rebuilt from a '
+                'pickle; pickle env.get_state() instead'
             )
         build, arguments = self.recipe
         return build, arguments, self.get_state()

@@ -23,7 +23,7 @@ def check(name: str) -> str:
     """Returns the name of a policy, one of `POLICIES` or a file.
 
     Raises:
-      ValueError: neither; the message has the closest matches.
+      ValueError: any other name; the message has the closest matches.
     """
     if name not in POLICIES and not name.endswith('.npz'):
         raise ValueError(errors.unknown('policy', name, (*POLICIES, 'FILE.npz')))
@@ -35,7 +35,7 @@ def trained(name: str, id: str) -> policies.Policy:
 
     Args:
       name: 'reference', or an .npz file.
-      id: of the environment, or an alias.
+      id: id or alias of the environment.
     """
     if name == 'reference':
         return policies.reference(catalogue.find(id).id)
@@ -47,15 +47,15 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
 
     Args:
       name: one of `POLICIES`, or an .npz file.
-      environment: which it acts in.
-      id: of the environment, or an alias.
-      seed: of 'random'.
+      environment: the environment that it acts in.
+      id: id or alias of the environment.
+      seed: seed of the policy 'random'.
 
     Returns:
       A function from time steps to actions in [-1, 1].
 
     Raises:
-      ValueError: the environment has no such policy, or the policy does not fit.
+      ValueError: the environment has no such policy, or the policy is incompatible with it.
       FileNotFoundError: there is no such file, or no reference is shipped.
     """
     size = len(environment.action_map)
@@ -84,9 +84,9 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
 
 
 def best(environment: Environment, id: str) -> tuple[str, Policy]:
-    """Returns name and policy of the first that an environment has: the order of `POLICIES`.
+    """Returns name and policy of the first of `POLICIES` that works in an environment.
 
-    What cannot act in its first state, as a clip cannot where torques act, does not count.
+    A policy that raises an error in the first state is skipped: 'clip' does with torque control.
     """
     time_step = environment.reset()
     for name in POLICIES:

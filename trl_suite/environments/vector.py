@@ -1,11 +1,11 @@
-"""Many simulations of one environment on threads, each on a terrain of its own, as arrays.
+"""Many simulations of one environment, each on its own terrain, stepped on threads, as arrays.
 
     environments = VectorEnvironment('PD_Biped2D_Gaps_Terrain-v0', num_envs=64, seed=1)
     observation = environments.reset()
     step = environments.step(actions)  # (64, 11) in [-1, 1]
 
-Simulation i behaves, bit for bit, as the single environment whose seed is `environments.seeds[i]`,
-whatever the number of simulations and threads, and whenever simulations are reset.
+Simulation i is bit-identical to the single environment with the seed `environments.seeds[i]`, for
+any number of simulations and threads, and whenever other simulations are reset.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ AUTORESET = ('next_step', 'same_step', 'disabled')
 
 
 class Step(NamedTuple):
-    """What one step of all simulations returned.
+    """The results of one step of all simulations.
 
     Attributes:
       observation: (n, size), or a dict of blocks (n, ...) in order.
       reward: (n,).
-      terminated: simulations that failed, (n,) bool.
-      truncated: simulations that were cut by the step or time limit, (n,) bool.
-      info: arrays of n simulations: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), and with
-        autoreset 'same_step' 'final_observation' where 'ended' says so.
+      terminated: whether the episode failed, (n,) bool.
+      truncated: whether the step or time limit ended the episode, (n,) bool.
+      info: arrays (n, ...) by name: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), ...;
+        with autoreset 'same_step' also 'ended' and, if an episode ended, 'final_observation'.
     """
 
     observation: Any
@@ -51,17 +51,18 @@ class Step(NamedTuple):
 class VectorEnvironment:
     """n simulations of one environment.
 
-    Autoreset is what Gymnasium 1 calls so. With 'next_step' a simulation that has ended ignores its action
-    in the next step and returns the first observation of a new episode with reward 0. With
-    'same_step' it begins anew in the step in which it ended; the observation is then the new
-    episode's, and the last one is in `info['final_observation']`. With 'disabled' the caller resets
-    simulations; stepping an ended simulation raises.
+    `autoreset` has the modes of Gymnasium 1. With 'next_step', a simulation whose episode has ended
+    ignores its action in the next step and returns the first observation of a new episode with
+    reward 0. With 'same_step', it is reset in the step in which its episode ended: the observation
+    is the first of the new episode, and the last one of the old episode is in
+    `info['final_observation']`. With 'disabled', the caller resets simulations; stepping a
+    simulation whose episode has ended raises an exception.
 
     Attributes:
       num_envs: number of simulations n.
       seeds: seed of each simulation, (n,) uint32.
-      blocks: where each observation block lies in the flat vector.
-      action_map: what actions mean.
+      blocks: slice of each observation block in the flat vector.
+      action_map: the map from actions to physical units.
       control_timestep: duration of a step, s.
     """
 
@@ -78,21 +79,22 @@ class VectorEnvironment:
         step_limit: int | None = -1,
         task_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        """Compiles one light model and makes n simulations of it.
+        """Compiles one model without visual assets and makes n simulations of it.
 
         Args:
-          environment: id, alias, or row of the catalogue.
+          environment: id, alias, or `EnvSpec`.
           num_envs: number of simulations.
-          num_threads: threads that step the physics; 0 takes all cores.
-          seed: of the whole: simulation i gets the i-th number that
-            `numpy.random.SeedSequence(seed).generate_state(n)` gives. Or a sequence of n seeds, one
-            per simulation. Drawn from the system if None.
+          num_threads: threads that step the physics; 0 uses all cores.
+          seed: one seed for all: simulation i gets the i-th number of
+            `numpy.random.SeedSequence(seed).generate_state(n)`. Or a sequence of n seeds, one
+            per simulation. Drawn from the operating system if None.
           autoreset: one of `AUTORESET`.
-          dtype: of observations and rewards, float64 or float32.
-          flat_observation: give one array of all blocks side by side, else a dict of blocks.
-          step_limit: control steps after which an episode is cut; by default the simulation's own.
-          task_kwargs: as for `suite.load`, `time_limit` (s) and `step_limit` included, which goes
-            before the argument above; the seed is an argument here, not an option.
+          dtype: type of observations and rewards, float64 or float32.
+          flat_observation: return observations as one array instead of a dict of blocks.
+          step_limit: control steps after which an episode is truncated; by default (-1) that of the
+            `EnvSpec`; None for no limit.
+          task_kwargs: as for `suite.load`, including `time_limit` (s) and `step_limit`, which
+            overrides the argument above; not `random`, for which the argument `seed` is used.
 
         Raises:
           ValueError: unknown names or options, or numbers out of range.
@@ -142,11 +144,11 @@ class VectorEnvironment:
         seed: int | Sequence[int] | None,
         env_ids: np.ndarray | Sequence[int] | None = None,
     ) -> None:
-        """Gives some simulations, or all, new streams of random numbers, from which resets draw.
+        """Reseeds the random streams, from which resets draw, of some simulations or of all.
 
         Args:
-          seed: of all n simulations, as the constructor takes it.
-          env_ids: simulations that get theirs; numbers, or a mask (n,) bool; None for all.
+          seed: one seed for all n simulations or n seeds, as for the constructor.
+          env_ids: numbers of the simulations to reseed, or a mask (n,) bool; None for all.
         """
         if seed is None or np.ndim(seed) == 0:
             sequence = np.random.SeedSequence(seed)  # type: ignore[arg-type]
@@ -166,11 +168,12 @@ class VectorEnvironment:
         env_ids: np.ndarray | Sequence[int] | None = None,
         seed: int | Sequence[int] | None = None,
     ) -> Any:
-        """Begins an episode in some simulations, or in all, without touching the others.
+        """Begins an episode in some simulations, or in all; the others are unchanged.
 
         Args:
           env_ids: numbers of simulations, or a mask (n,) bool; None for all.
-          seed: also seed these simulations anew, as the constructor does: as part of a seed of all n.
+          seed: reseeds these simulations first: one seed for all n simulations or n seeds, as for
+            the constructor.
 
         Returns:
           The observations of all simulations.
@@ -189,12 +192,15 @@ class VectorEnvironment:
         """Takes one step in every simulation, or in some.
 
         Args:
-          action: (n, k) in [-1, 1], clipped there.
-          env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others do not move; their
-            reward and its terms are 0, and all else in `info` is of their last step.
+          action: (n, k), clipped to [-1, 1].
+          env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others are not
+            stepped: their reward and its terms are 0, and their other entries of `info` are those
+              of
+            their last step.
 
         Raises:
-          ValueError: an action of another shape, or with NaN or infinity; the simulation is named.
+          ValueError: an action of the wrong shape, or with NaN or infinity; the message names the
+            simulation.
           RuntimeError: before the first reset, after `close`, in a forked process, or with autoreset
             'disabled' for a simulation that has ended.
         """
@@ -215,7 +221,7 @@ class VectorEnvironment:
             over = np.isin(part, resetting)
             self.begin(part[over])
             task.step(action, part[~over])
-            # A slice of neighbours is copied faster than a choice of simulations.
+            # A slice is copied faster than an array of indices.
             near = len(part) and part[-1] - part[0] == len(part) - 1
             env_ids = slice(part[0], part[-1] + 1) if near else part
             observation[env_ids] = task.observation[env_ids]
@@ -249,15 +255,15 @@ class VectorEnvironment:
 
     @property
     def info(self) -> dict[str, Any]:
-        """What happened in each simulation's last step, or its reset: see the task's `info`."""
+        """Further results of each simulation's last step or reset: see the task's `info`."""
         self._check_usable()
         return self._task.info()
 
     def render(self, env_id: int = 0, **options: Any) -> np.ndarray:
-        """Draws one simulation; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
+        """Renders one simulation, (h, w, 3) uint8; options as for `trl_suite.rendering.frame`."""
         self._check_usable()
         assert self._world is not None
-        if self._picture is None:  # the batch's models have no pictures in them
+        if self._picture is None:  # the models of the simulations have no visual assets
             self._picture = Environment(build_task(self.spec, self._task_kwargs))
             self._picture.reset()
         self._picture.task.set_state(0, self._task.get_state(env_id))
@@ -266,7 +272,7 @@ class VectorEnvironment:
 
     @property
     def task(self) -> Task:
-        """The rules, with arrays of n simulations."""
+        """The task, whose arrays have a leading axis of n simulations."""
         self._check_usable()
         return self._task
 
@@ -281,7 +287,7 @@ class VectorEnvironment:
             self._picture = None
 
     def get_state(self, env_ids: Sequence[int] | None = None) -> dict[str, Any]:
-        """Returns everything that the future of some simulations, or of all, depends on.
+        """Returns the complete state of some simulations, or of all.
 
         Args:
           env_ids: numbers of m simulations; None for all.
@@ -301,15 +307,15 @@ class VectorEnvironment:
         }
 
     def set_state(self, state: dict[str, Any], env_ids: Sequence[int] | None = None) -> None:
-        """Restores what `get_state` of an environment of the same id and options returned.
+        """Restores a state from `get_state` of an environment with the same id and options.
 
         Args:
-          state: of m simulations.
-          env_ids: numbers of the m simulations that go on from it, each named once; None for all.
+          state: state of m simulations.
+          env_ids: numbers of the m simulations to restore, without repeats; None for all.
 
         Raises:
-          ValueError: the state has another number of simulations, or there are no such simulations.
-          RuntimeError: some simulations are restored before the first reset.
+          ValueError: the state has another number of simulations, or `env_ids` is invalid.
+          RuntimeError: only some simulations are restored before the first reset.
         """
         self._check_usable()
         assert self._world is not None
@@ -336,19 +342,19 @@ class VectorEnvironment:
     def copy_from(
         self, other: VectorEnvironment, other_rows: Sequence[int], env_ids: Sequence[int]
     ) -> None:
-        """Puts some simulations where simulations of another environment are, to try what would come of an action.
+        """Copies the state of simulations of another environment, e.g. to try actions.
 
-        Random numbers and seeds stay: the simulations share the present, and the future as far as nothing is
-        drawn.
+        Random streams and seeds are not copied: the copies evolve identically until a random number
+        is drawn from these streams.
 
         Args:
-          other: environment of the same id and options.
+          other: environment with the same id and options.
           other_rows: numbers of its simulations.
-          env_ids: as many simulations of this one; each may be named once.
+          env_ids: numbers of as many simulations of this environment, without repeats.
 
         Raises:
-          ValueError: another environment, or as many simulations do not exist.
-          RuntimeError: one of the two was never reset.
+          ValueError: an environment with another id or options, or invalid simulation numbers.
+          RuntimeError: one of the two environments was never reset.
         """
         self._check_usable()
         other._check_usable()
@@ -357,11 +363,12 @@ class VectorEnvironment:
         assert self._world is not None and other._world is not None
         if other.spec != self.spec or other._task_kwargs != self._task_kwargs:
             raise ValueError(
-                f'simulations of {other.spec.id} cannot go on in {self.spec.id} as it is here'
+                f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options differ'
             )
         if len(other_rows) != len(env_ids) or len(self._numbers(env_ids)) != len(env_ids):
             raise ValueError(
-                f'{len(other_rows)} simulations to put into simulations {list(env_ids)}'
+                f'cannot copy {len(other_rows)} simulations to simulations {list(env_ids)}; expected '
+                'as many different ones'
             )
         other._numbers(other_rows)
         for source, env_id in zip(other_rows, env_ids, strict=True):
@@ -371,12 +378,12 @@ class VectorEnvironment:
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(
-            'a live batch cannot be pickled; pickle what made it (id, num_envs, seed) and '
-            'get_state(), and build it again where it is needed'
+            'a vector environment cannot be pickled; pickle its arguments (id, num_envs, seed) and '
+            'get_state(), and construct a new one from these'
         )
 
     def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
-        """Has the threads do some work, each for a part of the simulations."""
+        """Calls `work` on the threads, each time for a part of the simulations."""
         assert self._world is not None
         if self._task.in_parts:
             self._world.share(work, env_ids)
@@ -384,7 +391,7 @@ class VectorEnvironment:
             work(env_ids)
 
     def begin(self, env_ids: np.ndarray) -> None:
-        """Begins episodes in some simulations; `reset` checks its arguments and observes as well."""
+        """Begins episodes in some simulations, without the checks and observations of `reset`."""
         if not len(env_ids):
             return
         self._task.reset(env_ids, [self._random[env_id] for env_id in env_ids.tolist()])
@@ -395,7 +402,7 @@ class VectorEnvironment:
         return self._parts(self._task.observation.astype(self.dtype))
 
     def _parts(self, flat: np.ndarray) -> Any:
-        """Returns observations (n, size) as they are given: one array, or a dict of blocks."""
+        """Returns observations (n, size) in the form that the user gets: an array, or a dict."""
         if self.flat_observation:
             return flat
         return {name: flat[:, part] for name, part in self.blocks.items()}
@@ -406,12 +413,12 @@ class VectorEnvironment:
         env_ids = np.asarray(env_ids)
         if env_ids.dtype == bool:
             if env_ids.shape != (self.num_envs,):
-                raise ValueError(f'a mask of shape {env_ids.shape}; expected ({self.num_envs},)')
+                raise ValueError(f'mask has shape {env_ids.shape}; expected ({self.num_envs},)')
             return np.flatnonzero(env_ids)
         numbers = np.unique(env_ids.astype(int))
         if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < self.num_envs):
             raise ValueError(
-                f'simulations {env_ids.tolist()} of an environment of {self.num_envs} simulations'
+                f'env_ids are {env_ids.tolist()}; expected numbers in [0, {self.num_envs})'
             )
         return numbers
 
@@ -420,6 +427,6 @@ class VectorEnvironment:
             raise RuntimeError('the environment is closed')
         if os.getpid() != self._pid:
             raise RuntimeError(
-                'a vector environment does not survive a fork: its threads stay in the parent. Make '
-                "it in the child, or start processes with multiprocessing's 'spawn'"
+                'a vector environment cannot be used after a fork: the child has no copy of its '
+                "threads. Make it in the child, or use multiprocessing's start method 'spawn'"
             )

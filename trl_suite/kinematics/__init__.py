@@ -1,1 +1,1 @@
-"""What tasks measure of a character: places, velocities and contacts, relative to its ground."""
+"""Kinematics of characters for tasks: positions, velocities and contacts relative to the ground."""

@@ -1,4 +1,4 @@
-"""A planar character on planar ground: what every planar task measures, and how it is placed."""
+"""A planar character on planar ground: measurements for all planar tasks, and initial placement."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
 
-CLEARANCE = 0.001  # m; left under every link at the start
-_UPRIGHT = np.pi / 2  # rad; beyond it a trunk may point backwards
+CLEARANCE = 0.001  # m; between links and ground after the initial placement
+_UPRIGHT = np.pi / 2  # rad; below this pitch a trunk points forwards
 
 
 class PlanarBody(NamedTuple):
@@ -25,11 +25,11 @@ class PlanarBody(NamedTuple):
       qpos, dof: addresses of x, z, pitch and the joints, (3 + J,).
       links: body ids, the root body first, (L,).
       effectors: body ids of the end effectors, (E,).
-      share: of each link in the mass, (L,).
-      about_com: whether end effectors are measured from the centre of mass, else from the root.
-      samples: where ground heights are observed, ahead of the root, (S,) m.
+      share: mass of each link over the total mass, (L,).
+      about_com: whether end effector positions are relative to the centre of mass, not to the root.
+      samples: x of observed ground heights, relative to the root, (S,) m.
       fall, contact: addresses of contact sensors of fall links and of end effectors.
-      terrain, pose, velocity: where these blocks begin in an observation.
+      terrain, pose, velocity: first columns of these blocks in an observation.
     """
 
     qpos: np.ndarray
@@ -60,17 +60,17 @@ class PlanarState(NamedTuple):
 
 
 class PlanarMeasurement(NamedTuple):
-    """What `measure` finds beside the observation.
+    """Results of `measure` in addition to the observation.
 
     Attributes:
       facing: 1, or -1 while the trunk points backwards, (n,).
       under: height of the ground under the root, (n,) m.
-      height: of the root above it, (n,) m.
-      effectors: end effectors: all x ahead of the centre of mass, or of the root, then all z above
-        the ground, (n, 2 * E) m.
-      com_velocity: of the centre of mass, (n, 2) m/s.
-      leaving: whether the window of ground has to be laid anew, (n,).
-      waiting: whether ground that a simulation looks back on has to be drawn first, (n,).
+      height: height of the root above the ground, (n,) m.
+      effectors: end effectors: all x relative to the centre of mass, or to the root, then all z
+        above the ground, (n, 2 * E) m.
+      com_velocity: velocity of the centre of mass, (n, 2) m/s.
+      leaving: whether the character has left its ground window, which must then be moved, (n,).
+      waiting: whether ground outside the window must be drawn before the measurement, (n,).
     """
 
     facing: np.ndarray
@@ -84,7 +84,7 @@ class PlanarMeasurement(NamedTuple):
 
 @compiled
 def facing_of(i: int, body: PlanarBody, state: PlanarState) -> float:
-    """Returns 1, or -1 where the trunk points backwards and so looks backwards."""
+    """Returns 1, or -1 if the trunk points backwards: the terrain is then observed backwards."""
     pitch = state.qpos[i, body.qpos[2]]
     return -1.0 if abs(pitch) > _UPRIGHT and math.cos(pitch) < 0.0 else 1.0
 
@@ -93,7 +93,7 @@ def facing_of(i: int, body: PlanarBody, state: PlanarState) -> float:
 def looks_outside(
     i: int, facing: float, body: PlanarBody, state: PlanarState, ground: PlanarWindows
 ) -> bool:
-    """Whether a character that looks backwards sees ground beyond its window."""
+    """Returns whether ground samples or end effectors of a character are outside its window."""
     x = state.qpos[i, body.qpos[0]]
     for sample in body.samples:
         if planar_ground.is_outside(i, x + sample * facing, ground):
@@ -106,7 +106,11 @@ def looks_outside(
 
 @compiled
 def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows) -> bool:
-    """Whether `PlanarArena.widen` has to be called before a character can be measured."""
+    """Returns whether `PlanarArena.widen` must be called before a character can be measured.
+
+    The terrain is drawn on demand; a character that points backwards may need ground outside its
+    window.
+    """
     if ground.is_wide[i]:
         return False
     facing = facing_of(i, body, state)
@@ -118,7 +122,7 @@ def measure(
     i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
     found: PlanarMeasurement,
 ) -> None:  # fmt: skip
-    """Writes the blocks terrain, pose and velocity, and what else tasks compare.
+    """Writes the blocks terrain, pose and velocity, and the other measurements.
 
     Positions are relative to the root, heights to the ground under it; x is mirrored while the trunk
     points backwards.
@@ -169,7 +173,7 @@ def measure(
 
 @compiled
 def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
-    """Whether a fall link touches the ground."""
+    """Returns whether a fall link touches the ground."""
     for sensor in body.fall:
         if state.sensordata[i, sensor] != 0.0:
             return True
@@ -180,7 +184,7 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 def leaves(
     i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, found: PlanarMeasurement
 ) -> bool:
-    """Whether a window of ground must be laid anew; notes it."""
+    """Writes and returns whether a character has left its ground window, which must be moved."""
     found.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
     return found.leaving[i]
 
@@ -190,7 +194,7 @@ class PlanarFigure:
 
     Attributes:
       body: its ids, after `bind`; see `PlanarBody`.
-      state: the fields of the physics that it is measured by.
+      state: the fields of the physics from which it is measured.
       pose_qpos, pose_dof: addresses of x, z, pitch and the joints in link order.
       links, effectors: body ids, in link order.
       geoms: ids of the collision geoms.
@@ -212,11 +216,11 @@ class PlanarFigure:
 
         Args:
           character: a planar character; it is attached to the arena and given root joints.
-          arena: where it moves.
-          behind: where the line of observed ground heights begins, m behind the root.
-          ahead: where it ends, m ahead of the root.
-          samples: number of heights on that line; 0 is blind.
-          contact: whether to sense the contacts of end effectors too.
+          arena: the arena with its terrain.
+          behind: distance behind the root at which the observed ground heights begin, m.
+          ahead: distance ahead of the root at which they end, m.
+          samples: number of observed ground heights; 0 for none.
+          contact: whether to add contact sensors for end effectors too.
         """
         self.character, self.arena = character, arena
         character.create_root_joints(arena.attach(character))
@@ -241,8 +245,8 @@ class PlanarFigure:
 
         Args:
           world: the simulations.
-          blocks: where terrain, pose and velocity lie in what `measure` writes.
-          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
+          blocks: slices of terrain, pose and velocity in the array that `measure` writes.
+          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
         """
         self._world = world
         self.arena.bind(world)
@@ -269,11 +273,11 @@ class PlanarFigure:
 
     @property
     def ground(self) -> PlanarWindows:
-        """The ground under all simulations, for compiled functions."""
+        """The ground of all simulations, for compiled functions."""
         return self.arena.ground
 
     def measurement(self) -> PlanarMeasurement:
-        """Makes room for what `measure` finds."""
+        """Allocates the results of `measure`."""
         n = self._world.n
         return PlanarMeasurement(
             np.ones(n), np.zeros(n), np.zeros(n), np.zeros((n, 2 * len(self.effectors))),
@@ -281,24 +285,24 @@ class PlanarFigure:
         )  # fmt: skip
 
     def follow(self, env_ids: np.ndarray) -> None:
-        """Lays the windows of ground of some simulations anew, about where they are."""
+        """Moves the ground windows of some simulations to the positions of their characters."""
         self.arena.follow_all(env_ids, self._world.qpos[env_ids, self.pose_qpos[0]])
 
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray
     ) -> None:
-        """Puts the characters of some simulations at x = 0 onto the ground.
+        """Places the characters of some simulations on the ground, at x = 0.
 
-        Each is lifted until every link's bounding box is clear of the ground under its middle and
-        its ends; never lowered.
+        Each is raised until the bounding boxes of all collision geoms are above the ground, at the
+        middle and both ends of each; never lowered.
 
         Args:
-          env_ids: which simulations; they are reset.
-          poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); they
-            come back with x and z as placed.
-          rates: their velocities, (m, 3 + J).
-          extents: of the collision geoms in these poses, relative to the root, (m, 3, G); see
-            `trl_suite.kinematics.planar_reference.link_extents`.
+          env_ids: numbers of simulations, which are reset.
+          poses: x (ignored), z above the ground, pitch and joints in link order, (m, 3 + J); x and
+            z are overwritten with those of the placement.
+          rates: velocities, (m, 3 + J).
+          extents: extents of the collision geoms in these poses, relative to the root, (m, 3, G);
+            see `trl_suite.kinematics.planar_reference.link_extents`.
         """
         world = self._world
         world.reset(env_ids)
@@ -308,11 +312,11 @@ class PlanarFigure:
         world.forward(env_ids)
 
     def feet(self) -> np.ndarray:
-        """Returns where the end effectors are in the world, x and z, (n, E, 2) m."""
+        """Returns world positions of the end effectors, x and z, (n, E, 2) m."""
         return self._world.xpos[:, self.effectors, ::2]
 
     def ground_heights(self, env_id: int, x: np.ndarray) -> np.ndarray:
-        """Heights of the ground of one simulation at x (k,), m."""
+        """Returns heights of the ground of one simulation at x (k,), m."""
         return self.arena.height(x[None], slice(env_id, env_id + 1))[0]
 
 
@@ -321,7 +325,7 @@ def put_down(
     env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray,
     body: PlanarBody, ground: PlanarWindows, qpos: np.ndarray, qvel: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes the poses and velocities of characters that stand at x = 0; see `PlanarFigure.place`."""
+    """Writes poses and velocities of characters placed at x = 0; see `PlanarFigure.place`."""
     for env_id in range(len(env_ids)):
         i = env_ids[env_id]
         height = poses[env_id, 1] + planar_ground.height(i, 0.0, ground)

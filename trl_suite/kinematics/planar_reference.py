@@ -1,4 +1,4 @@
-"""A motion clip on a planar character: poses to start from and features to compare with."""
+"""A motion clip on a planar character: initial poses, and features for the reward."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from trl_suite.motion import Clip
 from trl_suite.util.compiled import compiled
 
-SAMPLES = 1024  # per cycle; in our clips links are placed within 0.5 mm of the exact pose
+SAMPLES = 1024  # per cycle; for the suite's clips, link positions are then exact to 0.5 mm
 _SAMPLES = np.full(1, float(SAMPLES))
 
 
@@ -21,7 +21,7 @@ class ClipTable(NamedTuple):
 
     Attributes:
       table: features at SAMPLES phases, (SAMPLES, columns).
-      steps: differences to the next phase, (SAMPLES, columns).
+      steps: differences to the features at the next phase, (SAMPLES, columns).
       period: duration of the cycle, s.
     """
 
@@ -40,19 +40,19 @@ def feature(phase: float, column: int, clip: ClipTable) -> float:
 
 
 class Reference:
-    """Kinematics of a looping planar clip, tabulated once over the phase.
+    """Kinematics of a looping planar clip, tabulated over the phase.
 
-    Features of one phase, all independent of the ground and of the distance walked; see `columns`:
-      angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
-      effectors (2 * E,) end effectors: all x ahead of the centre of mass, or of the root, then all z
-        above 0, m;
+    Features of one phase, all independent of the ground and of the distance travelled; see
+      `columns`: angles (1 + J,) of pitch and joints in link order, rad; rates (1 + J,) rad/s;
+      effectors (2 * E,) end effectors: all x relative to the centre of mass, or to the root, then
+        all z above 0, m;
       com_velocity (2,) m/s; height of the root, m;
-      positions (2 * links,) link centres relative to the root, x and z by turns, m;
+      positions (2 * links,) link centres relative to the root, x and z alternating, m;
       velocities (2 * links,) of the link centres, m/s;
       root_rate (2,) velocity of the root in x and z, m/s;
-      extents (3 * G,) of the collision geoms: centres ahead of the root, half lengths, lowest
-        points above the root, m;
-      phase itself; quarter (bins,) one-hot of the part of the cycle that the phase lies in.
+      extents (3 * G,) of the collision geoms: x of centres relative to the root, half lengths in x,
+        z of lowest points relative to the root, m;
+      phase; quarter (bins,) one-hot of the part of the cycle.
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class Reference:
           clip: a looping clip with a planar root, its joints in link order.
           model: the compiled model of the character.
           pose_qpos: addresses in qpos of x, z, pitch and the joints in link order.
-          pose_dof: the same in qvel.
+          pose_dof: their addresses in qvel.
           links: body ids in link order, the root body first.
           effectors: body ids of the end effectors.
           geoms: ids of the collision geoms.
-          bins: parts of the cycle, a divisor of SAMPLES.
-          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
+          bins: number of parts of the cycle, a divisor of SAMPLES.
+          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
         """
         self.clip = clip
         self.period = clip.duration
@@ -127,10 +127,10 @@ class Reference:
         return ClipTable(self._table, self._steps, self.period)
 
     def state(self, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns where a character is at phases (n,).
+        """Returns the state of the reference at phases (n,).
 
         Returns:
-          Poses: x = 0, z above 0, pitch, joints, (n, 3 + J); their velocities, (n, 3 + J); and the
+          Poses: x = 0, z above 0, pitch, joints, (n, 3 + J); velocities, (n, 3 + J); and the
           extents of the collision geoms as `link_extents` gives them, (n, 3, G).
         """
         found, column = self.features(phase), self.columns
@@ -143,7 +143,7 @@ class Reference:
         """Returns the features at phases in [0, 1), shape (n,) -> (n, columns)."""
         u = phase * _SAMPLES
         sample = np.floor(u)
-        u = u - sample  # not in place: slower for a single number
+        u = u - sample  # in place would be slower for a single number
         index = sample.astype(np.int64)
         found = self._steps.take(index, 0)
         found *= u[:, None]
@@ -159,21 +159,21 @@ def tabulated(
     rates: np.ndarray,
     parts: Mapping[str, np.ndarray | slice],
 ) -> dict[str, np.ndarray]:
-    """Puts a model into many states and reads positions and velocities, nothing else simulated.
+    """Computes positions and velocities for many states of a model, without simulating.
 
     Args:
       model: the compiled model.
       pose_qpos: addresses in qpos of the columns of a pose.
-      pose_dof: addresses in qvel of those of a velocity.
+      pose_dof: addresses in qvel of the columns of a velocity.
       poses: (n, columns).
       rates: (n, columns).
-      parts: which simulations of which fields of MjData are wanted.
+      parts: names of fields of MjData -> their rows to return.
 
     Returns:
-      By name the fields (n, simulations, ...).
+      Field name -> array (n, rows, ...).
     """
     data = mujoco.MjData(model)
-    views = [getattr(data, name) for name in parts]  # they stay current
+    views = [getattr(data, name) for name in parts]  # updated in place
     found = {
         name: np.empty((len(poses), *view[part].shape))
         for view, (name, part) in zip(views, parts.items(), strict=True)
@@ -182,7 +182,7 @@ def tabulated(
     for i, (pose, rate) in enumerate(zip(poses, rates, strict=True)):
         data.qpos[pose_qpos] = pose
         data.qvel[pose_dof] = rate
-        # Contacts, inertia and forces would take most of the time.
+        # Not mj_forward: contacts, inertia and forces would take most of the time.
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
@@ -196,8 +196,8 @@ def link_velocities(centres: np.ndarray, cvel: np.ndarray, about: np.ndarray) ->
 
     Args:
       centres: link centres, x and z, m, shape (..., links, 2).
-      cvel: spatial velocities (angular, linear) about `about`, shape (..., links, 6).
-      about: centre of mass of the whole tree, where MuJoCo keeps cvel, x and z, m, (..., 1, 2).
+      cvel: spatial velocities (angular, linear) at the point `about`, shape (..., links, 6).
+      about: centre of mass of the whole tree, the origin of MuJoCo's cvel, x and z, m, (..., 1, 2).
 
     Returns:
       Velocities in x and z, m/s, shape (..., links, 2).

@@ -1,4 +1,4 @@
-"""A character in three dimensions: what every spatial task measures, and how it is placed.
+"""A character in three dimensions: measurements for all spatial tasks, and initial placement.
 
 The heading frame of a character has its origin on the ground under the root, x along the root's
 heading, y to the left and z up.
@@ -21,7 +21,7 @@ from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES, SpatialWindows, see_movers
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
-CLEARANCE = 0.001  # m; left under every link at the start
+CLEARANCE = 0.001  # m; between links and ground after the initial placement
 LINK_POSE, LINK_VELOCITY = 7, 6  # numbers of each link in the blocks pose and velocity
 
 
@@ -36,10 +36,10 @@ class SpatialBody(NamedTuple):
       hinges: addresses of the angles of the other joints.
       links: body ids, the root body first, (L,).
       effectors: body ids of the end effectors, (E,).
-      share: of each link in the mass, (L,).
-      about_com: whether end effectors are measured from the centre of mass, else from the root.
+      share: mass of each link over the total mass, (L,).
+      about_com: whether end effector positions are relative to the centre of mass, not to the root.
       fall: addresses of the contact sensors of fall links.
-      contact: addresses of those of end effectors, (E, sensors of each).
+      contact: addresses of the contact sensors of end effectors, (E, sensors per end effector).
     """
 
     qpos: np.ndarray
@@ -69,22 +69,22 @@ class SpatialState(NamedTuple):
 
 
 class SpatialMeasurement(NamedTuple):
-    """What `measure` finds, simulations of n simulations.
+    """Results of `measure` for n simulations.
 
     Attributes:
-      root, com: of the root and of the centre of mass, (n, 3) m.
-      heading: of the root, rad to the left of +x, (n,).
-      cosine, sine: of the heading, (n,).
+      root, com: positions of the root and of the centre of mass, (n, 3) m.
+      heading: heading of the root, rad to the left of +x, (n,).
+      cosine, sine: cosine and sine of the heading, (n,).
       under: height of the ground under the root, (n,) m.
-      feet: the end effectors' joints in the world, (n, E, 3) m.
-      com_velocity: of the centre of mass, world axes, (n, 3) m/s.
+      feet: world positions of the end effectors' joints, (n, E, 3) m.
+      com_velocity: velocity of the centre of mass, world axes, (n, 3) m/s.
       contact: 1 where an end effector touches the ground, (n, E).
       fallen: whether a fall link touches the ground, (n,).
-      pose: height of the root above the ground, then of each link the position of its centre from
-        the root in the heading frame (3) and its orientation in it (4), w not negative, (n, 7L + 1).
-      velocity: of each link the velocity of its centre against the ground under the root (3) and
-        its angular velocity (3), in the heading frame, (n, 6L).
-      features: what is compared with a reference, (n, F); see `feature_columns`.
+      pose: height of the root above the ground, then for each link the position of its centre from
+        the root (3) and its orientation (4), w not negative, in the heading frame, (n, 7L + 1).
+      velocity: for each link the velocity of its centre relative to the ground under the root (3)
+        and its angular velocity (3), in the heading frame, (n, 6L).
+      features: features to compare with a reference, (n, F); see `feature_columns`.
     """
 
     root: np.ndarray
@@ -103,7 +103,7 @@ class SpatialMeasurement(NamedTuple):
 
 
 def measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
-    """Makes room for what `measure` finds of n characters."""
+    """Allocates the results of `measure` for n characters."""
     links, effectors = len(body.links), len(body.effectors)
     columns = feature_columns(body)
     return SpatialMeasurement(
@@ -118,10 +118,11 @@ def measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
 def feature_columns(body: SpatialBody) -> dict[str, slice]:
     """Returns name -> columns of the features of a character.
 
-    `rotations`, quaternions of the root without its heading and of the ball joints; `angles` of the
-    hinges, rad; `rates` of the root in the heading frame and of all joints, rad/s; `effectors` in
-    the heading frame, in x and y from the middle that was asked for, in z above the ground, m;
-    `com_velocity` in world axes, m/s; `height` of the root above the ground, m.
+    `rotations`: quaternions of the root without its heading and of the ball joints; `angles`: of
+    the hinges, rad; `rates`: of the root in the heading frame and of all joints, rad/s;
+    `effectors`: end effector positions in the heading frame, x and y from the centre of mass or the
+    root (see `SpatialBody.about_com`), z above the ground, m; `com_velocity`: in world axes, m/s;
+    `height`: of the root above the ground, m.
     """
     sizes = {
         'rotations': 4 + len(body.balls), 'angles': len(body.hinges),
@@ -155,7 +156,7 @@ def measure(
     cosine, sine = math.cos(heading), math.sin(heading)
     half_cosine, half_sine = math.cos(0.5 * heading), -math.sin(0.5 * heading)
     under = spatial_ground.height(i, root_x, root_y, ground)
-    drift_x = drift_y = 0.0  # of the ground under the root, m/s
+    drift_x = drift_y = 0.0  # velocity of the ground under the root, m/s
     if ground.box_velocity.shape[1] + ground.mover_top.shape[1] > 0:
         drift_x, drift_y = spatial_ground.velocity(i, root_x, root_y, ground)
     found.root[i, 0], found.root[i, 1], found.root[i, 2] = root_x, root_y, root_z
@@ -247,14 +248,14 @@ def measure(
 
 @compiled_inline
 def ahead_and_left(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
-    """Returns a horizontal vector of the world in the heading frame."""
+    """Converts a horizontal vector from world axes to the heading frame."""
     cosine, sine = found.cosine[i], found.sine[i]
     return cosine * x + sine * y, cosine * y - sine * x
 
 
 @compiled_inline
 def polar(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
-    """Returns bearing (rad to the left) and length of a horizontal vector of the world."""
+    """Returns bearing (rad to the left) and length of a horizontal vector in world axes."""
     ahead, left = ahead_and_left(i, x, y, found)
     return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
 
@@ -263,7 +264,7 @@ def polar(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float,
 def write_body(
     i: int, pose: int, velocity: int, found: SpatialMeasurement, observation: np.ndarray
 ) -> None:
-    """Writes the blocks pose and velocity into an observation, at these columns."""
+    """Writes the blocks pose and velocity to an observation, from these columns on."""
     for k in range(found.pose.shape[1]):
         observation[i, pose + k] = found.pose[i, k]
     for k in range(found.velocity.shape[1]):
@@ -274,7 +275,7 @@ def write_body(
 def write_terrain(
     i: int, column: int, ground: SpatialWindows, found: SpatialMeasurement, observation: np.ndarray
 ) -> None:
-    """Writes the map of heights around a character; nothing if the column is negative."""
+    """Writes the height map around a character to an observation, unless the column is negative."""
     if column >= 0:
         block = observation[i, column : column + SAMPLES * SAMPLES]
         x, y = found.root[i, 0], found.root[i, 1]
@@ -282,7 +283,7 @@ def write_terrain(
 
 
 class Measured(NamedTuple):
-    """What the loop over characters works on."""
+    """Data for loops over characters."""
 
     body: SpatialBody
     state: SpatialState
@@ -301,8 +302,8 @@ class Corners(NamedTuple):
     """Corners of the boxes of a character.
 
     Attributes:
-      bodies: which link each is on, (C,).
-      places: in the frame of the link, (C, 3) m.
+      bodies: body id of the link of each corner, (C,).
+      places: positions in the frame of the link, (C, 3) m.
     """
 
     bodies: np.ndarray
@@ -314,7 +315,10 @@ def put_down(
     i: int, env_id: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
     measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
-    """Puts the character of simulation i on the ground; see `SpatialFigure.place`, whose simulation it is."""
+    """Places the character of simulation i, from row `env_id` of poses, rates and spawns.
+
+    See `SpatialFigure.place`.
+    """
     body, physics, ground = measured.body, measured.state, measured.ground
     for k in range(len(body.qpos)):
         physics.qpos[i, body.qpos[k]] = poses[env_id, k]
@@ -361,7 +365,7 @@ def put_down_all(
     env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray,
     corners: Corners, measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
-    """Puts characters on the ground; takes packs."""
+    """Places characters on the ground; takes packs."""
     for env_id in range(len(env_ids)):
         put_down(env_ids[env_id], env_id, poses, rates, spawns, corners, measured, engine)
 
@@ -371,17 +375,17 @@ class SpatialFigure:
 
     Attributes:
       body: its ids, after `bind`; see `SpatialBody`.
-      state: the fields of the physics that it is measured by.
-      found: what was measured last.
+      state: the fields of the physics from which it is measured.
+      found: the last measurement.
       pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
       links: body ids, in link order.
-      blocks: observation blocks of the body, with their sizes.
+      blocks: sizes of the observation blocks of the body.
     """
 
     body: SpatialBody
     state: SpatialState
     found: SpatialMeasurement
-    fields: tuple[str, ...] = ('xquat',)  # of MjData, beside those that every world binds
+    fields: tuple[str, ...] = ('xquat',)  # further fields of MjData to bind, see `World`
 
     def __init__(
         self, character: Character, arena: SpatialArena, terrain_observation: bool
@@ -390,8 +394,8 @@ class SpatialFigure:
 
         Args:
           character: a spatial character; it is attached to the arena and given a free joint.
-          arena: where it moves.
-          terrain_observation: whether it sees the heights around it, 32 x 32 samples.
+          arena: the arena with its terrain.
+          terrain_observation: whether ground heights around it are observed, 32 x 32 samples.
         """
         self.character, self.arena, self.terrain_observation = character, arena, terrain_observation
         (self._root,) = character.create_root_joints(arena.attach(character))
@@ -425,7 +429,7 @@ class SpatialFigure:
 
         Args:
           world: the simulations.
-          about: from where end effectors are measured, the centre of mass ('com') or the 'root'.
+          about: origin of end effector positions, the centre of mass ('com') or the 'root'.
         """
         self._world = world
         self.arena.bind(world)
@@ -454,7 +458,7 @@ class SpatialFigure:
         self._pack = packed(Measured(self.body, self.state, self.ground, self.found))
         geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
-        boxes = model.geom_aabb[geoms, None]  # middle and half sides, in the geoms' frames
+        boxes = model.geom_aabb[geoms, None]  # centres and half sizes, in the geoms' frames
         corners = quaternion.rotate(
             model.geom_quat[geoms, None], boxes[..., :3] + signs * boxes[..., 3:]
         )
@@ -464,7 +468,7 @@ class SpatialFigure:
 
     @property
     def ground(self) -> SpatialWindows:
-        """The ground under all simulations, for compiled functions."""
+        """The ground of all simulations, for compiled functions."""
         return self.arena.surroundings.arrays
 
     @property
@@ -480,22 +484,23 @@ class SpatialFigure:
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray
     ) -> None:
-        """Puts the characters of some simulations on the ground.
+        """Places the characters of some simulations on the ground.
 
-        Each is lifted until the corners of all its boxes are clear of the ground; never lowered.
+        Each is raised until the corners of all its bounding boxes are above the ground; never
+        lowered.
 
         Args:
-          env_ids: which simulations; their physics was reset.
-          poses: of a free root that stands at the origin, z above the ground, and the joints in link
-            order, (m, columns of a pose).
-          rates: their velocities, (m, columns of a velocity).
-          spawns: where the origin is put: x, y in m, and by how much it is turned, rad, (m, 3).
+          env_ids: numbers of simulations whose physics has been reset.
+          poses: free root, with z above the ground, then joints in link order, (m, columns of a
+            pose).
+          rates: velocities, (m, columns of a velocity).
+          spawns: displacement x, y (m) and rotation about z (rad) of these poses, (m, 3).
         """
         world = self._world
         put_down_all(env_ids, poses, rates, spawns, self._corners, self._pack, world.pack)
 
 
 def _addresses(starts: np.ndarray, sizes: Any) -> np.ndarray:
-    """Returns the addresses of blocks of columns, one block after the other."""
+    """Returns the concatenated addresses of blocks with these starts and sizes."""
     blocks = [start + np.arange(size) for start, size in zip(starts, sizes, strict=True)]
     return np.concatenate(blocks) if blocks else np.zeros(0, int)

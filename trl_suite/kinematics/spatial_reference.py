@@ -1,4 +1,4 @@
-"""The reference motion of a spatial character: a looping clip, or single steps, as numbers."""
+"""The reference motion of a spatial character: features of a looping clip, or of single steps."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class TrackTable(NamedTuple):
     """Features of tracks for compiled functions; see `SpatialReference` for their columns.
 
     Attributes:
-      table: of all tracks one after the other, (tracks * (samples + 1), columns).
+      table: features of all tracks, one track after the other, (tracks * (samples + 1), columns).
       steps: differences to the next sample, (tracks * (samples + 1), columns).
-      samples: parts into which a track is cut.
+      samples: number of intervals of a track.
     """
 
     table: np.ndarray
@@ -48,7 +48,7 @@ class TrackTable(NamedTuple):
 
 @compiled_inline
 def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
-    """Returns where a share in [0, 1] of a track lies: a simulation of the table, and what is beyond it."""
+    """Returns the row of the table for a fraction in [0, 1] of a track, and the remainder."""
     u = share * tracks.samples
     sample = min(max(math.floor(u), 0.0), tracks.samples - 1.0)
     return int(sample) + track * (tracks.samples + 1), u - sample
@@ -56,17 +56,18 @@ def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
 
 @compiled_inline
 def feature(env_id: int, rest: float, column: int, tracks: TrackTable) -> float:
-    """Returns a feature at a moment."""
+    """Returns a feature, interpolated at a row and remainder from `moment`."""
     return tracks.steps[env_id, column] * rest + tracks.table[env_id, column]
 
 
 class SpatialReference:
     """Features of tracks, each tabulated over [0, 1]: one looping clip, or many single steps.
 
-    All are independent of where the reference is and of the ground, which lies at 0.
+    Except `heading` and `root`, they are independent of the position and heading of the reference.
+    The ground is at height 0.
 
     Attributes:
-      columns: those of `feature_columns` first, then `heading` rad and `root` x, y (m) of the
+      columns: those of `feature_columns` first, then `heading` (rad) and `root` x, y (m) on the
         track's own path, then `positions` (3 * links) of link centres from the root and
         `velocities` (3 * links) of them, both in the heading frame, m and m/s.
       tracks: the table, for compiled functions.
@@ -78,11 +79,11 @@ class SpatialReference:
         """Tabulates tracks.
 
         Args:
-          body: of the character.
+          body: ids of the character.
           model: its compiled model.
-          poses: of each track at evenly spaced moments, the last one the end, (tracks, samples + 1,
-            columns of a pose).
-          rates: the velocities, (tracks, samples + 1, columns of a velocity).
+          poses: poses of each track at evenly spaced times, including its end, (tracks, samples +
+            1, columns of a pose).
+          rates: velocities, (tracks, samples + 1, columns of a velocity).
         """
         count, samples = poses.shape[0], poses.shape[1] - 1
         n, links = count * (samples + 1), len(body.links)
@@ -112,13 +113,13 @@ class SpatialReference:
 
     @classmethod
     def of_clip(cls, clip: Clip, body: SpatialBody, model: mujoco.MjModel) -> SpatialReference:
-        """The cycle of a looping clip as track 0."""
+        """Returns a reference with the cycle of a looping clip as track 0."""
         times = np.linspace(0, clip.duration, CYCLE_SAMPLES + 1)
         return cls(body, model, clip.pose(times)[None], clip.velocity(times)[None])
 
     @classmethod
     def of_steps(cls, steps: Steps, body: SpatialBody, model: mujoco.MjModel) -> SpatialReference:
-        """A library: its k steps in right stance as tracks 0 to k - 1, then those in left stance."""
+        """Returns a reference with a library's k steps in right stance, then their mirror images."""
         times = np.linspace(0, steps.duration, STEP_SAMPLES + 1)
         index = np.tile(np.arange(len(steps)), 2)[:, None]
         mirrored = (np.arange(2 * len(steps)) >= len(steps))[:, None]
@@ -126,7 +127,7 @@ class SpatialReference:
         return cls(body, model, poses, steps.velocity(index, times, mirrored))
 
     def features(self, share: np.ndarray, track: np.ndarray) -> np.ndarray:
-        """Returns the features of tracks (n,) at shares (n,) in [0, 1] of them, (n, columns)."""
+        """Returns the features of tracks (n,) at fractions (n,) in [0, 1], (n, columns)."""
         tracks = self.tracks
         u = share * tracks.samples
         sample = np.minimum(np.floor(u), tracks.samples - 1)
@@ -137,18 +138,18 @@ class SpatialReference:
 def _stacked(
     model: mujoco.MjModel, body: SpatialBody, poses: np.ndarray, rates: np.ndarray
 ) -> SpatialState:
-    """Returns the physics of a character in poses (n, ...) with rates (n, ...), nothing simulated."""
+    """Returns fields of the physics for poses (n, ...) and rates (n, ...), without simulating."""
     names = [name for name in SpatialState._fields if name != 'sensordata']
     everything = dict.fromkeys(names, slice(None))
     found = tabulated(model, body.qpos, body.dof, poses, rates, everything)
     found['sensordata'] = np.zeros((len(poses), model.nsensordata))
     for name, array in found.items():
-        array.flags.writeable = name in WRITABLE  # of the types that the fields of a world have
+        array.flags.writeable = name in WRITABLE  # for the same Numba types as those of a world
     return SpatialState(**found)
 
 
 def _continuous(features: np.ndarray, rotations: slice) -> np.ndarray:
-    """Returns features (tracks, samples + 1, F) as simulations, no quaternion jumping to its negative."""
+    """Returns features (tracks, samples + 1, F) as rows, without sign flips of quaternions."""
     part = features[..., rotations]
     q = part.reshape(*part.shape[:2], -1, 4)
     flips = np.cumprod(np.where((q[:, 1:] * q[:, :-1]).sum(3) < 0, -1, 1), axis=1)
@@ -158,11 +159,11 @@ def _continuous(features: np.ndarray, rotations: slice) -> np.ndarray:
 
 
 def mean_targets(clip_poses: np.ndarray, clip: Clip | Steps) -> np.ndarray:
-    """Returns the mean target of every degree of freedom over poses, left and right made alike.
+    """Returns the mean target of every degree of freedom over poses and their mirror images.
 
     Args:
       clip_poses: (k, columns of a pose).
-      clip: whose layout the poses have.
+      clip: motion with the layout of these poses.
 
     Returns:
       Rotation vectors of ball joints in rad, angles of hinges, in link order.

@@ -1,1 +1,1 @@
-"""Every environment as data."""
+"""All environments, as data."""

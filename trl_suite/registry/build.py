@@ -1,4 +1,4 @@
-"""From the data of an environment to its task."""
+"""Builds the task of an `EnvSpec`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
 def task_type(spec: EnvSpec) -> TaskType | None:
-    """Returns the task type of an environment; None where a function of the user's makes the task."""
+    """Returns the task type of an environment; None if a custom function makes the task."""
     own = spec.own.get('task_type')
     if own is None:
         return TASK_TYPES[spec.task_type]
@@ -30,13 +30,13 @@ def task_type(spec: EnvSpec) -> TaskType | None:
 
 
 def character_of(spec: EnvSpec) -> characters.CharacterSpec:
-    """Returns the data of an environment's character."""
+    """Returns the spec of an environment's character."""
     character = spec.part('character')
     return characters.CHARACTERS[character] if isinstance(character, str) else character
 
 
 def config_of(spec: EnvSpec) -> type[Config] | None:
-    """Returns the options of an environment's task; None of a function of the user's."""
+    """Returns the config class of an environment's task; None for a user's function without one."""
     type_ = task_type(spec)
     if type_ is not None:
         return type_.config
@@ -45,7 +45,7 @@ def config_of(spec: EnvSpec) -> type[Config] | None:
 
 
 def task_options(spec: EnvSpec) -> list[Option]:
-    """Returns the options of an environment's task, besides those of every task."""
+    """Returns the options of an environment's task, except those that all tasks have."""
     config = config_of(spec)
     if config is None:
         known = [
@@ -61,16 +61,16 @@ def task_options(spec: EnvSpec) -> list[Option]:
 
 
 def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
-    """Builds the task of an environment, for a plain `composer.Environment` or many simulations.
+    """Builds the task of an environment, for a single simulation or many.
 
     Args:
-      spec: of the environment.
-      options: of the task that override those of the spec; besides those every task takes `rewards`,
-        `observations` and `failures`, see `trl_suite.tasks.composed`.
+      spec: spec of the environment.
+      options: options of the task, which override those of the spec; in addition, every task has
+        the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
 
     Raises:
-      ValueError: an unknown option, or one out of range; the message has the closest matches. Or
-        parts that do not fit each other.
+      ValueError: an unknown option (the message has the closest matches), a value out of range, or
+        parts that are incompatible.
     """
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
@@ -91,7 +91,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
         config = config_type.of(spec.id, merged, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
-            f'{spec.task}: joints are driven by {" or ".join(type_.actuations or ())} control, not by '
+            f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
     parts = _parts(spec, type_)
@@ -107,14 +107,14 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
 
 
 def _policy(source: Any) -> Any:
-    """Returns the policy that is shipped for an id or alias; what is no id stays as it is."""
+    """Returns the policy shipped for an id or alias; other sources are returned unchanged."""
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
     return policies.reference(find(source).id)
 
 
 def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
-    """Makes what the task is composed of."""
+    """Makes the parts of the task."""
     character, ground = character_of(spec), terrains.load(spec.part('terrain'))
     if ground.spatial != character.spatial:
         presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS

@@ -1,7 +1,7 @@
-"""Every environment as data: ids of the paper, aliases, tags, one-line descriptions.
+"""All environments as data: ids as in the papers, aliases, tags, one-line descriptions.
 
 Environments tagged 'original' are registered in the original simulator; those tagged 'completion' are
-combinations that its papers name and its registry lacks.
+combinations that its papers name or imply but that it does not register.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ALIASES: dict[str, EnvSpec] = {
 
 
 def find(id: str) -> EnvSpec:
-    """Returns the row of an id or alias.
+    """Returns the `EnvSpec` of an id or alias.
 
     Raises:
       ValueError: unknown id; the message has the closest matches.

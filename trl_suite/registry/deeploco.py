@@ -1,4 +1,4 @@
-"""DeepLoco: footstep controllers, high-level tasks above one, and the same tasks without hierarchy.
+"""DeepLoco: footstep controllers, tasks that plan footsteps, and these tasks without hierarchy.
 
 Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 """
@@ -21,7 +21,7 @@ def _step(
     original: bool = True,
     aliases: tuple[str, ...] = (),
     differences: tuple[str, ...] = (
-        'the steps are our own, 27 of them; the original chooses among 14 captured ones',
+        'the 27 reference steps were made for this suite; the original has 14 from motion capture',
     ),
     **options: Any,
 ) -> EnvSpec:
@@ -51,7 +51,7 @@ _STEP2D = EnvSpec(
     terrain='flat',
     task_type='planar_footsteps',
     clip='biped2d_full_walk',
-    description='The biped with arms walks along planned footsteps, straight on over flat ground.',
+    description='The biped with arms walks straight ahead along planned footsteps on flat ground.',
     tags=frozenset({'planar', 'flat', 'completion'}),
 )
 
@@ -62,16 +62,17 @@ _STEPS = (
     ),
     _step(
         'PD_Biped3D_LLC_Symetric_Step-v0', 'llc_symmetric_step',
-        'walks along planned footsteps; what it sees and does is mirrored in left stance',
+        'walks along planned footsteps; observation and action are mirrored in left stance',
         aliases=('PD_Biped3D_LLC_Symmetric_Step-v0',), mirrored=True,
     ),
     _step(
         'PD_Biped3D_LLC_Run_FootStep-v0', 'llc_run_footstep', 'runs along planned footsteps',
         character='biped3d_mocap_run',
         differences=(
-            'the footstep is rewarded in the second half of every step; in the original that clock is slower '
-            'than the steps',
-            "the step is our own, 3.83 m/s; the original's is captured, 4.4 m/s",
+            'the landing place is rewarded in the second half of every step; in the original, the clock '
+            'of this reward is slower than the steps',
+            "the reference step was made for this suite, 3.83 m/s; the original's is from motion capture, "
+            '4.4 m/s',
         ),
         plans={'length': (1.15, 1.15), 'turn': 0.0, 'sharp': 0.0},
     ),
@@ -82,7 +83,7 @@ _STEPS = (
     ),
     _step(
         'PD_Biped3D_LLC_Trail_Step-v0', 'llc_trail_step',
-        'walks along footsteps that head for goals on a trail', preset='trail3d2', original=False,
+        'walks along planned footsteps towards goals on a trail', preset='trail3d2', original=False,
         goal=True, plans={'length': (0.4, 0.4)},
     ),
     _step(
@@ -92,8 +93,8 @@ _STEPS = (
     ),
 )  # fmt: skip
 
-HIKE_LIMIT = 400  # plans after which an episode is cut: 200 s
-RUN_LIMIT = 667  # the same of a run, whose footsteps last 0.3 s
+HIKE_LIMIT = 400  # footsteps after which an episode is truncated: 200 s
+RUN_LIMIT = 667  # the same for running, where a footstep lasts 0.3 s
 
 
 def _hike(
@@ -110,9 +111,9 @@ def _hike(
         task_type=task_type,
         clip=character,
         options=MappingProxyType(options),
-        description=f'The 3D biped {words}; an action plans its next two footsteps.',
+        description=f'The 3D biped {words}; an action plans the next two footsteps.',
         differences=(
-            f'MuJoCo at 300 Hz instead of Bullet at {rate} Hz; task option substeps',
+            f'MuJoCo at 300 Hz instead of Bullet at {rate} Hz; see the option substeps',
             *differences,
         ),
         tags=frozenset({'spatial', 'hierarchical', 'original' if original else 'completion'}),
@@ -121,7 +122,7 @@ def _hike(
     )
 
 
-_FROM_ZERO = (0.0,)  # phase of the start
+_FROM_ZERO = (0.0,)  # phase of the clock at the start
 _HIKES = (
     _hike('LargeBlocks', 'obstacles3d', 'goes from goal to goal among large blocks'),
     _hike(
@@ -134,8 +135,8 @@ _HIKES = (
         'Forest', 'pillars3d', 'goes from goal to goal between the pillars of a forest',
         rate=3000,
         differences=(
-            'the heights of its pillars are observed; the original gives a map of velocities that are all '
-            'zero',
+            'terrain heights are observed, including the pillars; the original observes surface velocities, '
+            'which are all zero',
         ),
         start_phases=_FROM_ZERO,
     ),
@@ -171,7 +172,7 @@ def _hard(
         task_type=task_type,
         clip='biped3d_mocap_walk',
         options=MappingProxyType(options),
-        description=f'The 3D biped {words}, without hierarchy: by PD targets 30 times a second.',
+        description=f'The 3D biped {words}, without hierarchy: an action sets PD targets, at 30 Hz.',
         tags=frozenset({'spatial', 'flat_control', 'original' if original else 'completion'}),
         aliases=aliases,
     )

@@ -1,4 +1,4 @@
-"""Imitation: a motion clip is tracked with one of four actuation models, or in three dimensions.
+"""Imitation: tracking a motion clip, in the plane with four actuation models, or in 3D.
 
 Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 """
@@ -17,16 +17,16 @@ BY = {
     'velocity': 'joint velocity targets',
 }  # fmt: skip
 
-# Phases in the air. Where the clip brakes in stance, its hips turn at 12 rad/s, and the raptor's hip
-# extensors, which shorten as fast, pull with a third of what it takes: hardly a start there is
-# survived.
+# Phases in the air. In stance the clip brakes: its hips turn at 12 rad/s, and at the corresponding
+# shortening velocity the raptor's hip extensors produce a third of the force that braking requires,
+# so that nearly all episodes that start there fail.
 _FLIGHT = ((0.25, 0.5), (0.75, 1.0))
 
 
 def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec:
     run = '_Run' if clip == 'biped2d_run' else ''
-    # Where servos or torques drive joints hard into their limits, limits hold at 600 Hz; see
-    # benchmarks/physics_rate.md.
+    # Servos or torques that push joints against their limits need 600 Hz to keep within the limits;
+    # see benchmarks/physics_rate.md.
     fine = model == 'velocity' or (model == 'torque' and character != 'biped2d')
     id_ = f'{PREFIX[model]}_{NAMES[character]}_LLC_Imitate{run}_Flat-v0'
     figure = NAMES[character][:-2].lower()
@@ -35,8 +35,8 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec
     if (character, model) == ('raptor', 'muscle'):
         options['start_phase'] = _FLIGHT
         differences = (
-            'episodes start in the air, in phases 0.25 to 0.5 and 0.75 to 1: in stance its muscles cannot '
-            'brake the clip',
+            'episodes start in the air, at phases 0.25 to 0.5 and 0.75 to 1, since its muscles are too weak '
+            'to brake as the clip does in stance',
         )
     return EnvSpec(
         id=id_,
@@ -53,7 +53,7 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec
     )
 
 
-# Name in ids, preset, words. The original tracks a walk over all of them.
+# Name in ids, preset, words, whether the original has it. It tracks a walk over these.
 _SPATIAL_TERRAINS = (
     ('', 'plane', 'flat ground', True),
     ('Hills', 'hills3d', 'hills', True),
@@ -64,7 +64,9 @@ _SPATIAL_TERRAINS = (
 )
 
 
-_CLIPS = {'biped3d_walk': "the clip is our own, 1.2 m/s; the original's walks at 1.535 m/s"}
+_CLIPS = {
+    'biped3d_walk': "the clip was made for this suite, 1.2 m/s; the original's walks at 1.535 m/s"
+}
 
 
 def _spatial(
@@ -72,8 +74,8 @@ def _spatial(
 ) -> EnvSpec:
     gait = 'run' if clip.endswith('run') else 'walk'
     seeing = options.get('terrain_observation', False)
-    view = ', seeing the ground around it,' if seeing else ''
-    view = ', whose state it sees,' if options.get('reference_observation') else view
+    view = ', observing the terrain around it,' if seeing else ''
+    view = ', whose state is observed,' if options.get('reference_observation') else view
     return EnvSpec(
         id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}{"_Terrain" if seeing else ""}-v0',
         domain='imitation',
@@ -83,11 +85,14 @@ def _spatial(
         terrain=preset,
         task_type='spatial_imitation',
         differences=(
-            _CLIPS.get(clip, "the clip is our own, close to the original's in gait and speed"),
+            _CLIPS.get(
+                clip,
+                "the clip was made for this suite, with gait and speed close to the original's",
+            ),
         ),
         clip=clip,
         options=MappingProxyType(options),
-        description=f'The 3D biped tracks a {gait}{view} straight on over {words} by PD targets.',
+        description=f'The 3D biped tracks a {gait}{view} straight ahead over {words} by PD targets.',
         tags=frozenset({'spatial', 'original' if original else 'completion'}),
     )
 
@@ -98,7 +103,7 @@ SPECS = (
         for character, clips in (
             ('biped2d', ('biped2d_walk', 'biped2d_walk')),
             ('dog', ('dog_bound', 'dog_bound')),
-            # The original tracks another run of the raptor with PD than with the other models.
+            # For the raptor, the original tracks one run with PD control and another otherwise.
             ('raptor', ('raptor_run_050', 'raptor_run_066')),
         )
         for model, clip in (
@@ -109,7 +114,7 @@ SPECS = (
     _imitation('biped2d', 'position', 'biped2d_run', original=False),
     _imitation('biped2d', 'muscle', 'biped2d_run', original=False),
     *(_spatial(*terrain) for terrain in _SPATIAL_TERRAINS),
-    # The original is blind on all of them.
+    # The original does not observe the terrain in these environments.
     *(_spatial(*terrain[:3], False, terrain_observation='height') for terrain in _SPATIAL_TERRAINS[1:]),
     _spatial('Track', 'plane', 'flat ground', True, reference_observation=True),
     _spatial('Run', 'plane', 'flat ground', False, clip='biped3d_run'),

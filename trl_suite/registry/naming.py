@@ -1,6 +1,6 @@
-"""How ids and descriptions name characters and their gaits, and what the original registers."""
+"""Names of characters and gaits in ids and descriptions, and which ids the original registers."""
 
-# The original's name of each character in ids, and the words for descriptions.
+# Names of characters in the original's ids, and words for the gaits in descriptions.
 NAMES = {'biped2d': 'Biped2D', 'biped2d_full': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D'}
 GAITS = {
     'biped2d_walk': 'walk', 'biped2d_run': 'run', 'biped2d_full_walk': 'walk', 'dog_bound': 'bound',
@@ -15,5 +15,5 @@ NOT_REGISTERED = {
 
 
 def status(id_: str, original: bool) -> str:
-    """Returns the tag that tells whether the original registers an environment."""
+    """Returns the tag for whether the original registers an environment."""
     return 'original' if original and id_ not in NOT_REGISTERED else 'completion'

@@ -10,15 +10,15 @@ from types import MappingProxyType
 from trl_suite.registry.naming import GAITS, NAMES, status
 from trl_suite.registry.spec import EnvSpec
 
-SAMPLES = 50  # heights that are observed, unless an environment is blind
+SAMPLES = 50  # observed terrain heights, except in blind environments
 CHARACTERS = {
     'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound', 'raptor': 'raptor_run_050',
 }  # fmt: skip
 # Name in ids, preset, words.
 TERRAINS = (
     ('Flat', 'flat', 'flat ground'),
-    ('Incline', 'inclines', 'a steady ramp of about 10 degrees'),
-    ('Steps', 'steps_humanoid', 'ever ascending steps of 5 to 15 cm'),
+    ('Incline', 'inclines', 'a constant incline of about 10 degrees'),
+    ('Steps', 'steps_humanoid', 'ascending steps of 5 to 15 cm'),
     ('Slopes', 'slopes_humanoid', 'rough rolling slopes'),
     ('Gaps', 'gaps_humanoid', 'gaps 25 to 30 cm wide'),
     ('Walls', 'walls_humanoid', 'walls 5 to 25 cm high'),
@@ -31,7 +31,7 @@ def _plaid(character: str, name: str, preset: str, words: str, blind: bool) -> E
     clip = CHARACTERS[character]
     id_ = f'PD_{NAMES[character]}_{name}{"" if blind else "_Terrain"}-v0'
     figure = NAMES[character][:-2].lower()
-    view = 'without seeing the ground' if blind else 'seeing 3 m of ground ahead'
+    view = 'without observing the terrain' if blind else 'observing 3 m of terrain ahead'
     return EnvSpec(
         id=id_,
         domain='plaid',

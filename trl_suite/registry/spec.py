@@ -1,4 +1,4 @@
-"""What an environment is, as data."""
+"""The specification of an environment, as data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-STEP_LIMIT = 256  # control steps after which an episode is cut
+STEP_LIMIT = 256  # steps after which an episode is truncated
 _MAPPINGS = ('options', 'own')
 
 
@@ -17,10 +17,10 @@ def _empty() -> Mapping[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
-    """One environment: names only, and beside them objects of the user's own.
+    """One environment: names of its parts, and custom objects in place of some of them.
 
     Attributes:
-      id: id in the paper's manner.
+      id: id, named as in the papers.
       domain: family, for `suite.load`.
       task: name within the family, for `suite.load`.
       character: name in `trl_suite.characters.CHARACTERS`.
@@ -28,13 +28,15 @@ class EnvSpec:
       terrain: a preset, or a file that `trl_suite.terrain.load` takes.
       description: one line.
       task_type: name in `trl_suite.registry.task_types.TASK_TYPES`.
-      clip: a clip or a library of steps in mocap/, or a file; None where the task type tracks nothing.
-      options: of the task type, where they differ from its defaults.
-      tags: for selection.
+      clip: name of a clip or library of steps in mocap/, or a file; None if the task type has no
+        reference motion.
+      options: options of the task type that differ from its defaults.
+      tags: tags by which environments can be selected.
       aliases: other ids.
-      step_limit: control steps after which an episode is cut.
-      differences: from the original, in sentences, beside those of the task type.
-      own: objects of the user's in place of what 'character', 'terrain', 'clip' or 'task_type' names.
+      step_limit: steps after which an episode is truncated.
+      differences: differences from the original, in sentences, in addition to those of the task
+        type.
+      own: custom objects that replace the named 'character', 'terrain', 'clip' or 'task_type'.
     """
 
     id: str
@@ -58,11 +60,11 @@ class EnvSpec:
         return _spec, ({**values, **{name: dict(values[name]) for name in _MAPPINGS}},)
 
     def part(self, name: str) -> Any:
-        """Returns what a field names: the user's object, or else the name."""
+        """Returns the custom object for a field if there is one, otherwise the field's name."""
         return self.own.get(name, getattr(self, name))
 
     def with_terrain(self, terrain: Any) -> EnvSpec:
-        """Returns the same environment on another terrain, whatever `trl_suite.terrain.load` takes."""
+        """Returns a copy with another terrain: anything that `trl_suite.terrain.load` takes."""
         own = {name: value for name, value in self.own.items() if name != 'terrain'}
         if not isinstance(terrain, str):
             own['terrain'], terrain = terrain, 'terrain'

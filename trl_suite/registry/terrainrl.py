@@ -1,4 +1,4 @@
-"""TerrainRL: planar characters driven through gait state machines over random terrain.
+"""TerrainRL: planar characters, controlled by gait state machines, on random terrain.
 
 Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from trl_suite.registry.spec import EnvSpec
 
-# Name in ids, preset, words; then who crosses it in a completion of ours.
+# Name in ids, preset, words.
 _GAIT_TERRAINS = (
     ('Gaps', 'gaps', 'gaps'),
     ('Cliffs', 'cliffs_humanoid', 'drops'),
@@ -23,16 +23,16 @@ _GAIT_CHARACTERS = {
 }  # fmt: skip
 _MORE_GAITS = (
     ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
-    ('dog', 'Tight_Gaps', 'tight_gaps', 'clusters of gaps with little room between'),
+    ('dog', 'Tight_Gaps', 'tight_gaps', 'clusters of closely spaced gaps'),
     ('dog', 'Slopes_Gaps', 'slopes_gaps0', 'gaps on rolling slopes'),
     ('dog', 'Slopes_Steps', 'slopes_steps', 'steps on rolling slopes'),
     ('dog', 'Slopes_Walls', 'slopes_walls', 'walls on rolling slopes'),
     ('raptor', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
-    ('raptor', 'Mixed_Raptor', 'mixed_raptor', 'gaps, walls and steps of its own size'),
+    ('raptor', 'Mixed_Raptor', 'mixed_raptor', 'gaps, walls and steps scaled to its size'),
     ('goat', 'Variable_Steps', 'cliffs_rugged', 'rugged stairs'),
     ('goat', 'Cliffs', 'cliffs_humanoid', 'drops'),
-    ('hopper', 'Gaps_Easy', 'gaps_hopper', 'gaps of its own size'),
-    ('hopper', 'Mixed_Easy', 'mixed_hopper', 'gaps, walls and steps of its own size'),
+    ('hopper', 'Gaps_Easy', 'gaps_hopper', 'gaps scaled to its size'),
+    ('hopper', 'Mixed_Easy', 'mixed_hopper', 'gaps, walls and steps scaled to its size'),
 )
 
 
@@ -46,7 +46,7 @@ def _gait(character: str, name: str, preset: str, words: str, original: bool) ->
         actuation='gait',
         terrain=preset,
         task_type='gait',
-        description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait of a cycle.',
+        description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait parameters of a cycle.',
         tags=frozenset({'planar', 'original' if original else 'completion'}),
     )
 

@@ -1,1 +1,1 @@
-"""Tasks: observation, reward, termination and reset, as rules of one simulation."""
+"""Tasks: observation, reward, termination and reset, as compiled functions of one simulation."""

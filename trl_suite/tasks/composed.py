@@ -1,4 +1,4 @@
-"""A task with reward terms, observation blocks and failures of the user's beside its own.
+"""Adds custom reward terms, observation blocks and failures to a task.
 
     def low(task):
         return (parts.height(task) < 0.7).astype(float)
@@ -8,7 +8,7 @@
         'observations': {'low': (1, low)},
     })
 
-The same `task_kwargs` go into `VectorEnvironment` and Gymnasium.
+`VectorEnvironment` and Gymnasium environments take the same `task_kwargs`.
 """
 
 from __future__ import annotations
@@ -28,15 +28,17 @@ OPTIONS = ('rewards', 'observations', 'failures')
 
 
 class Composed(Task):
-    """Rules of another task, and some more.
+    """Another task with additional reward terms, observation blocks and failures.
 
-    A function is given this task and returns an array with a simulation per simulation. What it may read:
-    `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], all attributes of the other
-    task, and `trl_suite.tasks.parts`. It must treat simulations alike and by themselves, and draw nothing.
+    Each custom function is called with this task and returns an array with one row per simulation.
+    It may read `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], and all
+    attributes of the other task, and call functions of `trl_suite.tasks.parts`. The row of a
+    simulation must depend on this simulation only, in the same way for all, and not on random
+    numbers.
 
     Attributes:
-      task: the other one.
-      action: what was last done, (n, k); 0 at a start.
+      task: the other task.
+      action: the last action, (n, k); 0 at the start of an episode.
     """
 
     def __init__(
@@ -50,15 +52,17 @@ class Composed(Task):
         """Composes the task.
 
         Args:
-          task: any task that nothing else uses.
-          rewards: name -> weight, function -> (n,). weight * value is added to the reward, but in
-            steps in which the other task fails.
-          observations: name -> size, function -> (n, size), or (n,) if the size is 1. Blocks
-            behind those of the other task.
-          failures: name -> function -> (n,) bool; where True, the episode ends with discount 0.
+          task: any task that no other environment uses.
+          rewards: name -> (weight, function); the function returns (n,). weight * value is added to
+            the reward, except in steps in which the other task fails.
+          observations: name -> (size, function); the function returns (n, size), or (n,) if the
+            size is 1. These blocks follow those of the other task.
+          failures: name -> function; it returns (n,) bool. Where True, the episode ends with
+            discount 0.
 
         Raises:
-          ValueError: a name that is taken, a weight or a size that is none, or no function.
+          ValueError: a name that is in use, an invalid weight or size, or an object that is not a
+            function.
         """
         self.task = task
         self._rewards, self._extras = dict(rewards or {}), dict(observations or {})
@@ -69,7 +73,7 @@ class Composed(Task):
             whole = isinstance(size, (int, np.integer)) and size > 0
             _check('observation', name, function, whole, f'size {size!r}')
             if name in task.blocks:
-                raise ValueError(f'the task has a block {name!r} already; name it otherwise')
+                raise ValueError(f'the task already has a block {name!r}; choose another name')
         for name, function in self._failures.items():
             _check('failure', name, function, True, '')
         self.set_timesteps(task.control_timestep, task.physics_timestep)
@@ -77,16 +81,16 @@ class Composed(Task):
         sizes = {name: part.stop - part.start for name, part in task.blocks.items()}
         self.blocks = consecutive(sizes | {name: size for name, (size, _) in self._extras.items()})
         self._own = sum(sizes.values())
-        self.mirror = None  # nothing tells how to reflect what was added
+        self.mirror = None  # unknown for the added blocks
 
     def __getattr__(self, name: str) -> Any:
-        if name == 'task' or name.startswith('__'):  # while being copied
+        if name == 'task' or name.startswith('__'):  # `task` is not set yet while a copy is made
             raise AttributeError(name)
         return getattr(self.task, name)
 
     @property
     def watch(self) -> Any:
-        """What is to be called within long steps, where the other task has such; for pictures."""
+        """Callback within steps of variable duration of the other task; for rendering."""
         return self.task.watch  # type: ignore[attr-defined]
 
     @watch.setter
@@ -116,14 +120,14 @@ class Composed(Task):
         self.failed[env_ids] = self.diverged[env_ids] = False
         self._write(env_ids)
 
-    in_parts = False  # functions of the user's read all simulations
+    in_parts = False  # custom functions compute the values of all simulations
 
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
         self.world.share(lambda part: self.task.step(action, part), env_ids)
         self._finish(env_ids)
 
-    # Of a plain composer.Environment, which calls these one by one.
+    # A plain composer.Environment calls these instead of `step`.
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
@@ -138,7 +142,7 @@ class Composed(Task):
         self._finish(self.world.all_ids)
 
     def _finish(self, env_ids: np.ndarray) -> None:
-        """Adds the terms and failures of the user's to what the other task found."""
+        """Adds the custom reward terms and failures to the outcome of the other task."""
         inner = self.task
         self.diverged[env_ids] = inner.diverged[env_ids]
         self._write(env_ids)
@@ -166,7 +170,10 @@ class Composed(Task):
             self.observation[usable, self.blocks[name]] = value[usable]
 
     def _ask(self, kind: str, name: str, function: Function, size: int) -> np.ndarray:
-        """Returns what a user's function says, (n, size), finite but where the physics broke down."""
+        """Returns the checked value of a custom function, (n, size).
+
+        It must be finite, except in simulations that have diverged, where it becomes 0.
+        """
         with np.errstate(invalid='ignore' if self.diverged.any() else 'warn'):
             value = np.asarray(function(self), dtype=float)
         n = self.world.n
@@ -183,11 +190,11 @@ class Composed(Task):
         return value
 
     def info(self) -> dict[str, Any]:
-        """As of the other task; the terms are of both."""
+        """Returns the info of the other task, with the custom reward terms added."""
         return self._added(self.task.info(), lambda term: term.copy())
 
     def info_of(self, env_id: int) -> dict[str, Any]:
-        """As of the other task; the terms are of both."""
+        """Returns `info` for one simulation, as numbers."""
         return self._added(self.task.info_of(env_id), lambda term: term.item(env_id))
 
     def _added(self, found: dict[str, Any], read: Callable[[np.ndarray], Any]) -> dict[str, Any]:
@@ -209,10 +216,10 @@ class Composed(Task):
 
 
 def compose(task: Task, parts: Mapping[str, Any]) -> Task:
-    """Returns a task with parts, some of the keyword arguments of `Composed`; itself if none.
+    """Returns a `Composed` task with these keyword arguments; the task itself if they are empty.
 
     Raises:
-      ValueError: parts that are none, see `Composed`; each must be a dict by name.
+      ValueError: an unknown keyword, a value that is not a dict by name, or see `Composed`.
     """
     for kind, entries in parts.items():
         if kind not in OPTIONS:
@@ -231,5 +238,5 @@ def _check(kind: str, name: str, function: Any, good: Any, number: str) -> None:
         raise ValueError(f'{kind} {name!r} is {function!r}; expected a function of the task')
     if not good:
         raise ValueError(
-            f'{kind} {name!r} has {number}; expected a number, of a size a positive one'
+            f'{kind} {name!r} has {number}; expected a finite weight, or a positive integer size'
         )

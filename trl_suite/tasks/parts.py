@@ -1,7 +1,8 @@
-"""Parts to compose tasks of: what a task's characters do, over a leading batch axis.
+"""Measurements of a task's character, for reward terms, observation blocks and failures.
 
-Each is a function of a task with a `figure`, as all families but the user's have, planar or spatial;
-one may be the function of a reward term or an observation block (see `trl_suite.tasks.composed`).
+Each is a function of a task and returns an array with a leading axis of n simulations, as
+`trl_suite.tasks.composed` expects. The task must have a `figure`, planar or spatial, as all tasks
+of the suite do.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def height(task: Any) -> np.ndarray:
 
 
 def speed(task: Any) -> np.ndarray:
-    """Speed of the root where it heads, m/s, (n,); in the plane along x."""
+    """Speed of the root along its heading, m/s, (n,); in the plane along x."""
     velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
     if not _spatial(task):
         return velocity[:, 0]
@@ -41,7 +42,7 @@ def speed(task: Any) -> np.ndarray:
 
 
 def heading(task: Any) -> np.ndarray:
-    """Where the root heads, rad to the left of +x, (n,); 0 in the plane."""
+    """Heading of the root, rad to the left of +x, (n,); 0 in the plane."""
     if not _spatial(task):
         return np.zeros(task.world.n)
     return quaternion.heading(task.world.qpos.take(task.figure.pose_qpos[3:7], 1))
@@ -61,7 +62,7 @@ def effort(task: Any) -> np.ndarray:
 
 
 def root(task: Any) -> np.ndarray:
-    """Where the root is, m, (n, 3)."""
+    """Position of the root, m, (n, 3)."""
     return task.world.xpos[:, task.figure.links[0]].copy()
 
 

@@ -1,4 +1,4 @@
-"""What tasks of a walker in three dimensions share: body, clock, actions, and how it is seen."""
+"""Base class of tasks for a 3D walker: body, clock, actions, observation, reflection."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from trl_suite.util.options import Config, option
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SpatialConfig(Config):
-    """Options of tasks of a walker in three dimensions that drive its joints."""
+    """Options of tasks for a 3D walker."""
 
     terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
     substeps: int = option(
@@ -59,12 +59,12 @@ class SpatialConfig(Config):
     )
     action_offset: str = option(
         'clip',
-        "pose at action 0: the mean of the motion ('clip'), left and right made alike, the working "
-        "'posture', or the 'original' map: an angle and an axis for every ball joint",
+        "pose at action 0: the mean of the reference motion made symmetric ('clip'), or the working "
+        "'posture'; 'original': the original's map, with an angle and an axis for every ball joint",
         choices=ACTION_OFFSETS, actuation='position',
     )  # fmt: skip
     action_scale: float | None = option(
-        None, 'joint angle per unit action; by default 1 about the clip, 1.5 about the posture',
+        None, "joint angle per unit action; by default 1 with action_offset 'clip', 1.5 with 'posture'",
         unit='rad', above=0, actuation='position',
     )  # fmt: skip
     start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
@@ -75,38 +75,41 @@ class SpatialConfig(Config):
         self._set('terrain_observation', maps(self.terrain_observation))
         start_phases(self.start_phase)
         if self.action_offset == 'original' and self.action_scale is not None:
-            raise ValueError("action_offset 'original' has ranges of its own: give no action_scale")
+            raise ValueError("action_offset 'original' has fixed ranges: it takes no action_scale")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MirroredConfig(SpatialConfig):
-    """Options of tasks whose walkers may see and act as in a mirror while the left foot stands."""
+    """Options of tasks that can mirror observations and actions in left stance."""
 
-    mirrored: bool = option(False, 'observe and act as if the right foot always stood first')
+    mirrored: bool = option(
+        False,
+        'mirror observations and actions in left stance, so that every step is in right stance',
+    )
 
 
 def maps(names: str | Collection[str]) -> tuple[str, ...]:
-    """Returns names of maps as a tuple, of one name or several."""
+    """Returns one or several names of maps as a tuple."""
     return (names,) if isinstance(names, str) else tuple(names)
 
 
 class SpatialTask(Task):
-    """A walker in three dimensions with a clock of the period of its motion.
+    """A 3D walker with a clock that has the period of its reference motion.
 
-    A subclass says how an episode starts, what a step is worth, and what else is observed; it adds
-    its blocks behind terrain, pose, velocity and phase.
+    A subclass defines the start of an episode, the reward, and further observation blocks, which
+    follow terrain, pose, velocity and phase.
 
     Attributes:
       figure: the character in every simulation.
-      clock: where each simulation is in its cycle.
-      period: of that, s.
-      mirror: how a policy may reflect what it observes; None if there is nothing to reflect.
+      clock: phase of each simulation in its cycle.
+      period: duration of a cycle, s.
+      mirror: reflection of observations and actions, for policies; None if it is not available.
     """
 
     TERMS: Mapping[str, tuple[float, float]]  # reward terms: weight, and scale of the error
-    ABOUT = 'com'  # from where end effectors are measured, or 'root'
+    ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
     fields: tuple[str, ...] = SpatialFigure.fields
-    config: Any  # of the subclass
+    config: Any  # options of the subclass
     period: float
 
     def __init__(
@@ -124,15 +127,15 @@ class SpatialTask(Task):
 
         Args:
           character: a spatial character without actuators; it is attached to the arena.
-          arena: where it moves.
-          motion: what poses and clock are taken from.
+          arena: the arena with its terrain.
+          motion: the reference motion.
           config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
           phase: whether the phase is observed.
           extras: sizes of the blocks of a subclass, by name.
 
         Raises:
-          ValueError: options that do not fit each other, or a motion that does not fit the character.
+          ValueError: incompatible options, or a motion that does not fit the character.
         """
         mirrored = getattr(config, 'mirrored', False)
         spec = character.spec
@@ -144,7 +147,7 @@ class SpatialTask(Task):
                 'need them'
             )
         if mirrored and not phase:
-            raise ValueError('mirrored observations need the phase, which tells left from right')
+            raise ValueError('mirrored observations need the phase, which tells the stance foot')
         self.character, self.arena, self.motion = character, arena, motion
         self.actuation_model, self.config = actuation_model, config
         self.mirrored = mirrored
@@ -159,20 +162,20 @@ class SpatialTask(Task):
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
-        self.joint_map = self.action_map  # from actions to the actuators
+        self.joint_map = self.action_map  # actions to actuators; a subclass may replace action_map
         full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
         self._full = self.blocks = consecutive(full)
         self._reflection = self._reflected() if phase and spec.mirror else None
         self.mirror: Mirror | None = self._reflection
         self._kept: np.ndarray = np.zeros(0, int)  # all
         if mirrored:
-            self.mirror = None  # what is mirrored already has nothing to reflect
+            self.mirror = None  # observations are mirrored already
             self._kept = self._canonical_columns()
             self.blocks = consecutive({
                 **self.figure.blocks, 'phase': 1 + MIRRORED_BINS, **self._canonical_extras(extras)
             })  # fmt: skip
 
-    # What a subclass has.
+    # Methods of a subclass.
 
     @abc.abstractmethod
     def _typical_poses(self) -> np.ndarray:
@@ -182,26 +185,27 @@ class SpatialTask(Task):
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Begins the grounds of some simulations; returns poses, rates, spawns: see `figure.place`.
+        """Draws ground and initial state of some simulations, and writes phases to `clock.start`.
 
-        Phases must be in `clock.start` afterwards.
+        Returns:
+          Poses, rates and spawns, see `SpatialFigure.place`.
         """
 
     @abc.abstractmethod
     def _extra_mirror(self, name: str) -> reflection3d.Reflection:
-        """Returns how a block of the subclass is reflected."""
+        """Returns the reflection of a block of the subclass."""
 
     def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns blocks of the subclass, with their sizes, as mirrored observations have them."""
+        """Returns sizes of the blocks of the subclass in mirrored observations."""
         return extras
 
     def _canonical_extra_columns(self, name: str) -> np.ndarray:
-        """Returns which columns of a block of the subclass mirrored observations keep."""
+        """Returns the columns of a block of the subclass that mirrored observations keep."""
         part = self._full[name]
         return np.arange(part.start, part.stop)
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        """What a subclass does once the characters of some simulations stand."""
+        """Called by `reset` after the characters of some simulations were placed."""
 
     # Binding.
 
@@ -215,13 +219,13 @@ class SpatialTask(Task):
         return f'{super().signature} of {" / ".join(parts)}'
 
     def _bind_rules(self, world: World) -> SpatialRules:
-        """Binds what all these tasks have; the subclass sets `saved` and `info_arrays` up."""
+        """Binds the common parts; a subclass may extend `saved` and `info_arrays` afterwards."""
         self.world, n = world, world.n
         figure = self.figure
         figure.bind(world, self.ABOUT)
         self.clock = Clock(np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n))
         self.travel = Travel(np.zeros((n, 3)), np.zeros(n))
-        self._random = [np.random.default_rng(0)] * n  # what is drawn within an episode
+        self._random = [np.random.default_rng(0)] * n  # for draws within an episode
         size = max(part.stop for part in self.blocks.values())
         self.outcome = outcome(n, size, len(self.TERMS))
         self._full_observation = self.outcome.observation
@@ -229,7 +233,7 @@ class SpatialTask(Task):
             size = max(part.stop for part in self._full.values())
             self._full_observation = np.zeros((n, size))
         scope = f'{self.character.mjcf_model.model}/'
-        # Actuators were added one after the other.
+        # The controls are consecutive.
         first = int(world.control_addresses([scope + self.joint_map.actuators[0]])[0])
         starts = {name: part.start for name, part in self._full.items()}
         self.info_arrays = {
@@ -266,7 +270,7 @@ class SpatialTask(Task):
 
     @property
     def cycles(self) -> np.ndarray:
-        """Time on the motion in periods: the phase, not wrapped, (n,)."""
+        """Time in periods of the motion: the phase, not wrapped, (n,)."""
         return self.clock.cycles
 
     # Episodes.
@@ -286,7 +290,7 @@ class SpatialTask(Task):
     def _begin_grounds(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> np.ndarray:
-        """Draws phases, grounds, generators and starts of simulations; returns spawns, (m, 3)."""
+        """Draws phase, ground, random stream and spawn of simulations; returns spawns, (m, 3)."""
         spawns = np.zeros((len(env_ids), 3))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             drawn = random_state.random_sample()
@@ -308,7 +312,7 @@ class SpatialTask(Task):
         self.clock.cycles[env_ids], self.clock.phase[env_ids] = cycles, cycles - np.floor(cycles)
 
     def _lay_ground(self, env_ids: np.ndarray, rules: SpatialRules) -> None:
-        """Lays the windows of ground anew that some simulations are leaving."""
+        """Moves the ground windows of those simulations that have left theirs."""
         leaving = env_ids[rules.leaving[env_ids]]
         self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
 
@@ -326,7 +330,7 @@ class SpatialTask(Task):
     # Left and right.
 
     def _reflected(self) -> Mirror:
-        """How full observations and actions are reflected."""
+        """Returns the reflection of full observations and actions."""
         parts = reflection3d.body(self.character)
         parts['phase'] = reflection3d.phase(PHASE_BINS)
         parts |= {name: self._extra_mirror(name) for name in self._full if name not in parts}
@@ -337,7 +341,7 @@ class SpatialTask(Task):
         )
 
     def _canonical_columns(self) -> np.ndarray:
-        """Which columns of a full observation in right stance a mirrored one has."""
+        """Returns the columns of a full observation in right stance that a mirrored one keeps."""
         columns = []
         for name, part in self._full.items():
             if name == 'phase':
@@ -350,13 +354,13 @@ class SpatialTask(Task):
 
 
 class Full(NamedTuple):
-    """The full observation as a part of the state of a task, (n, size)."""
+    """The full observation, as part of the state of a task, (n, size)."""
 
     observation: np.ndarray
 
 
 def check_motion(character: Character, motion: Clip | Steps) -> None:
-    """Checks that a motion is one of a spatial character.
+    """Checks that a motion is for this spatial character.
 
     Raises:
       ValueError: it is not; the message has the joints of both.
@@ -373,7 +377,7 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
 def position_range(
     typical_poses: np.ndarray, motion: Clip | Steps, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
-    """Returns the options of position control for a action_offset and a half range."""
+    """Returns the arguments of position control for an action_offset and an action_scale."""
     if action_offset == 'original':
         return {'rotations': 'angle_axis'}
     options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}

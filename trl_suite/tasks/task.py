@@ -1,4 +1,4 @@
-"""The base of all tasks: rules for n simulations at once, as a composer task."""
+"""The base class of all tasks, which are composer tasks for n simulations at once."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from trl_suite.util.compiled import compiled
 MOST_SUBSTEPS = 1000  # physics steps per control step
 MOST_SAMPLES = 10_000  # heights observed on a line
 # Meanings of options that several tasks have.
-START_PHASE = 'phase of every start, in [0, 1), or pairs to draw it between; by default any'
-TERRAIN_LEVEL = (
-    "which of the terrain's parameter sets to draw from: 0 is the first, 0.5 half-way to the second"
+START_PHASE = (
+    'phase at the start of an episode, in [0, 1), or pairs of bounds between which it is drawn; by '
+    'default drawn from [0, 1)'
 )
+TERRAIN_LEVEL = "index of the terrain's parameter set; fractions interpolate: 0.5 is half-way between sets 0 and 1"
 SPAWNS = ('intended', 'upstream')
-MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
+MAX_JOINT_SPEED = 200.0  # rad/s; above it a simulation counts as diverged
 
 
 class Marker(NamedTuple):
-    """Something that a task points out in pictures; the physics knows nothing of it.
+    """A shape that a task adds to rendered images; it has no effect on the physics.
 
     Attributes:
       shape: 'box', 'cylinder', 'sphere', 'ellipsoid', or 'arrow', which points along its yaw.
-      position: of its middle, of an arrow its tail, m.
-      size: as MuJoCo has it, m: half sides, radii, or of a cylinder radius and half height; of an
+      position: centre, or for an arrow its tail, m.
+      size: as in MuJoCo, m: half sizes, radii, or for a cylinder radius and half height; for an
         arrow radius, radius and length.
       colour: red, green, blue, opacity.
       yaw: rad.
@@ -49,15 +50,15 @@ class Marker(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step of each simulation came to; simulations of simulations.
+    """The results of a step, with a leading axis of n simulations.
 
     Attributes:
-      observation: all observation blocks side by side, (n, observation size).
+      observation: all observation blocks, concatenated, (n, observation size).
       reward: (n,).
-      reward_terms: its parts, weighted, (n, terms); 0 after a reset.
+      reward_terms: weighted terms of the reward, (n, terms); 0 after a reset.
       failed: whether the episode has ended with discount 0, (n,) bool.
-      diverged: whether that was because the physics became unstable, (n,) bool.
-      fell: whether it failed without that: a fall, or a foot that missed its place, (n,) bool.
+      diverged: whether it failed because the physics diverged, (n,) bool.
+      fell: whether it failed for another reason, a fall or a landing error, (n,) bool.
     """
 
     observation: np.ndarray
@@ -69,7 +70,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(n: int, size: int, terms: int = 0) -> Outcome:
-    """Makes room for n simulations, an observation of some size, and some reward terms."""
+    """Allocates the outcome of n simulations, for a size of observations and a number of terms."""
     return Outcome(
         np.zeros((n, size)), np.zeros(n), np.zeros((n, terms)), *np.zeros((3, n), bool)
     )  # fmt: skip
@@ -77,7 +78,7 @@ def outcome(n: int, size: int, terms: int = 0) -> Outcome:
 
 @compiled
 def begin(i: int, outcome: Outcome) -> None:
-    """Clears what the last episode of a simulation came to, but for its observation."""
+    """Resets the outcome of a simulation, except its observation."""
     outcome.reward[i] = 0.0
     outcome.failed[i] = outcome.diverged[i] = outcome.fell[i] = False
     for k in range(outcome.reward_terms.shape[1]):
@@ -86,7 +87,7 @@ def begin(i: int, outcome: Outcome) -> None:
 
 @compiled
 def conclude(i: int, failed: bool, outcome: Outcome) -> None:
-    """Sums the reward terms up, or drops them where the episode has failed."""
+    """Sets the reward to the sum of its terms, or both to 0 if the episode has failed."""
     outcome.failed[i] = failed
     outcome.fell[i] = failed and not outcome.diverged[i]
     reward = 0.0
@@ -99,7 +100,7 @@ def conclude(i: int, failed: bool, outcome: Outcome) -> None:
 
 @compiled
 def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
-    """Whether any of some velocities is beyond a limit, or no number."""
+    """Returns whether the magnitude of any of these velocities is above a limit, or NaN."""
     for k in dofs:
         if not abs(qvel[i, k]) <= limit:
             return True
@@ -107,30 +108,32 @@ def too_fast(i: int, dofs: np.ndarray, limit: float, qvel: np.ndarray) -> bool:
 
 
 class Task(composer.Task):
-    """Rules of an environment for n simulations at once.
+    """Observation, reward, termination and reset of an environment, for n simulations at once.
 
-    The rules of a family are compiled functions of one simulation `i` (see
-    `trl_suite.util.compiled`); its task holds the arrays that they work on and calls loops over
-    simulations. A task of the user's may do the same with plain NumPy.
+    The rules of the suite's tasks are compiled functions of one simulation `i` (see
+    `trl_suite.util.compiled`); the task holds the arrays that they use and calls loops over
+    simulations. A custom task may do the same with plain NumPy.
 
     An environment calls `bind` once, `reset` for simulations that begin an episode, and `step` for
-    those that take a step. A step is
+    those that take a step. A step consists of
 
-    1. `apply_action`: writes controls from actions, which it clips, and lays ground ahead;
+    1. `apply_action`: clips actions, writes controls, and moves ground windows if necessary;
     2. `simulate`: advances the physics;
     3. `finish_step`: clock, divergence, measurement, reward, failure, observation, in this order.
 
-    Threads call `reset` and `step` for parts of the simulations: each must touch the simulations that
-    it is given, and no others. The composer hooks below are the case n = 1, so that a plain `composer.Environment` runs
-    the task as well; but not one whose step lasts a variable time, which overrides `simulate`.
+    Threads call `reset` and `step` for parts of the simulations: each call may only change the
+    simulations that it is given. The composer hooks below are the case n = 1, so that a plain
+    `composer.Environment` can run the task, unless its steps have a variable duration: such a task
+    overrides `simulate`.
 
     Attributes:
-      world: the simulations, after compiling.
-      action_map: what an action means.
+      world: the simulations; set by `bind`.
+      action_map: the map from actions to physical units.
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
-      saved: tuples of arrays with n simulations that make up the state of the task, `outcome` among them.
-      info_arrays: what `info` tells, arrays of n simulations by name, or dicts of such; kept up to date.
+      saved: tuples of arrays (n, ...) that are the state of the task, including `outcome`.
+      info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays;
+        updated in place.
     """
 
     world: World
@@ -139,40 +142,45 @@ class Task(composer.Task):
     outcome: Outcome
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
-    CONFIG: Any = None  # its options: a subclass of `Config`, or {spatial: one} where they differ
-    fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
-    in_parts = True  # whether threads may each be given a part of the simulations
+    CONFIG: Any = None  # options: a subclass of `Config`, or a dict of them by `spec.spatial`
+    fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
+    in_parts = True  # whether threads may call the task for parts of the simulations
     _begun = False  # whether no step was taken since composer's reset
 
-    # What a family implements.
+    # Methods that a subclass implements.
 
     @abc.abstractmethod
     def bind(self, world: World) -> None:
-        """Resolves ids in a compiled world and allocates arrays of `world.n` simulations."""
+        """Resolves ids in a compiled world and allocates arrays for `world.n` simulations."""
 
     @abc.abstractmethod
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        """Draws terrain and start of some simulations, each from its stream, and observes them."""
+        """Begins episodes in some simulations: draws terrain and initial state, and observes.
+
+        Args:
+          env_ids: numbers of m simulations.
+          random_states: random streams of these simulations, m of them.
+        """
 
     @abc.abstractmethod
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        """Takes the actions of some simulations, among those of all, shape (n, k), in [-1, 1]."""
+        """Applies the actions of some simulations; `action`: of all, (n, k), in [-1, 1]."""
 
     @abc.abstractmethod
     def finish_step(self, env_ids: np.ndarray) -> None:
-        """Updates the outcome of some simulations after the physics has advanced."""
+        """Writes the outcome of some simulations, after the physics was advanced."""
 
     @abc.abstractmethod
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         """Writes the observations of some simulations, or of all, from the state of the world."""
 
-    # The step and the state, for all families.
+    # Step and state, for all tasks.
 
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         """Advances some simulations by one step.
 
         Args:
-          action: of all simulations, (n, k), in [-1, 1]; those of the others do not count.
+          action: actions of all simulations, (n, k), in [-1, 1]; those of the others are ignored.
           env_ids: sorted numbers of the simulations that take a step.
         """
         self.apply_action(action, env_ids)
@@ -184,20 +192,20 @@ class Task(composer.Task):
         self.world.step(self._substeps, env_ids)
 
     def info(self) -> dict[str, Any]:
-        """Returns what happened beyond observation and reward: arrays of n simulations, or dicts of such."""
+        """Returns further results by name: arrays of n simulations, or dicts of such arrays."""
         return _each(self.info_arrays, np.copy)
 
     def info_of(self, env_id: int) -> dict[str, Any]:
-        """Returns the same of one simulation, as numbers."""
+        """Returns `info` for one simulation, as numbers."""
         return _each(self.info_arrays, lambda array: array.item(env_id))
 
     def get_state(self, env_id: int) -> dict[str, Any]:
-        """Returns everything about one simulation that the world's state does not hold."""
+        """Returns the state of one simulation, except that of the world."""
         arrays = [[array[env_id].copy() for array in group] for group in self.saved]
         return {'arena': self.arena.state(env_id), 'arrays': arrays}  # type: ignore[attr-defined]
 
     def set_state(self, env_id: int, state: dict[str, Any]) -> None:
-        """Restores what `get_state` returned; the world's state is set afterwards."""
+        """Restores a state from `get_state`; the caller restores the world's state afterwards."""
         self.arena.restore(env_id, state['arena'])  # type: ignore[attr-defined]
         for group, values in zip(self.saved, state['arrays'], strict=True):
             for array, value in zip(group, values, strict=True):
@@ -205,7 +213,7 @@ class Task(composer.Task):
 
     @property
     def observation(self) -> np.ndarray:
-        """All observation blocks side by side, (n, observation size)."""
+        """All observation blocks, concatenated, (n, observation size)."""
         return self.outcome.observation
 
     @property
@@ -215,7 +223,7 @@ class Task(composer.Task):
 
     @property
     def reward_terms(self) -> np.ndarray:
-        """Its parts, weighted, (n, terms)."""
+        """Weighted terms of the reward, (n, terms)."""
         return self.outcome.reward_terms
 
     @property
@@ -225,12 +233,12 @@ class Task(composer.Task):
 
     @property
     def diverged(self) -> np.ndarray:
-        """Whether it has because the physics became unstable, (n,) bool."""
+        """Whether the episode has ended because the physics diverged, (n,) bool."""
         return self.outcome.diverged
 
     @property
     def signature(self) -> str:
-        """Which task this is, for people and to recognise the owner of a saved state."""
+        """A description of the task, for messages and to check which task a saved state is for."""
         blocks = ', '.join(f'{name} {part.stop - part.start}' for name, part in self.blocks.items())
         steps = f'{self._substeps} x {self.physics_timestep:.6g} s'
         return f'{type(self).__name__} by {self.action_map.quantity} ({blocks}; {steps})'
@@ -242,7 +250,7 @@ class Task(composer.Task):
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
         super().set_timesteps(control_timestep, physics_timestep)
-        self._substeps = self.physics_steps_per_control_step  # composer's is slow to ask
+        self._substeps = self.physics_steps_per_control_step  # composer's property is slow
 
     def initialize_episode(
         self, physics: mjcf.Physics, random_state: np.random.RandomState
@@ -254,7 +262,7 @@ class Task(composer.Task):
         self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
     ) -> None:
         if self._begun:
-            # A plain composer.Environment leaves a reset with the actuators' velocities at zero.
+            # After a reset by a plain composer.Environment, the velocities of actuators are zero.
             self.world.forward(self.world.all_ids)
             self._begun = False
         self.apply_action(np.asarray(action, dtype=float)[None], self.world.all_ids)
@@ -298,23 +306,23 @@ def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dic
 
 
 def check_simulated(lasted: np.ndarray) -> None:
-    """Checks that simulations have run the physics of a step of a task that does so by itself.
+    """Checks that `simulate` of a task with steps of variable duration was called.
 
     Args:
-      lasted: how long each has, 0 where it has not.
+      lasted: duration of the step of each simulation; 0 if `simulate` was not called.
 
     Raises:
-      RuntimeError: some have not.
+      RuntimeError: it was not called for some simulations.
     """
     if not lasted.all():
         raise RuntimeError(
-            'a task whose steps are long runs their physics by itself: step it by '
-            'trl_suite.environments.environment.Environment, not by a plain composer.Environment'
+            'the steps of this task have a variable duration: use '
+            'trl_suite.environments.environment.Environment, not a plain composer.Environment'
         )
 
 
 def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarray:
-    """Draws a way on the ground in any direction, of any length from low to high, (2,) m."""
+    """Draws a horizontal displacement with uniform direction and length in [low, high), (2,) m."""
     angle = random.uniform(-np.pi, np.pi)
     return random.uniform(low, high) * np.array([np.cos(angle), np.sin(angle)])
 
@@ -322,11 +330,11 @@ def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarra
 def start_phases(
     option: float | Sequence[Sequence[float]] | None,
 ) -> Callable[[float], float]:
-    """Returns what turns a uniform draw from [0, 1) into the phase of a start.
+    """Returns a function from a uniform draw in [0, 1) to the phase at the start of an episode.
 
     Args:
-      option: None: the phase is the draw. A number in [0, 1): it is always this. Pairs of numbers,
-        ascending in [0, 1]: it lies between the numbers of a pair, as likely anywhere there.
+      option: None: the phase is the draw. A number in [0, 1): the phase is this number. Pairs of
+        numbers, ascending in [0, 1]: the phase is uniform in the union of these intervals.
 
     Raises:
       ValueError: anything else.
@@ -361,24 +369,24 @@ def start_phases(
 
 
 def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
-    """Checks that options of position control are not given to another actuation model.
+    """Checks that options of position control are only given with this actuation model.
 
     Raises:
-      ValueError: they are.
+      ValueError: they are given with another one.
     """
     if model != 'position' and (action_offset != 'clip' or action_scale is not None):
         raise ValueError(
-            f'action_offset and action_scale shape position control, not {model} control'
+            f'action_offset and action_scale are options of position control, not {model} control'
         )
 
 
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:
-    """Draws the seed of a stream of its own, for what goes on to draw during an episode."""
+    """Draws the 128-bit seed of a separate random stream, e.g. for draws within an episode."""
     return np.random.SeedSequence(random_state.randint(0, 2**32, size=4, dtype=np.uint32))
 
 
 def consecutive(sizes: dict[str, int]) -> dict[str, slice]:
-    """Lays blocks of the given sizes side by side; empty ones are left out."""
+    """Returns consecutive slices for blocks of the given sizes; empty blocks are left out."""
     ends = np.cumsum(list(sizes.values()))
     return {
         name: slice(int(end) - size, int(end))

@@ -1,4 +1,4 @@
-"""A task type: what a kind of task takes, how it is made, and how it is described."""
+"""Task types: the parts and options that a kind of task takes, its constructor and description."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 
 def tracking(task: Callable[..., Task]) -> Callable[[Parts, Any], Task]:
-    """Returns what makes a task that tracks a motion, and takes parts as those of the suite do."""
+    """Returns the `make` function of a task type, for a task class with a reference motion."""
     return lambda parts, config: task(
         parts.character, parts.arena, parts.motion, config, actuation_model=parts.actuation
     )
 
 
 class Parts(NamedTuple):
-    """What a task is composed of.
+    """The parts from which a task is made.
 
     Attributes:
-      character: without actuators.
-      arena: of as many dimensions.
-      motion: a clip or a library of steps, as the task type asks for; None if it takes none.
-      actuation: one of the actuation models of the type.
+      character: a character without actuators.
+      arena: planar or spatial, as the character.
+      motion: the reference motion, a clip or a library of steps; None if the task type has none.
+      actuation: one of the actuation models of the task type.
     """
 
     character: Character
@@ -45,16 +45,16 @@ class Parts(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """Functions that describe a task for people; sections come in the order of the attributes.
+    """Functions that describe a task, for `trl-suite info` and the documentation pages.
 
     Attributes:
       blocks: task -> unit and meaning of each observation block.
       rules: spec, task -> sections on motion, reward and termination.
-      before, after: task -> sections before and after that of the observation.
-      action: environment -> section on what actions mean.
+      before, after: task -> sections before and after the section on the observation.
+      action: environment -> section on the meaning of actions.
       time: spec, task -> section on rates and limits.
-      joints: task -> title of one more column in the table of links, and its entry for each joint.
-      legend: what pictures show beside the physics.
+      joints: task -> title of the last column in the table of links, and its entry for each joint.
+      legend: meaning of the markers in rendered images.
     """
 
     blocks: Callable[[Any], Meanings]
@@ -72,18 +72,18 @@ class TaskType:
     """A kind of task.
 
     Attributes:
-      name: as an `EnvSpec` names it.
-      title: as `suite.build` names it; types with the same title are for other characters.
-      spatial: whether it is for three-dimensional characters, or for planar ones.
-      config: its options.
+      name: unique name, for `EnvSpec.task_type`.
+      title: name for `suite.build`; a planar and a spatial type may have the same title.
+      spatial: whether it is for three-dimensional characters, not for planar ones.
+      config: class of its options.
       make: parts, config -> task.
-      description: how it is described.
-      motion: what it tracks: `Clip`, `Steps`, or None for nothing.
-      actuations: models by which it may drive joints; None for all of them.
-      options: options that differ from the defaults in what `suite.build` makes.
-      score: what tells best how well a policy does, a key of what `evaluation.evaluate` returns.
-      samples: what a step is called where steps are counted.
-      differences: from the original.
+      description: functions that describe it.
+      motion: type of the reference motion: `Clip`, `Steps`, or None.
+      actuations: supported actuation models; None for all of them.
+      options: options for `suite.build` that differ from the defaults.
+      score: the main performance measure, a key of the result of `evaluation.evaluate`.
+      samples: name of the steps where they are counted, e.g. 'cycles'.
+      differences: differences from the original.
     """
 
     name: str

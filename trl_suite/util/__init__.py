@@ -1,1 +1,1 @@
-"""What every layer may use, and what knows none of them."""
+"""Utilities that every layer may import and that import none of the others."""

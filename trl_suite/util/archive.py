@@ -1,4 +1,4 @@
-"""Archives of named arrays (.npz) without pickled objects: whole or not at all."""
+"""Archives of named arrays (.npz) without pickled objects, written atomically."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trl_suite.util.files import load_arrays, replacing
 
 
 def write(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-    """Writes an archive; an old file stays until the new one is whole."""
+    """Writes an archive; an existing file is replaced only when the new one is complete."""
     arrays = {name: np.asarray(value) for name, value in fields.items()}
     with replacing(pathlib.Path(path)) as part, part.open('wb') as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -29,14 +29,14 @@ def read(
 
     Args:
       path: file.
-      what: what it should hold, for messages.
-      fields: names, and for those that become Python objects the kinds of dtype they may have and
-        their number of axes; None: an array, which the caller checks.
+      what: what the file should contain, for messages.
+      fields: names of the fields. The value of a field that becomes a Python object is the allowed
+        kinds of its dtype and its number of axes; None means an array, which the caller checks.
       defaults: values of fields that may be missing.
 
     Raises:
-      ValueError: for a broken file or a malformed field (names file and field).
-      FileNotFoundError: if there is no file at the path.
+      ValueError: a corrupt file or a malformed field; the message has the path and the field.
+      FileNotFoundError: there is no file at the path.
     """
     found: dict[str, Any] = {}
     field = ''
@@ -49,7 +49,7 @@ def read(
                 raise ValueError('is missing')
     except FileNotFoundError:
         raise
-    except Exception as error:  # a damaged archive fails in a dozen ways
+    except Exception as error:  # a corrupt archive raises many types of exceptions
         where = f'field {field!r}' if field else f'no readable {what}'
         raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     for field, value in found.items():

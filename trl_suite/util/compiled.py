@@ -1,4 +1,4 @@
-"""Functions of one simulation that Numba compiles, and the folder where the machine code is kept.
+"""Functions of one simulation that Numba compiles, and the cache folder of the machine code.
 
     @compiled
     def has_fallen(i, contacts):
@@ -8,20 +8,20 @@
         return False
 
 A compiled function takes numbers, arrays and (named) tuples of them, and returns numbers or tuples of
-numbers. It may call other compiled functions and `math`, allocates nothing (Numba refuses to compile
-one that does, since arrays are not reference-counted: counting costs more than most functions do, and
-threads would wait for each other's counts), and never raises: a division by zero gives infinity or
-NaN, as in NumPy. Indices are not checked. It runs without the interpreter's lock.
+numbers. It may call other compiled functions and `math`. It must not allocate memory: Numba raises
+an error for a function that does, since reference counting is disabled (it would cost more than
+most functions, and threads would contend for the counts). It never raises: a division by zero gives
+infinity or NaN, as in NumPy. Indices are not checked. It runs without the global interpreter lock.
 
-A small function that is called in an inner loop is decorated with `compiled_inline`: its code takes the
-place of every call. Loops over simulations, which Python calls, are decorated with `compiled_loop`.
-Tuples of arrays enter them as packs, see `packed`.
+A small function that is called in an inner loop is decorated with `compiled_inline`: it is inlined
+in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
+tuples of arrays are passed to them as packs, see `packed`.
 
-Numba is imported and the function is compiled when it is first called; the result is kept on disk.
-The folder is `$NUMBA_CACHE_DIR`, or else the user's cache folder, and in it one folder for each state
-of the package's sources, since Numba does not notice that a function called from another module has
-changed. Where no folder can be written, functions are compiled by every process anew. With
-`NUMBA_DISABLE_JIT=1` the same lines run as Python, for debugging.
+Numba is imported and a function is compiled when it is first called; the result is cached on disk.
+The cache is in `$NUMBA_CACHE_DIR`, or else in the user's cache folder, with one subfolder for each
+version of the package's sources, since Numba does not detect changes of functions in other modules.
+If no folder can be written, every process compiles the functions again. With `NUMBA_DISABLE_JIT=1`
+the same code runs as Python, for debugging.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-PATIENCE = 2.0  # s; compiling that takes longer is announced on a terminal
-UNUSED = 30 * 86400.0  # s; folders of other sources that nobody used for so long are removed
+PATIENCE = 2.0  # s; if compiling takes longer, a message is printed on a terminal
+UNUSED = 30 * 86400.0  # s; folders of other source versions that were unused for longer are removed
 _PREFIX = 'trl_suite-'
 
 
@@ -62,9 +62,9 @@ class Compiled:
         """Wraps a function.
 
         Args:
-          function: what runs if compiling is switched off, and what is compiled otherwise.
-          native: returns what is compiled in its place: for what only Numba can express.
-          inline: whether its code takes the place of calls.
+          function: compiled, or called as Python if compiling is disabled.
+          native: returns a function that is compiled instead, e.g. one that uses Numba intrinsics.
+          inline: whether callers inline the function.
         """
         functools.update_wrapper(self, function)
         self.function, self._native = function, native
@@ -74,12 +74,12 @@ class Compiled:
 
     @property
     def dispatcher(self) -> Callable[..., Any]:
-        """What Numba made of the function for compiled callers; the function itself without Numba."""
+        """The Numba dispatcher for compiled callers; the function itself if compiling is disabled."""
         return self._made.get(False) or self._make(False)
 
     @property
     def entry(self) -> Callable[..., Any]:
-        """What Python calls."""
+        """The compiled function for Python callers."""
         return self._made.get(True) or self._make(True)
 
     def _make(self, entry: bool) -> Callable[..., Any]:
@@ -93,22 +93,23 @@ class Compiled:
         if numba.config.DISABLE_JIT:
             return self.function
         options = {'nogil': True, 'error_model': 'numpy', 'forceinline': self._inline}
-        if not entry:  # what takes arguments from Python is half of the time that compiling takes
+        if not entry:  # wrappers for calls from Python take half of the compile time
             options['no_cpython_wrapper'] = options['no_cfunc_wrapper'] = True
-        if self._native is not None:  # a line or two; what calls it is kept on disk
+        if self._native is not None:  # not cached, since it is short; its callers are cached
             return numba.njit(self._native(), _nrt=True, **options)
         options['_nrt'] = False
         folder = cache_folder()
         if folder is None:
             return numba.njit(self.function, **options)
-        # Numba looks at its setting when a function is decorated; it is the user's otherwise.
+        # Numba reads CACHE_DIR when a function is decorated; afterwards the user's value is
+        # restored.
         with _setting:
-            # Apart, since Numba takes the one with and the one without an entry for the same.
+            # Two folders, since Numba cannot distinguish functions with and without wrappers.
             folder = folder / ('entries' if entry else 'rows')
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
             try:
                 return numba.njit(self.function, cache=True, **options)
-            except RuntimeError:  # no file: a function that was typed in
+            except RuntimeError:  # the function has no source file, e.g. in an interactive session
                 return numba.njit(self.function, **options)
             finally:
                 numba.config.CACHE_DIR = before
@@ -132,18 +133,18 @@ def compiled_inline(function: Callable[..., Any]) -> Compiled:
 
 
 def compiled_loop(function: Callable[..., Any]) -> Compiled:
-    """Decorates a loop over simulations, which Python calls; it takes packs, see `packed`."""
+    """Decorates a loop over simulations that Python calls with packs; see `packed`."""
     return Compiled(function)
 
 
 def packed(value: Any) -> Any:
-    """Returns a named tuple of arrays and numbers as one argument; see `trl_suite.util.pack`.
+    """Converts a named tuple of arrays and numbers to one argument; see `trl_suite.util.pack`.
 
-    Compiled functions read its fields by name, as they would of the tuple, which stands for itself
-    where functions run as Python. The arrays stay alive as long as the pack.
+    Compiled functions read its fields by name, as from the tuple. With `NUMBA_DISABLE_JIT=1` the
+    tuple itself is returned. The pack keeps the arrays alive.
 
     Raises:
-      TypeError: a field is neither an array, nor a number, nor such a tuple.
+      TypeError: a field is not an array, a number, or a named tuple of these.
     """
     if _numba().config.DISABLE_JIT:
         return value
@@ -157,7 +158,7 @@ _setting = threading.Lock()
 
 @functools.cache
 def _numba() -> Any:
-    """Numba, which is told how to treat `Compiled` objects that compiled functions refer to."""
+    """Imports Numba and registers the type of `Compiled` objects in compiled functions."""
     import numba
     from numba.extending import typeof_impl
 
@@ -170,9 +171,9 @@ def _numba() -> Any:
 
 @functools.cache
 def cache_folder() -> pathlib.Path | None:
-    """Returns the folder of the machine code of these sources, made if need be; None if it cannot be.
+    """Returns the cache folder for these sources, creating it if necessary.
 
-    A warning is issued once if there is none.
+    If no folder can be written, returns None and issues a warning once.
     """
     for base in (os.environ.get('NUMBA_CACHE_DIR'), _user_cache()):
         if not base:
@@ -188,8 +189,8 @@ def cache_folder() -> pathlib.Path | None:
         _forget(folder)
         return folder
     warnings.warn(
-        'no folder for compiled code can be written, so every process compiles anew; set '
-        'NUMBA_CACHE_DIR to one that can',
+        'no folder for compiled code is writable, so every process compiles it again; set '
+        'NUMBA_CACHE_DIR to a writable folder',
         stacklevel=2,
     )
     return None
@@ -205,9 +206,9 @@ def _user_cache() -> str:
 
 @functools.cache
 def fingerprint() -> str:
-    """Returns a name for all that the machine code depends on: the package's sources, and MuJoCo.
+    """Returns a hash of everything that the machine code depends on: sources and MuJoCo's version.
 
-    All sources, since compiled functions hold constants from modules that have none of their own.
+    All sources count, since compiled functions contain constants from other modules.
     """
     digest = hashlib.sha256(importlib.metadata.version('mujoco').encode())
     root = pathlib.Path(__file__).parents[1]
@@ -217,18 +218,18 @@ def fingerprint() -> str:
 
 
 def _forget(folder: pathlib.Path) -> None:
-    """Removes the folders of other sources that were not used for long."""
+    """Removes folders of other source versions that were unused for longer than `UNUSED`."""
     for path in folder.parent.glob(f'{_PREFIX}*'):
         try:
             unused = path.stat().st_mtime < time.time() - UNUSED
-        except OSError:  # another process was faster
+        except OSError:  # removed by another process
             continue
         if unused:
             shutil.rmtree(path, ignore_errors=True)
 
 
 class _Announcer:
-    """Says on a terminal, once in a process, that compiling takes long."""
+    """Prints a message on a terminal, once per process, if compiling takes long."""
 
     def __init__(self) -> None:
         self.spent, self.told = 0.0, False
@@ -236,7 +237,7 @@ class _Announcer:
 
     @contextmanager
     def compiling(self) -> Iterator[None]:
-        """Counts the time that is spent inside; tells of it once it is longer than `PATIENCE`."""
+        """Adds up the time spent inside; prints a message when it exceeds `PATIENCE`."""
         timer = threading.Timer(max(PATIENCE - self.spent, 0.0), self._tell)
         timer.daemon = True
         begun = time.monotonic()

@@ -1,4 +1,4 @@
-"""Sentences for bad input: what it was, what was expected, and the nearest valid choice."""
+"""Messages for invalid input: the value, what was expected, and the nearest valid choice."""
 
 import collections.abc
 import difflib
@@ -9,10 +9,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-LIKE, ALIKE = 0.6, 0.4  # shares of two names that must agree, see `difflib`
-FEW = 20  # names that may all be listed where none is like the one given
+LIKE, ALIKE = 0.6, 0.4  # `cutoff` of `difflib.get_close_matches`, for few and for many names
+FEW = 20  # up to as many names the stricter cutoff applies, since all can be listed instead
 MANY = 40  # names; of more only some are listed
-KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # what an annotation takes, in words
+KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # types, singular and plural in words
     bool: ((bool, np.bool_), 'True or False', 'bools'),
     int: ((numbers.Integral,), 'a whole number', 'whole numbers'),
     float: ((numbers.Real,), 'a number', 'numbers'),
@@ -24,7 +24,7 @@ KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # what an annotation
 def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
     """Returns a message for an unknown name, with its closest matches among `choices`."""
     known = sorted(choices)
-    cutoff = LIKE if len(known) <= FEW else ALIKE  # few can all be told instead
+    cutoff = LIKE if len(known) <= FEW else ALIKE
     near = difflib.get_close_matches(str(name), known, n=3, cutoff=cutoff)
     if not near:
         lowered = {choice.lower(): choice for choice in known}
@@ -62,15 +62,15 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
 
 
 def check_kind(name: str, value: object, hint: object) -> None:
-    """Checks an option by the annotation of what takes it, before that stumbles over it.
+    """Checks the value of an option against its type annotation.
 
     Args:
-      name: of the option.
-      value: what is given; it passes where the annotation says nothing here.
+      name: name of the option.
+      value: its value; annotations that this function does not know accept any value.
       hint: the annotation.
 
     Raises:
-      ValueError: the value is of another kind; the message has the name, and what was expected.
+      ValueError: the value has another type; the message has the name and what was expected.
     """
     choices = _choices(hint)
     if not any(_fits(value, choice) for choice in choices):

@@ -1,4 +1,4 @@
-"""Files that appear under their names when they are complete, never before."""
+"""Checks of paths, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ LARGEST = 2**28  # bytes of a text, or of the arrays of an archive, 268 MB
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
-    """Returns a path that can be written, so that nobody waits for a file that cannot be.
+    """Returns the path of a file to be written; checks it before a long computation starts.
 
     Raises:
-      ValueError: the suffix is none of the given ones.
+      ValueError: the suffix is not one of `suffixes`.
       OSError: the folder does not exist or cannot be written, or the path is a folder.
     """
     path = pathlib.Path(path)
@@ -37,11 +37,11 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
 
 
 def existing(path: Path, suffixes: tuple[str, ...] | None = None) -> pathlib.Path:
-    """Returns a path that can be read.
+    """Returns the path of an existing file.
 
     Raises:
-      ValueError: suffixes are given, and that of the path is none of them.
-      FileNotFoundError: there is no such file; the message has those with similar names beside it.
+      ValueError: suffixes are given, and that of the path is not one of them.
+      FileNotFoundError: there is no such file; the message has similar names in the same folder.
     """
     path = pathlib.Path(path)
     if suffixes is not None:
@@ -131,10 +131,10 @@ def read_json(path: Path) -> Any:
 
 @contextlib.contextmanager
 def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields a temporary path beside `path` that takes its place once all went well.
+    """Yields a temporary path in the same folder; the file replaces `path` if nothing is raised.
 
     Raises:
-      OSError: what was raised within, with the path if it had none, as errors of writing have not.
+      OSError: as raised within, with the path if the error had none, as errors of writing have not.
     """
     part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
     try:
@@ -149,7 +149,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def write_json(content: Any, path: pathlib.Path) -> None:
-    """Writes a .json file, readable by people too.
+    """Writes an indented .json file.
 
     Raises:
       ValueError: the content has a number that is not finite.

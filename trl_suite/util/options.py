@@ -1,4 +1,4 @@
-"""Options as data: frozen dataclasses whose fields say what they mean and what they may be.
+"""Options as data: frozen dataclasses whose fields have a meaning, a unit and bounds.
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class HopConfig(Config):
@@ -9,7 +9,7 @@
     HopConfig.of('my environment', {'heigth': 0.5})  # ValueError; did you mean 'height'?
     HopConfig.options()  # name, default, unit and meaning of each, for pages
 
-Constructors, `trl-suite info`, the pages and the messages read the same fields.
+Constructors, `trl-suite info`, documentation pages and error messages read the same fields.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ def option(
     """Returns a dataclass field for an option.
 
     Args:
-      default: its value where none is given.
-      meaning: one line for people.
-      unit: of numbers.
+      default: default value.
+      meaning: one line for `trl-suite info` and the pages.
+      unit: unit of the value, if it is a number.
       at_least, at_most, above, below: bounds of every number in the value.
-      choices: the only strings that the value may be, or hold.
+      choices: the allowed strings, for the value or its elements.
       actuation: the only actuation model that has the option.
-      policy: the value may be the id of an environment whose shipped policy is meant.
+      policy: whether the id of an environment may be given for the policy that is shipped for it.
     """
     bounds = {'at_least': at_least, 'at_most': at_most, 'above': above, 'below': below}
     metadata = {
@@ -62,7 +62,7 @@ def option(
 
 
 class Option(NamedTuple):
-    """What is known of an option; see `option`."""
+    """Name and properties of an option; see `option`."""
 
     name: str
     default: Any
@@ -74,11 +74,11 @@ class Option(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
-    """The options of something; a subclass has a field made by `option` for each.
+    """Base class of options; a subclass has a field, made by `option`, for each of them.
 
     Raises:
-      ValueError: a value of another kind or out of range; the message names the option, and what was
-        expected.
+      ValueError: a value of another type or out of range; the message has the name of the option
+        and what was expected.
     """
 
     def __post_init__(self) -> None:
@@ -91,15 +91,15 @@ class Config:
 
     @classmethod
     def of(cls, owner: str, given: Mapping[str, Any], others: Iterable[str] = ()) -> Self:
-        """Makes a config of values by name.
+        """Makes a config from values by name.
 
         Args:
-          owner: whose options they are, for messages.
-          given: values that are not the default.
-          others: names that somebody else takes, for messages.
+          owner: what the options belong to, for messages.
+          given: values that differ from the defaults.
+          others: further valid names that are handled elsewhere, for messages.
 
         Raises:
-          ValueError: an unknown name, or a value as for the class.
+          ValueError: an unknown name, or an invalid value.
         """
         known = [field.name for field in dataclasses.fields(cls)]
         for name in given:
@@ -109,7 +109,7 @@ class Config:
 
     @classmethod
     def options(cls) -> list[Option]:
-        """Returns what there is to set."""
+        """Returns all options of the class."""
         return [
             Option(
                 field.name, field.default,
@@ -119,7 +119,7 @@ class Config:
         ]  # fmt: skip
 
     def _set(self, name: str, value: Any) -> None:
-        """Puts a value in its final form; for `__post_init__` of subclasses."""
+        """Replaces a value by its canonical form; for `__post_init__` of subclasses."""
         object.__setattr__(self, name, value)
 
 

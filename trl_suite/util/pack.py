@@ -1,9 +1,10 @@
-"""Named tuples of arrays and numbers that enter compiled functions as one pointer.
+"""Named tuples of arrays and numbers that are passed to compiled functions as one pointer.
 
-Numba takes a tuple apart wherever it is passed: sixty arrays are four hundred arguments, which takes
-seconds to compile for every function, and 30 us for every call from Python. A pack is the address of a
-block of memory that describes the arrays as Numba does; compiled functions read from it what they ask
-for, by the names of the tuple. A pack is read-only, but the arrays that it refers to need not be.
+Numba passes every element of a tuple as separate arguments: sixty arrays are four hundred
+arguments, which take seconds to compile for every function, and 30 us for every call from Python. A
+pack is the address of a memory block that describes the arrays as Numba does; compiled functions
+read from it the fields that they use, by the names of the tuple. The pack is read-only; the arrays
+may be writable.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from numba.extending import (
     unbox,
 )
 
-_WORD = 8  # bytes; of everything that a block is made of
+_WORD = 8  # bytes; a block consists of words of this size
 
 
 class Field(NamedTuple):
-    """A field of a pack: its name and type, and where it begins in the block, in words."""
+    """A field of a pack: its name, its type, and its offset in the block, in words."""
 
     name: str
     type: types.Type
@@ -37,7 +38,7 @@ class Field(NamedTuple):
 
 
 class PackType(types.Type):
-    """Numba's type of a pack: names, types and places of its fields."""
+    """Numba's type of a pack: names, types and offsets of its fields."""
 
     def __init__(self, name: str, fields: tuple[Field, ...]) -> None:
         self.fields = {field.name: field for field in fields}
@@ -46,10 +47,10 @@ class PackType(types.Type):
 
 
 class Pack:
-    """The values of a named tuple at one address; keeps them alive.
+    """A memory block that describes the values of a named tuple, which it keeps alive.
 
     Attributes:
-      address: of the block of memory.
+      address: address of the memory block.
       numba_type: see `PackType`.
     """
 
@@ -59,10 +60,10 @@ class Pack:
         """Packs a named tuple.
 
         Args:
-          value: a named tuple of arrays, numbers, and such tuples.
+          value: a named tuple whose fields are arrays, numbers, or such tuples.
 
         Raises:
-          TypeError: a field is anything else; the message has its name.
+          TypeError: a field has another type; the message has its name.
         """
         words: list[bytes] = []
         self.numba_type = _describe(value, type(value).__name__, words)
@@ -71,7 +72,7 @@ class Pack:
 
 
 def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
-    """Appends the block of a named tuple to `words`; returns its type, relative to its beginning."""
+    """Appends the block of a named tuple to `words`; returns its type."""
     begin, fields = len(words), []
     for name, entry in zip(value._fields, value, strict=True):
         word = len(words) - begin
@@ -94,7 +95,7 @@ def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
         else:
             raise TypeError(
                 f'{path}.{name} is {type(entry).__name__}; expected an array, a number, or a named '
-                'tuple of such'
+                'tuple of these'
             )
         fields.append(Field(name, found, word))
     return PackType(type(value).__name__, tuple(fields))
@@ -135,7 +136,7 @@ def _read(context: Any, builder: Any, type_: PackType, pack: Any, name: str) -> 
 
 
 def _load(builder: Any, place: Any, kind: Any) -> Any:
-    """Loads words one by one, so that only those that are used are loaded in the end."""
+    """Loads words one by one, so that the compiler can remove the loads of unused ones."""
     if isinstance(kind, ir.LiteralStructType | ir.ArrayType):
         elements = (
             kind.elements if isinstance(kind, ir.LiteralStructType) else [kind.element] * kind.count
@@ -147,6 +148,6 @@ def _load(builder: Any, place: Any, kind: Any) -> Any:
             place = builder.gep(place, [ir.IntType(64)(_WORD * words)])
         return value
     found = builder.load(builder.bitcast(place, kind.as_pointer()))
-    # Blocks never change; so a store into an array does not make the compiler read them again.
+    # Blocks are constant: the compiler need not reload them after a store to an array.
     found.set_metadata('invariant.load', builder.module.add_metadata([]))
     return found

@@ -1,13 +1,14 @@
-"""Random numbers within compiled functions: NumPy's PCG64, a stream for each simulation.
+"""Random numbers in compiled functions: NumPy's PCG64, one stream per simulation.
 
     streams = Streams(n)
     streams.seed(3, np.random.SeedSequence(7))
-    uniform(3, 0.2, 0.7, streams.state)  # what np.random.default_rng(...).uniform(0.2, 0.7) gives
+    uniform(3, 0.2, 0.7, streams.state)  # as np.random.default_rng(...).uniform(0.2, 0.7)
 
-The numbers are those of `numpy.random.Generator` to the last bit, so a stream may be used from Python
-and from compiled functions by turns. So may a Generator of NumPy's, whatever its bits come from:
+The numbers are bit-identical to those of `numpy.random.Generator`, so that Python and compiled
+functions can draw from the same stream alternately. Compiled functions can also draw from a NumPy
+Generator with any bit generator:
 
-    draw(address(rng))  # what rng.random() gives
+    draw(address(rng))  # as rng.random()
 
 Source: NumPy's `PCG64` (M. E. O'Neill, 'PCG', 2014) and its ziggurat for the normal distribution.
 """
@@ -35,19 +36,20 @@ class Streams:
     """A PCG64 stream for each of n simulations.
 
     Attributes:
-      state: (n, 6) uint64; state and increment, high and low words, then the buffered 32 bits.
+      state: (n, 6) uint64; high and low words of state and increment, then `has_uint32` and
+        `uinteger`, the buffered 32 bits.
     """
 
     def __init__(self, n: int) -> None:
         self.state = np.zeros((n, 6), np.uint64)
 
     def seed(self, env_id: int, sequence: np.random.SeedSequence) -> None:
-        """Puts a stream where `np.random.default_rng(sequence)` begins."""
+        """Seeds a stream as `np.random.default_rng(sequence)` would be."""
         self._store(env_id, np.random.PCG64(sequence))
 
     @contextlib.contextmanager
     def generator(self, env_id: int) -> Iterator[np.random.Generator]:
-        """Yields a Generator that goes on from a stream, which goes on from there afterwards."""
+        """Yields a Generator that continues a stream; on exit the stream takes over its state."""
         bits = np.random.PCG64(0)
         high, low, inc_high, inc_low, has_uint32, uinteger = self.state[env_id].tolist()
         bits.state = {
@@ -77,7 +79,7 @@ def _next_native() -> Callable[..., Any]:
 
     @njit(error_model='numpy')
     def upper(a: Any, b: Any) -> Any:
-        """The upper word of a product."""
+        """Returns the upper word of a product."""
         a1, a0, b1, b0 = a >> half, a & mask, b >> half, b & mask
         middle = a1 * b0 + ((a0 * b0) >> half)
         other = a0 * b1 + (middle & mask)
@@ -152,7 +154,7 @@ _capsule_address.restype, _capsule_address.argtypes = ctypes.c_void_p, (
 
 
 def address(generator: np.random.Generator) -> int:
-    """Returns where the bits of a generator come from, for `draw`; it must be kept alive."""
+    """Returns the address of a generator's bitgen_t, for `draw`; the caller keeps it alive."""
     return _capsule_address(generator.bit_generator.capsule, b'BitGenerator')
 
 
@@ -202,7 +204,7 @@ def _words_native() -> Callable[..., Any]:
 
 
 def _words(i: int, state: np.ndarray) -> tuple[int, bool, int]:
-    """Draws a layer of the ziggurat, a sign, and 52 bits."""
+    """Draws the layer of the ziggurat, a sign, and 52 bits."""
     bits = _next64(i, state)
     rest = bits >> 8
     return bits & 0xFF, bool(rest & 1), rest >> 1 & 0x000FFFFFFFFFFFFF

@@ -11,12 +11,12 @@ WIDTH = 100  # characters of a line of text
 
 
 class Table(NamedTuple):
-    """Cells in rows under a header.
+    """A table with a header.
 
     Attributes:
       header: title of each column.
       cells: rows of numbers and texts.
-      numbered: whether rows are entries of a vector, which Markdown numbers.
+      numbered: whether rows are entries of a vector; Markdown then gets a column of indices.
     """
 
     header: Sequence[str]
@@ -24,18 +24,18 @@ class Table(NamedTuple):
     numbered: bool = False
 
 
-Part = Table | str  # a str is a paragraph, or items '- ...' on lines of their own
+Part = Table | str  # a str is a paragraph, or a list with an item '- ...' on each line
 
 
 class Section(NamedTuple):
-    """A title, and what is below it."""
+    """A title and the parts below it."""
 
     title: str
     parts: tuple[Part, ...]
 
 
 def section(title: str, *parts: Part) -> Section:
-    """Returns a section of some parts."""
+    """Returns a section."""
     return Section(title, parts)
 
 
@@ -50,14 +50,14 @@ def text(parts: Iterable[Part]) -> str:
 
 
 def markdown(parts: Iterable[Part]) -> str:
-    """Returns parts as Markdown, with empty lines between them."""
+    """Returns parts as Markdown, separated by empty lines."""
     return '\n\n'.join(
         markdown_table(part) if isinstance(part, Table) else escape(part) for part in parts
     )
 
 
 def table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str = '  ') -> str:
-    """Aligns cells in columns, numbers to the right."""
+    """Returns aligned columns as text; columns of numbers are right-aligned."""
     rows = [[_cell(c) for c in row] for row in cells]
     columns = list(zip(header, *rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
@@ -76,8 +76,8 @@ def markdown_table(table: Table, plain: bool = False) -> str:
     """Returns a table as Markdown.
 
     Args:
-      table: what to write.
-      plain: whether cells are Markdown already, as links are.
+      table: the table.
+      plain: whether cells are Markdown, e.g. links, which are not escaped.
     """
     header, rows = list(table.header), [[_cell(c) for c in row] for row in table.cells]
     if table.numbered:
@@ -93,7 +93,7 @@ def markdown_table(table: Table, plain: bool = False) -> str:
 
 
 def escape(text: str) -> str:
-    """Returns Markdown that reads as the text does."""
+    """Returns text with Markdown's special characters escaped."""
     return re.sub(r'([*|`\\])', r'\\\1', text).replace('<', '&lt;')
 
 
@@ -102,7 +102,7 @@ def _cell(value: object) -> str:
 
 
 def _numeric(columns: Iterable[Sequence[str]]) -> list[bool]:
-    """Returns which columns hold numbers only, below their titles."""
+    """Returns which columns have only numbers below their titles."""
     number = re.compile(r'([-+]?\d[-+.\de]*)?')
     return [all(number.fullmatch(cell) for cell in column[1:]) for column in columns]
 

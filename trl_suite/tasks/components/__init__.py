@@ -1,1 +1,1 @@
-"""What several tasks are made of."""
+"""Components that several tasks share."""

@@ -1,4 +1,4 @@
-"""A ball to dribble to a goal: the body, where it is put, what is seen of it, what it is worth.
+"""A ball to dribble to a goal: body, placement, observation, reward terms.
 
 Source: the soccer scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
 """
@@ -19,36 +19,37 @@ from trl_suite.tasks.task import Marker, drawn_way
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline
 
-LEVEL = ('plane', 'var3d_flat')  # types of ground on which a ball may lie
+LEVEL = ('plane', 'var3d_flat')  # types of terrain on which a ball is supported
 RADIUS, MASS = 0.2, 0.1  # m, kg
-FRICTION = (0.45, 0.005, 0.0001)  # 0.5 * 0.9, wherever it lies
-SOLREF = (0.01, 1)  # soft enough for a tenth of a kilogram
-DRAG = 0.5  # share of its velocity that is left after a second
-BALL_AWAY = (0.7, 10.0)  # m from the walker, where it is put
-BALL_LASTS = (100.0, 200.0)  # s until it is put elsewhere
-GOAL_AWAY = (0.0, 10.0)  # m from the ball
-AT_GOAL, NEAR = 0.5, 2.0  # m; ball from goal and from walker, for full reward
-SPEED = 1.0  # m/s, of walker and ball
+FRICTION = (0.45, 0.005, 0.0001)  # sliding: 0.5 * 0.9; the ball's friction has priority
+SOLREF = (0.01, 1)  # soft enough for a mass of 0.1 kg
+DRAG = 0.5  # ratio of its velocity to that one second earlier, without contact
+BALL_AWAY = (0.7, 10.0)  # m; distance from the walker when it is placed
+BALL_LASTS = (100.0, 200.0)  # s until it is placed again
+GOAL_AWAY = (0.0, 10.0)  # m; distance of a new goal from the ball
+AT_GOAL, NEAR = 0.5, 2.0  # m; distances of the ball from goal and walker for full reward
+SPEED = 1.0  # m/s; target speed of walker and ball
 SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
-# Walker towards the ball, walker near it, ball towards the goal, ball near it.
+# Speed of the walker towards the ball, its distance, speed of the ball towards the goal, its
+# distance.
 SOCCER_TERMS = {
     'approach': (0.2 / 1.2, SPEED_SHARPNESS), 'near': (0.2 / 1.2, BALL_SHARPNESS),
     'dribble': (0.4 / 1.2, SPEED_SHARPNESS), 'goal': (0.4 / 1.2, GOAL_SHARPNESS),
 }  # fmt: skip
-MIRRORED = (-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # signs of what is seen, in a mirror
+MIRRORED = (-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # signs of the mirrored block ball
 _WEIGHTS = np.array([weight for weight, _ in SOCCER_TERMS.values()])
 _APPROACH, _NEAR, _DRIBBLE, _GOAL = range(len(SOCCER_TERMS))
 
 
 class BallState(NamedTuple):
-    """What a task knows of each ball, (n, ...).
+    """State of each ball, (n, ...).
 
     Attributes:
-      due: control step of the episode at which it is put elsewhere.
-      begin: where it was at the beginning of the step, (n, 3) m.
-      walker: where the walker's centre of mass was then, (n, 3) m.
+      due: control step of the episode at which it is placed again.
+      begin: its position at the beginning of the step, (n, 3) m.
+      walker: position of the walker's centre of mass at that time, (n, 3) m.
       at_goal: whether it is at the goal.
-      wanted: whether it is to be put elsewhere now.
+      wanted: whether it must be placed again now.
     """
 
     due: np.ndarray
@@ -62,11 +63,11 @@ class BallRules(NamedTuple):
     """Balls for compiled functions.
 
     Attributes:
-      qpos, dof: where the columns of positions (7) and of velocities (6) begin; -1: there is none.
-      body: its body.
-      column: where the block ball begins in the observation.
-      target_speed: m/s of walker and ball from which on the reward is full.
-      goal_radius: m; nearer to the goal, with the walker near, the reward is full.
+      qpos, dof: first addresses of its position (7) in qpos and velocity (6) in qvel; -1: no ball.
+      body: its body id.
+      column: first column of the block ball in the observation.
+      target_speed: speed of walker and ball for full reward, m/s.
+      goal_radius: distance of the ball from the goal for full reward, if the walker is near, m.
     """
 
     qpos: int
@@ -79,14 +80,14 @@ class BallRules(NamedTuple):
 
 
 def ball_state(n: int) -> BallState:
-    """Makes room for what is known of n balls."""
+    """Allocates the state of n balls."""
     return BallState(
         np.zeros(n, int), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool), np.zeros(n, bool)
     )
 
 
 def no_ball(n: int) -> BallRules:
-    """What stands for the balls of a task without."""
+    """Returns the rules for a task without a ball."""
     return BallRules(-1, -1, -1, -1, 0.0, 0.0, ball_state(n))
 
 
@@ -95,7 +96,7 @@ def no_ball(n: int) -> BallRules:
 
 @compiled
 def remember(i: int, physics: SpatialState, found: SpatialMeasurement, ball: BallRules) -> None:
-    """Notes where ball and walker are at the beginning of a step."""
+    """Stores the positions of ball and walker at the beginning of a step."""
     for k in range(3):
         ball.state.begin[i, k] = physics.qpos[i, ball.qpos + k]
         ball.state.walker[i, k] = found.com[i, k]
@@ -106,17 +107,17 @@ def dribble(
     i: int, first: int, share: float, seconds: float, goal: np.ndarray, physics: SpatialState,
     found: SpatialMeasurement, ball: BallRules, terms: np.ndarray,
 ) -> float:  # fmt: skip
-    """Writes what a step was worth, and whether the ball is at its goal.
+    """Writes the reward terms of a step, and whether the ball is at its goal.
 
     Args:
-      i: which simulation.
+      i: number of the simulation.
       first: column of the first of the terms of `SOCCER_TERMS`.
-      share: of these terms in the reward.
-      seconds: duration of the step.
-      goal: of the balls, (n, 3) m.
-      physics, found: of all simulations, at the end of the step.
-      ball: where it and the walker were at the beginning.
-      terms: of the reward, (n, k).
+      share: factor of these terms, their share of the reward.
+      seconds: duration of the step, s.
+      goal: positions of the goals, (n, 3) m.
+      physics, found: state and measurement of all simulations at the end of the step.
+      ball: the balls, with positions at the beginning of the step.
+      terms: reward terms, (n, k).
 
     Returns:
       The ball's speed towards the goal, m/s.
@@ -155,7 +156,7 @@ def dribble(
 def _speed_along(
     moved_x: float, moved_y: float, way_x: float, way_y: float, seconds: float
 ) -> float:
-    """Speed of a displacement along a direction on the ground, m/s."""
+    """Returns the mean speed of a displacement along a horizontal direction, m/s."""
     length = max(math.sqrt(way_x * way_x + way_y * way_y), 1e-9)
     return (moved_x * way_x + moved_y * way_y) / length / seconds
 
@@ -165,10 +166,11 @@ def observe_ball(
     i: int, column: int, goal: np.ndarray, physics: SpatialState, found: SpatialMeasurement,
     ball: BallRules, observation: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes the goal as seen from the ball, and the block ball, in the heading frame.
+    """Writes the blocks goal and ball, in the heading frame of the walker.
 
-    Of the goal (n, 3) bearing and distance, rad and m, in `column` and the next. Of the ball
-    bearing, distance and height, rad, m and m; velocity, m/s; angular velocity, rad/s.
+    Block goal, at `column`: bearing and distance of the goal (n, 3) from the ball, rad and m. Block
+    ball: bearing, distance and height of the ball, rad, m and m; its velocity (3), m/s; its angular
+    velocity (3), rad/s.
     """
     x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
     bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, found)
@@ -190,11 +192,11 @@ class Ball:
     """One ball in every simulation of a world.
 
     Attributes:
-      qpos, dof: its columns of positions (7) and of velocities (6).
+      qpos, dof: its addresses in qpos (7) and in qvel (6).
     """
 
     def __init__(self, arena: SpatialArena) -> None:
-        """Adds it to an arena; `bind` ties it to the compiled world.
+        """Adds it to an arena; `bind` resolves its ids in the compiled world.
 
         Raises:
           ValueError: the ground of the arena is not level.
@@ -240,11 +242,18 @@ class Ball:
 
     @property
     def place(self) -> np.ndarray:
-        """Where the balls are, (n, 3) m; a copy."""
+        """Positions of the balls, (n, 3) m; a copy."""
         return self.world.qpos[:, self.qpos[:3]]
 
     def put(self, env_id: int, place: np.ndarray, count: int, random: np.random.Generator) -> None:
-        """Puts one ball, at rest, about a place (x, y) on level ground, at a control step."""
+        """Places one ball, at rest, at a random displacement from a position on level ground.
+
+        Args:
+          env_id: number of the simulation.
+          place: the position, (2,) m.
+          count: current control step of the episode.
+          random: generator of the displacement and of the time until the ball is placed again.
+        """
         x, y = place + drawn_way(random, *BALL_AWAY)
         self.world.qpos[env_id, self.qpos] = x, y, RADIUS, 1, 0, 0, 0
         self.world.qvel[env_id, self.dof] = 0.0
@@ -254,10 +263,10 @@ class Ball:
     def goal(
         self, env_id: int, random: np.random.Generator, away: tuple[float, float] = GOAL_AWAY
     ) -> np.ndarray:
-        """Draws a goal about one ball, between two distances (m) from it, (3,) m."""
+        """Draws a goal (3,) m at a distance from one ball between two bounds, m."""
         return np.append(self.world.qpos[env_id, self.qpos[:2]] + drawn_way(random, *away), 0.0)
 
 
 def goal_disc(goal: np.ndarray, radius: float) -> Marker:
-    """Returns what lies at the goal (3,) m of a ball."""
+    """Returns the marker of a ball's goal (3,) m."""
     return Marker('cylinder', goal, (radius, 0.005, 0.0), GOAL_COLOUR)

@@ -1,4 +1,4 @@
-"""How far a walker in three dimensions is from its reference motion, as compiled functions."""
+"""Errors between a 3D walker and its reference motion, as compiled functions."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from trl_suite.util.compiled import compiled
 
 
 class Comparison(NamedTuple):
-    """What a comparison works on: the reference, where its features are, and weights.
+    """Data for a comparison: the reference, columns of its features, and weights.
 
     Attributes:
       tracks: the reference.
       rotations, angles, rates, effectors, com_velocity, height, heading, root, positions: first
         columns of these features.
-      pose_weights: of rotations, then angles.
-      rate_weights: of rates.
-      term_weights, term_scales: of the reward terms.
+      pose_weights: weights of rotations, then of angles.
+      rate_weights: weights of rates.
+      term_weights, term_scales: weights and error scales of the reward terms.
     """
 
     tracks: TrackTable
@@ -46,7 +46,7 @@ class Comparison(NamedTuple):
 def comparison(
     character: Character, reference: SpatialReference, terms: Mapping[str, tuple[float, float]]
 ) -> Comparison:
-    """Returns what the comparison of a character with a reference works on."""
+    """Returns the data for comparing a character with a reference."""
     weights, ball = character.spec.weights, character.spherical
     joints = np.asarray(weights[1:])
     numbers = np.array(list(terms.values()))
@@ -64,14 +64,14 @@ def comparison(
     )
 
 
-# Of simulation i and a moment of the reference (see `moment`).
+# Functions of simulation i and a row and remainder of the reference table (see `moment`).
 
 
 @compiled
 def pose_error(
     i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
 ) -> float:
-    """Weighted sum of squared angles between rotations, and of squared differences of angles."""
+    """Weighted sum of squared angles between rotations and squared differences of angles, rad^2."""
     error, mine = 0.0, found.features
     count = (by.angles - by.rotations) // 4
     for joint in range(count):
@@ -81,7 +81,7 @@ def pose_error(
             other = feature(env_id, rest, k, by.tracks)
             dot += mine[i, k] * other
             square += other * other
-        angle = 2 * math.acos(min(abs(dot) / math.sqrt(square), 1.0))  # the shorter way
+        angle = 2 * math.acos(min(abs(dot) / math.sqrt(square), 1.0))  # the shortest rotation
         error += by.pose_weights[joint] * (angle * angle)
     for joint in range(by.rates - by.angles):
         off = mine[i, by.angles + joint] - feature(env_id, rest, by.angles + joint, by.tracks)
@@ -93,7 +93,7 @@ def pose_error(
 def rate_error(
     i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
 ) -> float:
-    """Weighted sum of squared differences of rates."""
+    """Weighted sum of squared differences of rates, rad^2/s^2."""
     error = 0.0
     for k in range(by.effectors - by.rates):
         off = found.features[i, by.rates + k] - feature(env_id, rest, by.rates + k, by.tracks)
@@ -117,7 +117,10 @@ def effector_error(
 def com_error(
     i: int, env_id: int, rest: float, turned: float, by: Comparison, found: SpatialMeasurement
 ) -> float:
-    """Squared difference of the velocities of the centre of mass, the reference's turned by rad."""
+    """Scaled squared difference of the velocities of the centre of mass, m^2/s^2.
+
+    The velocity of the reference is rotated about z by `turned`, rad.
+    """
     cosine, sine = math.cos(turned), math.sin(turned)
     x = feature(env_id, rest, by.com_velocity, by.tracks)
     y = feature(env_id, rest, by.com_velocity + 1, by.tracks)
@@ -138,5 +141,5 @@ def height_error(
 
 @compiled
 def term(k: int, error: float, by: Comparison) -> float:
-    """Returns what an error is worth in reward term k."""
+    """Returns reward term k for an error."""
     return rewards.term(error, by.term_weights[k], by.term_scales[k])

@@ -1,4 +1,4 @@
-"""Sections on tasks that several task types have in common."""
+"""Sections of descriptions that several task types share."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ REWARD_WEIGHT = 'reward weight'  # title of a column of links
 REWARD = 'Reward: sum of weight * exp(-scale * error), at most 1; 0 after a fall'
 PLAN_BLOCKS: Meanings = {
     'contact': ('1', 'whether the right and the left foot touch the ground'),
-    'plan': ('m, rad', 'see below'),
+    'plan': ('m, rad', 'footstep plan, see below'),
 }
-# What terms of a reward compare with the clip, or the step.
+# Quantities that terms of a reward compare with the reference motion.
 _ERRORS = {
-    'pose': 'angles of joints and root, mean weighted as in Links; rad^2',
-    'velocity': 'their rates, mean weighted alike; rad^2/s^2',
+    'pose': 'angles of joints and root, mean with the weights in Links; rad^2',
+    'velocity': 'angular velocities of joints and root, mean with the same weights; rad^2/s^2',
     'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
     'root': 'height of the root above the ground; m^2',
     'heading': '-',
@@ -33,37 +33,37 @@ _ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
 
 # Size, unit and meaning of the parts of a plan.
 _PLAN = (
-    (3, 'm', 'first landing place from the right foot; 0 while that one stands'),
-    (3, 'm', 'first landing place from the left foot; 0 while that one stands'),
-    (3, 'm', 'second landing place from the right foot; 0 unless that one stands'),
-    (3, 'm', 'second landing place from the left foot; 0 unless that one stands'),
-    (1, 'rad', 'planned heading, to the left of the present one'),
+    (3, 'm', 'first landing place relative to the right foot; 0 in right stance'),
+    (3, 'm', 'first landing place relative to the left foot; 0 in left stance'),
+    (3, 'm', 'second landing place relative to the right foot; 0 in left stance'),
+    (3, 'm', 'second landing place relative to the left foot; 0 in right stance'),
+    (1, 'rad', 'planned heading relative to the current one, positive to the left'),
 )
 _MIRRORED_PLAN = (
-    (1, 'rad', 'planned heading, to the swing side of the present one'),
-    (3, 'm', 'first landing place from the swing foot'),
-    (3, 'm', 'second landing place from the stance foot'),
+    (1, 'rad', 'planned heading relative to the current one, positive to the swing side'),
+    (3, 'm', 'first landing place relative to the swing foot'),
+    (3, 'm', 'second landing place relative to the stance foot'),
 )
 
 
 def reward_weights(task: Any) -> tuple[str, Iterable[object]]:
-    """Returns the title of a column of links, and the reward weight of each joint."""
+    """Returns the title of a column in the table of links, and the reward weight of each joint."""
     return REWARD_WEIGHT, [joint.weight for joint in task.character.spec.joints.values()]
 
 
 def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
-    """Returns the terms of a reward for tracking.
+    """Returns the table of reward terms for tracking.
 
     Args:
-      task: it has them.
-      steps: whether footsteps are tracked, not a clip.
+      task: the task.
+      steps: whether it tracks footsteps, not a clip.
       more: meanings of terms that only this task has; terms without a meaning are left out.
     """
     average = 'sum' if steps else 'mean'
     errors = {
         **_ERRORS,
-        'end_effector': f'joints of the end effectors, their way from {_ABOUT[task.ABOUT]} and their '
-        f'height above the ground, {average} over them; m^2',
+        'end_effector': f'end effector joints, position from {_ABOUT[task.ABOUT]} and height above '
+        f'the ground, {average} over them; m^2',
         **more,
     }
     return Table(
@@ -77,7 +77,7 @@ def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
 
 
 def action(environment: Environment) -> Section:
-    """Returns what the actions drive."""
+    """Returns the table of what each action controls."""
     action_map = environment.action_map
     title, limits = _limits(environment)
     unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
@@ -86,7 +86,7 @@ def action(environment: Environment) -> Section:
         f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '
         'action_scale * action',
         Table(
-            ('drives', 'action_offset', 'action_scale', title),
+            ('controls', 'action_offset', 'action_scale', title),
             list(zip(action_map.names, *map(floats, columns), strict=True)),
             numbered=True,
         ),
@@ -94,7 +94,7 @@ def action(environment: Environment) -> Section:
 
 
 def _limits(environment: Environment) -> tuple[str, Any]:
-    """Returns what limits each action's effect, and how much."""
+    """Returns the title of a column of limits, and the limit of each action."""
     task: Any = environment.task
     actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
     if environment.action_map.quantity == 'excitation':
@@ -105,29 +105,29 @@ def _limits(environment: Environment) -> tuple[str, Any]:
         return 'torque limit (N m)', limits
     if task.actuation_model == 'velocity':
         limits = np.where(ball, limits / np.sqrt(3), limits)
-    # Every ball joint takes as many numbers.
+    # All ball joints have the same number of actions.
     each = (len(names) - np.count_nonzero(~ball)) // np.count_nonzero(ball)
     norm = '' if task.actuation_model == 'velocity' else ', norm'
     return f'torque limit (N m{norm})', np.repeat(limits, np.where(ball, each, 1))
 
 
 def time(spec: EnvSpec, task: Any) -> Section:
-    """Returns rates, and how long an episode is."""
+    """Returns control and physics rates, and the length of an episode."""
     control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
     return section(
         'Time',
-        f'control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
+        f'control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is truncated (discount 1) after '
         f'{spec.step_limit} steps, {spec.step_limit * task.control_timestep:.3g} s',
     )
 
 
 def floats(values: Any) -> list[float]:
-    """Returns plain numbers."""
+    """Returns values as Python floats."""
     return [float(value) for value in values]
 
 
 def plan(task: Any, mirrored: bool = False) -> Section:
-    """Returns where the parts of a plan are in the observation."""
+    """Returns the table of the parts of the footstep plan in the observation."""
     parts = _MIRRORED_PLAN if mirrored else _PLAN
     starts = task.blocks['plan'].start + np.cumsum([0, *(size for size, _, _ in parts)])
     return section(
@@ -139,7 +139,7 @@ def plan(task: Any, mirrored: bool = False) -> Section:
                 for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
             ],
         ),
-        *([] if task.character.spec.spatial else ['in the plane y and the heading are 0']),
+        *([] if task.character.spec.spatial else ['y and the heading are always 0 in the plane']),
     )
 
 
@@ -159,7 +159,7 @@ def clip(task: Any) -> Section:
 
 
 def fall(task: Any, missed: str = '') -> Section:
-    """Returns when an episode fails; `missed` is a further reason."""
+    """Returns the conditions of failure; `missed` is a further condition."""
     return section(
         'Termination (discount 0)',
         f'a fall: one of {", ".join(task.character.spec.fall_links)} touches the ground at the end of a step; '
@@ -168,22 +168,22 @@ def fall(task: Any, missed: str = '') -> Section:
 
 
 def missed(task: Any) -> str:
-    """Returns that a landing error ends an episode, where it does."""
+    """Returns the condition on the landing error; empty if there is none."""
     if task.max_landing_error is None:
         return ''
-    return f'a foot lands more than {task.max_landing_error:g} m from its place; '
+    return f'a foot lands more than {task.max_landing_error:g} m from its landing place; '
 
 
 def contact_share(threshold: float, decay: float, gain: float) -> str:
-    """Returns when the running share of contacts `d` is too large."""
+    """Returns the condition on `d`, an exponentially decaying average of contacts."""
     return (
-        f'd > {threshold:g}: at every sample d becomes {decay:g} d, and 1/{1 / gain:.0f} more if one '
-        'touches'
+        f'd > {threshold:g}, where every sample multiplies d by {decay:g} and adds 1/{1 / gain:.0f} if '
+        'there is contact'
     )
 
 
 def samples_until_fall(threshold: float, decay: float, gain: float) -> int:
-    """Returns how many samples with a contact in a row make a fall."""
+    """Returns the number of consecutive samples with contact that count as a fall."""
     share, count = 0.0, 0
     while share <= threshold:
         share, count = decay * share + gain, count + 1

@@ -1,4 +1,4 @@
-"""What several task types do otherwise than the original; docs/differences.md has the reasons."""
+"""Differences from the original that task types share; docs/differences.md has the reasons."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
 
 class Difference(NamedTuple):
-    """A sentence on what differs from the original, and the environments that it is about."""
+    """A difference from the original, and a function that returns whether it applies to a spec."""
 
     text: str
     applies: Callable[[EnvSpec], bool] = lambda spec: True
 
 
 def _from(hertz: int) -> str:
-    return f'MuJoCo at 300 Hz instead of Bullet at {hertz} Hz; task option substeps'
+    return f'MuJoCo at 300 Hz instead of Bullet at {hertz} Hz; see the option substeps'
 
 
 FROM_1200, FROM_3000 = Difference(_from(1200)), Difference(_from(3000))
@@ -27,20 +27,21 @@ AXES = Difference('axes are x forward, y left, z up; the original has y up and z
 CONES = Difference('a ball joint is limited by one cone, as wide as the widest of its three ranges')
 ROTATIONS = (
     Difference(
-        "targets of ball joints are rotation vectors about the mean pose; option action_offset='original' "
-        "for the original's angle and axis"
+        'targets of ball joints are rotation vectors about the mean pose; the option '
+        "action_offset='original' selects the original's angle and axis"
     ),
     Difference(
-        'rotation errors are those of the shorter way, angular velocities of both sides in one frame'
+        'rotation errors are the shortest rotation; angular velocities of character and reference are '
+        'compared in the same frame'
     ),
 )
-OWN_CLIP = Difference("the clip is our own, close to the original's in gait and speed")
-START_PHASE = Difference('the start phase is drawn uniformly instead of swept')
-LANDING = Difference(
-    'a step that misses its place ends the episode only if asked for; option max_landing_error'
+OWN_CLIP = Difference(
+    "the clip was made for this suite, with gait and speed close to the original's"
 )
+START_PHASE = Difference('the start phase is drawn uniformly instead of swept')
+LANDING = Difference('a landing error ends the episode only with the option max_landing_error')
 FACES = Difference(
-    'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
+    'faces of gaps, walls and steps are exactly vertical, and every start has flat ground from -1 to 1 m',
     lambda spec: spec.terrain != 'flat',
 )
-CUT = Difference('episodes are cut after 256 steps (discount 1)')
+CUT = Difference('episodes are truncated after 256 steps (discount 1)')

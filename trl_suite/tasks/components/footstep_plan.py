@@ -1,4 +1,4 @@
-"""A plan of two footsteps and a heading, as a component of tasks: state, switches, what is seen."""
+"""A plan of two footsteps and a heading: state, switches of stance, observation."""
 
 from __future__ import annotations
 
@@ -14,21 +14,28 @@ from trl_suite.tasks.task import Marker
 from trl_suite.util.compiled import compiled
 
 RIGHT, LEFT = 0, 1  # of the end effectors, in link order
-SIDE = np.array([-1.0, 1.0])  # of each foot: to the right, to the left
+SIDE = np.array([-1.0, 1.0])  # sign of y of each foot
 CONTACT_SIZE, PLAN_SIZE = 2, 13
-SOLE, SOLE_AHEAD = (0.0885, 0.045, 0.004), 0.052  # m; of the markers, and how far before the ankle
-SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)  # who lands there
+SOLE, SOLE_AHEAD = (
+    (0.0885, 0.045, 0.004),
+    0.052,
+)  # m; half sizes of markers, distance ahead of the ankle
+SWING_COLOUR, STANCE_COLOUR = (
+    (0.95, 0.55, 0.1, 0.9),
+    (0.15, 0.45, 0.9, 0.9),
+)  # by the foot that lands
 
 
 class FootstepPlan(NamedTuple):
     """The plan of each simulation.
 
     Attributes:
-      stance: foot that stands, (n,).
-      landing: where the swing foot lands, then the stance foot, (n, 2, 3) m.
-      heading: planned, (n,) rad.
-      landing_error: of the last foot that landed, horizontal, (n,) m; 0 before any landing.
-      heading_error: at that moment, (n,) rad.
+      stance: stance foot, `RIGHT` or `LEFT`, (n,).
+      landing: landing place of the swing foot, then of the stance foot, (n, 2, 3) m.
+      heading: planned heading, (n,) rad.
+      landing_error: horizontal distance of the last foot that landed from its landing place, (n,)
+        m; 0 before the first landing.
+      heading_error: magnitude of the heading error at that time, (n,) rad.
       landed: whether a foot landed in the last step, (n,).
     """
 
@@ -41,7 +48,7 @@ class FootstepPlan(NamedTuple):
 
 
 def footstep_plan(n: int) -> FootstepPlan:
-    """Makes room for the plans of n simulations."""
+    """Allocates the plans of n simulations."""
     return FootstepPlan(
         np.zeros(n, int),
         np.zeros((n, 2, 3)),
@@ -54,7 +61,7 @@ def footstep_plan(n: int) -> FootstepPlan:
 
 @compiled
 def update_stance(i: int, phase: float, found: SpatialMeasurement, plan: FootstepPlan) -> bool:
-    """Switches the stance foot if the phase says so, and records how well the other has landed.
+    """Switches the stance foot if the phase is in the other half, and writes the landing errors.
 
     Returns:
       Whether it switched.
@@ -75,7 +82,7 @@ def observe_plan(
     i: int, contact: int, column: int, found: SpatialMeasurement, plan: FootstepPlan,
     observation: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes the blocks contact and plan at these columns; see `SpatialFootsteps`."""
+    """Writes the blocks contact and plan, from these columns on; see `SpatialFootsteps`."""
     for foot in range(2):
         observation[i, contact + foot] = found.contact[i, foot]
     for k in range(PLAN_SIZE - 1):
@@ -94,7 +101,7 @@ def observe_plan(
 
 
 def plan_mirror(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how the blocks contact and plan are reflected: index and sign."""
+    """Returns the reflection of the block contact or plan: index and sign."""
     if name == 'contact':
         return np.array([1, 0]), np.ones(CONTACT_SIZE)
     index = np.arange(PLAN_SIZE)
@@ -103,7 +110,7 @@ def plan_mirror(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Marker]:
-    """Where the feet are to land, and which way the body at `root` (3,) m is to head."""
+    """Returns markers of the landing places, and of the planned heading at `root` (3,) m."""
     yaw = float(plan.heading[env_id])
     ahead = SOLE_AHEAD * np.array([np.cos(yaw), np.sin(yaw), 0.0])
     colours = SWING_COLOUR, STANCE_COLOUR
@@ -115,10 +122,10 @@ def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Mark
 
 
 def check_two_feet(spec: CharacterSpec) -> None:
-    """Checks that a character has two feet to place.
+    """Checks that a character has two feet.
 
     Raises:
       ValueError: it has not.
     """
     if len(spec.end_effectors) != 2:
-        raise ValueError(f'character {spec.name!r} has no two feet to place')
+        raise ValueError(f'character {spec.name!r} does not have two end effectors as feet')

@@ -1,4 +1,4 @@
-"""How plans of footsteps are drawn, and the pushes that disturb who follows them: options as data."""
+"""Options for drawing footstep plans, and for pushes that disturb the walker."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from trl_suite.util import errors
 
 # Meanings of options of all tasks that follow footstep plans.
 MAX_LANDING_ERROR = (
-    'a foot that lands farther from its place ends the episode; by default it does not'
+    'distance between a foot and its landing place above which landing ends the episode; by default there '
+    'is no limit'
 )
-FOOTSTEP_SCALE = 'factor of the squared landing error in the reward; more teaches accuracy'
-ROOT_TURN_LIMIT = 1.2  # rad; the most that a plan made from the root turns
+FOOTSTEP_SCALE = 'factor of the squared landing error in the reward; larger values reward accuracy'
+ROOT_TURN_LIMIT = 1.2  # rad; largest turn of a plan that is made from the root
 
 
 @dataclasses.dataclass(frozen=True)
 class Plans:
-    """How plans are drawn; a plan says where both feet land next and where the body heads.
+    """Options for drawing plans; a plan has the next landing places of both feet and a heading.
 
-    At every switch of stance the second landing place of the old plan becomes the first of the new
-    one, and the second is laid from there: a step's length along the planned heading and its width
-    to the side of the foot.
+    At every switch of stance, the second landing place of the old plan becomes the first of the new
+    one. The new second place is displaced from it by the length of a step along the planned
+    heading, and by its width to the side of the foot.
 
     Attributes:
-      length: of a step, m: least and most.
-      width: between the feet, m: least and most.
-      change: probability that a step has other length and width than the one before.
-      turn: spread of the change of heading from one step to the next, rad.
-      sharp: probability of a sharp turn instead, anything between -pi and pi.
-      from_root: probability that a plan is made anew from where the body is and heads, as a
-        high-level controller makes plans.
-      root_length, root_width: of the steps of such a plan, m: least and most.
-      root_turn: spread of its turn off the present heading, rad; cut at 1.2.
+      length: minimum and maximum length of a step, m.
+      width: minimum and maximum distance between the feet to the side, m.
+      change: probability that length and width of a step are redrawn.
+      turn: standard deviation of the change of heading from one step to the next, rad.
+      sharp: probability of a sharp turn instead, drawn from [-pi, pi).
+      from_root: probability that a plan is made from the position and heading of the root, as those
+        of a high-level controller are.
+      root_length, root_width: minimum and maximum length and width of the steps of such a plan, m.
+      root_turn: standard deviation of its turn from the current heading, rad; clipped to +-1.2.
     """
 
     length: tuple[float, float] = (0.5, 0.5)
@@ -60,11 +61,11 @@ class Plans:
 
 @dataclasses.dataclass(frozen=True)
 class StraightPlans:
-    """How plans in the plane are drawn: as those of `Plans`, but straight on and of no width.
+    """Options for drawing plans in the plane: as `Plans`, but without turns and width.
 
     Attributes:
-      length: of a step, m: least and most.
-      change: probability that a step has another length than the one before.
+      length: minimum and maximum length of a step, m.
+      change: probability that the length of a step is redrawn.
     """
 
     length: tuple[float, float] = (0.4, 0.4)
@@ -78,12 +79,13 @@ class StraightPlans:
 
 @dataclasses.dataclass(frozen=True)
 class Pushes:
-    """Horizontal forces from any side on the middle of the torso, again and again.
+    """Repeated horizontal forces on the torso's centre of mass, in random directions.
 
     Attributes:
-      force: N: least and most.
-      duration: s of each, in whole control steps.
-      interval: s from the end of one, or the start of the episode, to the next.
+      force: minimum and maximum force, N.
+      duration: minimum and maximum duration of a push, s; rounded to control steps.
+      interval: minimum and maximum time from the end of a push, or the start of the episode, to the
+        next push, s; rounded to control steps.
     """
 
     force: tuple[float, float] = (50.0, 150.0)
@@ -96,28 +98,28 @@ class Pushes:
 
 
 def _check_ranges(instance: Any, names: Sequence[str], unit: str) -> None:
-    """Turns fields into pairs of floats, the least and the most."""
+    """Converts fields to pairs of floats, minimum and maximum."""
     for name in names:
         object.__setattr__(instance, name, span(name, getattr(instance, name), unit))
 
 
 def span(name: str, value: Any, unit: str) -> tuple[float, float]:
-    """Returns the least and the most, 0 or more, as floats.
+    """Returns a minimum and a maximum, both at least 0, as floats.
 
     Raises:
-      ValueError: it is no such pair; the message has the name.
+      ValueError: the value is not such a pair; the message has the name.
     """
     try:
         low, high = map(float, value)
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
     if not 0 <= low <= high < np.inf:
-        raise ValueError(f'{name} is {value}; expected the least and the most, in {unit}')
+        raise ValueError(f'{name} is {value}; expected minimum and maximum, in {unit}')
     return low, high
 
 
 def options(cls: Any, kind: str, given: Any) -> Any:
-    """Returns options as an instance of their class, made of keyword arguments if need be."""
+    """Returns options as an instance of `cls`; a mapping is passed to it as keyword arguments."""
     if not isinstance(given, Mapping):
         if not isinstance(given, cls):
             raise ValueError(f'{kind} is {given!r}; expected {cls.__name__} or a mapping')

@@ -1,6 +1,6 @@
-"""How what walkers in three dimensions observe and do looks in a mirror, the x-z plane.
+"""Reflection of observations and actions of 3D walkers in the x-z plane.
 
-A reflection of k columns is an index and a sign, both (k,): `x[index] * sign`; see
+A reflection of k columns is an index and a sign, both (k,): the result is `x[index] * sign`; see
 `trl_suite.policies.mirror`.
 """
 
@@ -16,14 +16,14 @@ from trl_suite.policies.mirror import blocks, exchanged
 from trl_suite.terrain.spatial.surroundings import SAMPLES
 
 Reflection = tuple[np.ndarray, np.ndarray]
-# Signs of a vector, of a quaternion, and of what turns about the axes of a vector.
+# Signs of a vector, of a quaternion, and of a pseudovector such as an angular velocity.
 VECTOR, QUATERNION, SPIN = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
 ANGLE_AXIS = (1.0, -1.0, -1.0, 1.0)  # angle; forward, up, right
-POSE = (*VECTOR, *QUATERNION)  # of what the block of the pose has for each link
+POSE = (*VECTOR, *QUATERNION)  # of the numbers of a link in the block pose
 
 
 def body(character: Character) -> dict[str, Reflection]:
-    """The blocks of the body and of the map around it."""
+    """Returns reflections of the blocks terrain, pose and velocity."""
     spec = character.spec
     names = list(spec.links)
     pairs = [(names.index(a), names.index(b)) for a, b in spec.mirror]
@@ -38,12 +38,12 @@ def body(character: Character) -> dict[str, Reflection]:
 
 
 def phase(bins: int) -> Reflection:
-    """The block of a phase and of the `bins` that tell which part of the cycle it is in."""
+    """Returns the reflection of the block phase: a phase, and the one-hot of its part, `bins`."""
     return np.append(0, 1 + np.roll(np.arange(bins), bins // 2)), np.ones(1 + bins)
 
 
 def actions(character: Character, action_map: ActionMap) -> Reflection:
-    """What joints are told."""
+    """Returns the reflection of actions, i.e. joint targets or torques."""
     spec = character.spec
     joints = list(spec.joints)
     ball = ANGLE_AXIS if isinstance(action_map, AngleAxisMap) else SPIN
@@ -62,6 +62,6 @@ def actions(character: Character, action_map: ActionMap) -> Reflection:
 
 
 def joined(layout: Mapping[str, slice], parts: Mapping[str, Reflection]) -> Reflection:
-    """An observation, from its layout and the reflection of each of its blocks."""
+    """Returns the reflection of an observation from its layout and those of its blocks."""
     index = np.concatenate([part.start + parts[name][0] for name, part in layout.items()])
     return index, np.concatenate([parts[name][1] for name in layout])

@@ -1,4 +1,4 @@
-"""Reward terms as pure functions over a leading batch axis."""
+"""Weights and scales of reward terms, and the functions that they share."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ IMITATION_TERMS: dict[str, tuple[float, float]] = {
     'com': (0.2, 10.0),
     'root': (0.1, 10.0),
 }
-# The footstep controller's, of the same structure; its end-effector error has the footstep in it,
-# and `heading` is a power of a cosine (see `heading`), its scale meaningless.
+# The reward of footstep controllers, of the same structure; its end-effector error includes the
+# landing place, and `heading` is a power of a cosine (see `facing`), so that its scale is unused.
 # Source: the step scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
 STEP_TERMS: dict[str, tuple[float, float]] = {
     'pose': (0.5 / 1.05, 2.0),
@@ -29,9 +29,9 @@ STEP_TERMS: dict[str, tuple[float, float]] = {
     'root': (0.1 / 1.05, 10.0),
     'heading': (0.1 / 1.05, 0.0),
 }
-# Imitation on the way to a goal, as the original's scenario with a goal means it: velocity and heading
-# count towards the goal, and `proximity` is of the squared distance over that within which they no
-# longer do.
+# Imitation while walking to a goal, after the original's scenario with a goal: velocity and heading
+# are compared with the direction of the goal unless it is near, and the error of `proximity` is the
+# squared ratio of the distance to the radius that counts as near.
 DIRECT_TERMS: dict[str, tuple[float, float]] = {
     'pose': (0.5 / 1.15, 2.0),
     'velocity': (0.05 / 1.15, 0.005),
@@ -46,23 +46,23 @@ COM_ERROR_FACTOR = 0.1  # the com error is this times the squared velocity error
 
 @compiled
 def term(error: float, weight: float, scale: float) -> float:
-    """Returns what an error is worth: weight * exp(-scale * error)."""
+    """Returns weight * exp(-scale * error)."""
     return weight * math.exp(-scale * error)
 
 
 @compiled
 def facing(error: float) -> float:
-    """Returns ((1 + cos error) / 2)^4 of an error in rad: 1 where it is 0, 0 where opposite."""
+    """Returns ((1 + cos error) / 2)^4 for an error in rad: 1 if it is 0, 0 if it is pi."""
     half = 0.5 + 0.5 * math.cos(error)
     return half * half * half * half
 
 
 @compiled
 def wrapped(angle: float) -> float:
-    """Returns an angle in rad wrapped to [-pi, pi]; one inside stays bit for bit."""
+    """Returns an angle in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
     return angle - 2 * math.pi * np.rint(angle / (2 * math.pi))
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-    """Wraps angles in rad to [-pi, pi]: the shortest rotation. Those inside stay bit for bit."""
+    """Returns angles in rad wrapped to [-pi, pi]; angles in this range are unchanged."""
     return angle - 2 * np.pi * np.round(angle / (2 * np.pi))

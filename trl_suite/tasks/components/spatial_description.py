@@ -1,4 +1,4 @@
-"""Sections on tasks of a walker in three dimensions that several task types have in common."""
+"""Sections of descriptions that several task types for 3D walkers share."""
 
 from __future__ import annotations
 
@@ -19,34 +19,35 @@ if TYPE_CHECKING:
 BLOCKS: Meanings = {
     'terrain': (
         'm',
-        'ground heights above the ground at the root, 32 lines from the left to the right (5.5 m to each '
-        'side), each of 32 from 1 m behind to 10 m ahead',
+        'ground heights relative to the ground under the root, 32 lines from left to right (5.5 m to '
+        'each side), each with 32 points from 1 m behind to 10 m ahead',
     ),
     'pose': (
         'm, 1',
-        'root height above ground; then of each link its centre from the root and its orientation (wxyz)',
+        'root height above the ground; then for each link the position of its centre from the root and '
+        'its orientation (wxyz)',
     ),
     'velocity': (
         'm/s, rad/s',
-        'of each link the velocity of its centre, against the ground under the root, and its angular '
-        'velocity',
+        'for each link the velocity of its centre relative to the ground under the root, and its '
+        'angular velocity',
     ),
     'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
     'reference': (
         'm, m/s',
-        "the clip's root height; its link centres from its root; their velocities",
+        'root height, link centres from the root, and velocities of link centres of the reference',
     ),
     'goal': (
         'rad, m',
-        'bearing (positive to the left) and distance of the point on the line of the start that is 3 m '
-        'further on',
+        'bearing (positive to the left) and distance of the point 3 m ahead on the line along +x through '
+        'the start',
     ),
     **PLAN_BLOCKS,
 }
-# Of a task whose goal moves, or whose ball has one.
+# Block goal of other tasks, without and with a ball.
 TARGETS = {
     False: ('rad, m', 'bearing (positive to the left) and distance of the goal'),
-    True: ('rad, m', 'bearing and distance of the goal as seen from the ball'),
+    True: ('rad, m', 'bearing and distance of the goal from the ball'),
 }
 BALL_BLOCK = (
     'rad, m, m/s, rad/s',
@@ -67,14 +68,14 @@ def blocks(task: Any) -> Meanings:
 
 
 def after(task: Any) -> Iterator[Section]:
-    """Yields where links and parts of a plan are in the observation."""
+    """Yields the tables of links and of the plan in the observation."""
     links = list(task.character.spec.links)
     pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
     if task.mirrored:
-        # In right stance; in left stance links change places.
+        # The table below is for right stance; in left stance links are exchanged.
         yield section(
-            'Mirrored: while the left foot stands, all is seen in a mirror, and actions are mirrored back',
-            'then what is called right below is the left side',
+            'Mirrored: in left stance, observations and actions are mirrored',
+            'the sides in the table below are then exchanged',
         )
     yield section(
         'Links in the observation (centre 3 and orientation 4; velocity 3 and angular velocity 3)',
@@ -91,20 +92,20 @@ def after(task: Any) -> Iterator[Section]:
 
 
 def start(spec: EnvSpec) -> Section:
-    """Returns where an episode begins."""
+    """Returns the initial position in an episode."""
     layout = _layout(spec)
     where = {
         'start': 'at the origin, heading along x',
-        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
-        f'within {ground.START_ROOM:g} m, with any heading',
-        'trail': f'on the middle of the trail and along it, anywhere up to '
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, with no obstacle or belt within '
+        f'{ground.START_ROOM:g} m, with any heading',
+        'trail': f'on the middle of the trail, heading along it, up to '
         f'{ground.TRAIL_SPAN - ground.TRAIL_PAD:g} m from the origin along x and along y',
     }
     return section('Start', where[layout.place])
 
 
 def goal(spec: EnvSpec, task: Any, rule: str) -> Section:
-    """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
+    """Returns where a goal is drawn, by a rule of `terrain.spatial.ground`, and when it changes."""
     layout = _layout(spec)
     segments = '1 to 10 segments'
     near = f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y'
@@ -113,50 +114,50 @@ def goal(spec: EnvSpec, task: Any, rule: str) -> Section:
         near = f'1 to {ground.GOAL_SPREAD:g} m ahead of the walker along x, where y is 0'
     where = {
         'start': near,
-        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
-        f'within {layout.goal_room:g} m',
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, with no obstacle or belt within '
+        f'{layout.goal_room:g} m',
         'trail': f'{segments} of the trail (2 m each) beyond the nearest, up to {ground.TRAIL_OFFSET:g} of '
-        'its width beside its middle',
+        'its width from its middle',
     }[layout.place]
     away = getattr(task.config, 'goal_distance', None)
     if away is not None:
         where = f'{span(away)} from the walker, in any direction'
     return section(
         'Goal',
-        f'drawn {where}; the next one when the walker is within {task.goal_reached:g} m of it, or after '
+        f'drawn {where}; redrawn when the walker is within {task.goal_reached:g} m of it, or after '
         f'{_seconds(goals.GOAL_LASTS)}',
     )
 
 
 def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
-    """Returns where ball and goal (`away` from it, m) are, and when they change."""
+    """Returns where ball and goal are placed, and when; `away`: distances of goal from ball, m."""
     return section(
         'Goal and ball',
-        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg is put {span(ball.BALL_AWAY)} from the walker, '
-        f'the goal {span(away or ball.GOAL_AWAY)} from the ball, in any direction; the ball is put elsewhere '
-        f'after {_seconds(ball.BALL_LASTS)}, the next goal is drawn after {_seconds(goals.GOAL_LASTS)}',
+        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg is placed {span(ball.BALL_AWAY)} from the walker, '
+        f'the goal {span(away or ball.GOAL_AWAY)} from the ball, in any direction; the ball is placed again '
+        f'after {_seconds(ball.BALL_LASTS)}, the goal is redrawn after {_seconds(goals.GOAL_LASTS)}',
     )
 
 
 def _layout(spec: EnvSpec) -> Layout:
-    """Returns how ground of an environment's terrain is laid out."""
+    """Returns the layout of the ground of an environment's terrain."""
     return SpatialGround(terrain.load(spec.part('terrain')), 0).layout
 
 
 def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
-    """Returns formulas of the terms that are about a ball, and when they are full.
+    """Returns formulas of the reward terms for a ball, and when all of them are full.
 
     Args:
-      speed: of the walker and the ball that is full, m/s.
-      reached: distance of the ball from the goal at which all are full, m.
+      speed: target speed of walker and ball, m/s.
+      reached: distance of the ball from the goal within which all terms are full, m.
     """
     speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
     formulas = [
         f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
-        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: on the ground from where the centre of mass was when the '
-        'step began to the ball, m',
-        f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
-        f"exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball's centre to the goal on the ground, m",
+        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: horizontal distance of the ball from the centre of mass at '
+        'the beginning of the step, m',
+        f'{speeds}, v: speed of the ball towards the goal, m/s; the term is 0 unless v > 0',
+        f"exp(-{ball.GOAL_SHARPNESS:g} d), d: distance from the ball's centre to the goal on the ground, m",
     ]
     return formulas, (
         f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '

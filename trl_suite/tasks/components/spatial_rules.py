@@ -1,4 +1,4 @@
-"""What the rules of all tasks of a spatial walker share: clock, actions, ground and observation."""
+"""Compiled functions that all tasks of a 3D walker share: clock, actions, ground, observation."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
 CONTROL_TIMESTEP = 1 / 30  # s
-TERRAIN_MAPS = "maps of the ground around that are observed, of 'height' and 'velocity'"
-SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
+TERRAIN_MAPS = "observed maps of the terrain: 'height', 'velocity', both or none"
+SUBSTEPS = 10  # physics at 300 Hz: trained policies score the same as at 600 Hz, less below 180 Hz
 ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
 PHASE_BINS = 4
-MIRRORED_BINS = 2  # of the phase of a single step
+MIRRORED_BINS = 2  # for the phase of a single step
 ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
-_DIGITS = 1e9  # per cycle, to which the clock is rounded
+_DIGITS = 1e9  # the clock is rounded to 1 / _DIGITS of a cycle
 
 
 class Clock(NamedTuple):
-    """Where each simulation is in the cycle of its motion, (n,).
+    """Phase of each simulation in the cycle of its reference motion, (n,).
 
     Attributes:
       start: phase at the start of the episode.
-      steps: control steps since.
-      cycles: time on the motion in periods: the phase, not wrapped.
-      phase: in [0, 1).
+      steps: control steps since the start.
+      cycles: time in periods of the motion: the phase, not wrapped.
+      phase: phase in [0, 1).
     """
 
     start: np.ndarray
@@ -52,11 +52,11 @@ class Clock(NamedTuple):
 
 
 class Travel(NamedTuple):
-    """Where the walkers come from.
+    """Start and distance travelled of each walker.
 
     Attributes:
-      origin: x, y (m) and heading (rad) of the start, (n, 3).
-      distance: of the root from there, (n,) m; in imitation along +x.
+      origin: x, y (m) and heading (rad) at the start, (n, 3).
+      distance: horizontal distance of the root from the start, (n,) m; in imitation along +x.
     """
 
     origin: np.ndarray
@@ -64,14 +64,14 @@ class Travel(NamedTuple):
 
 
 class View(NamedTuple):
-    """What of the full observation is given to the agent, perhaps in a mirror, and how it acts.
+    """How observation and action are derived from the full observation, with optional mirroring.
 
     Attributes:
-      mirrored: whether left stance is seen as right stance.
+      mirrored: whether observations and actions are reflected in left stance.
       source, sign: a reflected full observation is `full[source] * sign`, (size,).
       phase: column of the phase in the full observation.
-      kept: columns of the full observation that are given, (k,); all of them if it is empty.
-      given_phase: column of the phase among them.
+      kept: columns of the full observation that are observed, (k,); all of them if it is empty.
+      given_phase: column of the phase in the observation.
       action_index, action_sign: a reflected action is `action[index] * sign`.
     """
 
@@ -86,15 +86,16 @@ class View(NamedTuple):
 
 
 class SpatialRules(NamedTuple):
-    """What the rules of all these tasks work on.
+    """Data for the compiled functions of all these tasks.
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      period: of the motion's cycle, s.
-      terrain, pose, velocity, phase: where these blocks begin in the full observation; -1: nowhere.
+      period: period of the reference motion, s.
+      terrain, pose, velocity, phase: first columns of these blocks in the full observation; -1:
+        absent.
       full: the full observation, (n, size).
-      action: what joints are driven by, (n, k); scratch.
-      leaving: whether the window of ground has to be laid anew, (n,).
+      action: actions after reflection, (n, k); scratch.
+      leaving: whether the walker has left its ground window, which must then be moved, (n,).
     """
 
     engine: native.Engine
@@ -123,9 +124,9 @@ class SpatialRules(NamedTuple):
 
 @compiled
 def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
-    """Drives the joints and keeps boxes moving; returns whether a window of ground must be laid.
+    """Writes controls and drives moving boxes; returns whether the ground window must be moved.
 
-    Ground is laid before the physics, so that what is rendered afterwards is up to date.
+    It is moved before the physics steps, so that images rendered afterwards are up to date.
     """
     given = rules.given
     left = given.mirrored and rules.full[i, given.phase] >= 0.5
@@ -140,10 +141,10 @@ def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
 
 @compiled
 def prepare_ground(i: int, rules: SpatialRules) -> bool:
-    """Keeps boxes moving before a control step.
+    """Drives moving boxes before a control step, unless the ground window must be moved.
 
     Returns:
-      Whether the window of ground must be laid anew; who lays it keeps boxes moving as well.
+      Whether the ground window must be moved, which drives the boxes as well.
     """
     root = rules.body.links[0]
     x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
@@ -157,24 +158,24 @@ def prepare_ground(i: int, rules: SpatialRules) -> bool:
 
 @compiled
 def tick(i: int, rules: SpatialRules) -> None:
-    """Moves the clock on by a control step."""
+    """Advances the clock by a control step."""
     rules.clock.steps[i] += 1
     read_clock(i, rules)
 
 
 @compiled
 def read_clock(i: int, rules: SpatialRules) -> None:
-    """Works out the phase."""
+    """Computes the phase."""
     clock = rules.clock
     cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / rules.period)
-    # Half a cycle is half a cycle, however it was counted.
+    # Rounded, so that rounding errors of the sum do not delay the switch of stance at half a cycle.
     clock.cycles[i] = np.rint(cycles * _DIGITS) / _DIGITS
     clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
 
 
 @compiled
 def breaks_down(i: int, rules: SpatialRules) -> bool:
-    """Whether the physics has diverged; the last finite observation then stands."""
+    """Returns whether the physics has diverged; the caller then keeps the last observation."""
     diverged = native.diverged(i, rules.engine) or too_fast(
         i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
     )
@@ -184,7 +185,7 @@ def breaks_down(i: int, rules: SpatialRules) -> bool:
 
 @compiled
 def measure(i: int, rules: SpatialRules) -> None:
-    """Measures the body, on the ground as it now is."""
+    """Measures the body, relative to the current ground."""
     spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
     measure_body(i, rules.body, rules.physics, rules.ground, rules.found)
     x = rules.found.root[i, 0] - rules.travel.origin[i, 0]
@@ -206,7 +207,7 @@ def observe_body(i: int, rules: SpatialRules) -> None:
 
 @compiled
 def publish(i: int, rules: SpatialRules) -> None:
-    """Gives the agent what it is to see of the full observation."""
+    """Writes the observation from the full observation."""
     given, full, observation = rules.given, rules.full, rules.outcome.observation
     left = given.mirrored and full[i, given.phase] >= 0.5
     for k in range(len(given.kept)):
@@ -222,7 +223,7 @@ def publish(i: int, rules: SpatialRules) -> None:
 
 @compiled_loop
 def act_all(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
-    """Takes actions; returns how many windows of ground must be laid. Takes a pack."""
+    """Applies actions; returns how many ground windows must be moved. Takes a pack."""
     leaving = 0
     for i in env_ids:
         leaving += act(i, action, rules)

@@ -19,7 +19,7 @@ TYPES = (
         motion=Clip,
         differences=(
             differences.FROM_3000, differences.ACTIONS, differences.LANDING,
-            Difference('the reference is half a cycle of the walk for every step, however long'),
+            Difference('the reference of a step is half a cycle of the walk, for all step lengths'),
             differences.OWN_CLIP, differences.START_PHASE, differences.CUT,
         ),
     ),
@@ -35,12 +35,13 @@ TYPES = (
             differences.FROM_1200, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,
             differences.CONES,
             Difference(
-                'truly mirrored; the original runs the same environment as for the general plan',
+                'observations and actions are mirrored; in the original, this id runs the same environment as '
+                'PD_Biped3D_LLC_General_Step-v0',
                 lambda spec: spec.options.get('mirrored', False),
             ),
             differences.LANDING,
             Difference(
-                'a goal is drawn anew when the walker is within 1 m; the original draws one, at the start',
+                'a goal is redrawn when the walker is within 1 m; the original draws one, at the start',
                 lambda spec: spec.options.get('goal', False),
             ),
             differences.START_PHASE, differences.CUT,

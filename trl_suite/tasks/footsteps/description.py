@@ -1,4 +1,4 @@
-"""Walking along planned footsteps in words and tables."""
+"""Descriptions of tasks that track planned footsteps, in text and tables."""
 
 from __future__ import annotations
 
@@ -12,69 +12,74 @@ from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, section
 
 _PLANS = 'Plans: at every switch of stance'
-_SWING = 'end_effector: in the second half of a step, that of the swing foot is the way to its landing place'
-LEGEND = ' Orange and blue: where the foot that swings and the other one are to land.'
+_SWING = (
+    'end_effector: in the second half of a step, the error of the swing foot is its displacement from the '
+    'landing place'
+)
+LEGEND = ' Orange and blue: planned landing places of the swing foot and of the stance foot.'
 
 
 def after(task: Any) -> Iterator[Section]:
-    """Yields where parts of a plan are in the observation."""
+    """Yields the table of the parts of the plan in the observation."""
     yield description.plan(task)
 
 
 def planar_rules(spec: Any, task: Any) -> Iterator[Section]:
-    """Yields clip, plans, reward and termination."""
+    """Yields the sections on clip, plans, reward and termination."""
     yield description.clip(task)
     yield section(
         _PLANS,
-        f'steps {span(task.plans.length)} long, straight on; with probability {task.plans.change:g} '
-        'another length is drawn; the right foot stands while the phase is below 0.5',
+        f'steps {span(task.plans.length)} long, straight ahead; with probability {task.plans.change:g} '
+        'the length is redrawn; right stance while the phase is below 0.5',
     )
     yield section(
         REWARD,
         tracking_terms(task, True),
         _SWING,
-        'heading: the whole weight while the trunk faces ahead, 0 while it faces backwards',
+        'heading: weight while the trunk points forwards, 0 while it points backwards',
     )
     yield description.fall(task, description.missed(task))
 
 
 def spatial_rules(spec: Any, task: Any) -> Iterator[Section]:
-    """Yields steps, plans, reward and termination."""
+    """Yields the sections on steps, plans, reward and termination."""
     motion = task.motion
     yield section(
         f'Steps: {motion.name}',
-        f'{motion.description}, and mirrored; the nearest to the plan is the reference of a step. '
-        f'Period of two steps {task.period:.4g} s; the right foot stands while the phase is below 0.5',
+        f'{motion.description}, and mirrored; the one nearest to the plan is the reference of a step. '
+        f'Period of two steps {task.period:.4g} s; right stance while the phase is below 0.5',
     )
     yield section(_PLANS, '; '.join(_plans(task)))
     yield section(
         REWARD,
         tracking_terms(task, True),
-        'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and that planned',
+        'heading: weight * ((1 + cos error) / 2)^4, error: angle between heading and planned heading',
         _SWING,
     )
     yield description.fall(task, description.missed(task))
 
 
 def _plans(task: Any) -> list[str]:
-    """Returns how plans are drawn."""
+    """Returns phrases on how plans are drawn."""
     plans = task.plans
     lines = [f'steps {span(plans.length)} long, feet {span(plans.width)} apart']
     if task.goal_given:
-        lines.append('heads for a goal, drawn anew when it is reached')
+        lines.append('the heading is that of a goal, which is redrawn when it is reached')
     else:
         lines.append(
             f'the heading changes by N(0, {plans.turn:g}) rad from step to step'
             if plans.turn
-            else 'straight on'
+            else 'straight ahead'
         )
         if plans.sharp:
-            lines.append(f'with probability {plans.sharp:g} by anything up to pi instead')
+            lines.append(
+                f'with probability {plans.sharp:g} it changes uniformly in [-pi, pi) instead'
+            )
     if plans.from_root:
-        lines.append(f'with probability {plans.from_root:g} planned anew from the root')
+        lines.append(f'with probability {plans.from_root:g} the plan is made from the root')
     if task.pushes:
         low, high = task.pushes.force
-        lines.append(f'the torso is pushed now and then by {low:g} to {high:g} N')
+        lines.append(f'the torso is pushed repeatedly with {low:g} to {high:g} N')
     return lines
 
 

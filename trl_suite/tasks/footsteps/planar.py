@@ -1,6 +1,6 @@
-"""Walking in the plane along planned footsteps: the footstep controller, straight on.
+"""Walking straight ahead along planned footsteps in the plane: the planar footstep controller.
 
-Source: the step scenario of the original, as a configuration of it has it for the planar biped;
+Source: the step scenario of the original, with its configuration for the planar biped;
 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
 """
 
@@ -32,7 +32,9 @@ from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import option
 from trl_suite.util.random import Streams, random, uniform
 
-_DIGITS = 1e9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
+_DIGITS = (
+    1e9  # the clock is rounded to 1 / _DIGITS of a cycle, so that stance switches at half a cycle
+)
 _END_EFFECTOR = list(rewards.STEP_TERMS).index('end_effector')
 _HEADING = list(rewards.STEP_TERMS).index('heading')
 RIGHT, LEFT = 0, 1
@@ -42,13 +44,13 @@ class Plan(NamedTuple):
     """The footsteps planned in each simulation.
 
     Attributes:
-      stance: foot that stands, 0 the right one, 1 the left one, (n,).
-      landing: where the swing foot lands, then the stance foot: x, 0 and z, (n, 2, 3) m.
-      landing_error: distance between the last foot that landed and its place, along x, (n,) m.
-      landed: whether one landed in this step, (n,) bool.
-      length: of the current steps, (n,) m.
-      begun: time on the clip at the last switch, in periods, and the root's place then, (n, 2).
-      random: the stream that lengths are drawn from, (n, 6); see `util.random`.
+      stance: stance foot, 0 right, 1 left, (n,).
+      landing: landing places of the swing foot, then of the stance foot: x, 0 and z, (n, 2, 3) m.
+      landing_error: distance along x of the last foot that landed from its landing place, (n,) m.
+      landed: whether a foot landed in the last step, (n,) bool.
+      length: current step length, (n,) m.
+      begun: time in periods of the clip, and x of the root (m), at the last switch, (n, 2).
+      random: random stream for step lengths, (n, 6); see `util.random`.
     """
 
     stance: np.ndarray
@@ -61,14 +63,14 @@ class Plan(NamedTuple):
 
 
 class Options(NamedTuple):
-    """How plans are drawn and judged, and where blocks begin in an observation.
+    """Options of plans and of the reward, and columns of the observation.
 
     Attributes:
-      shortest, longest: of the steps, m.
-      change: probability that a step has another length than the one before.
-      max_landing_error: landing error that ends an episode, m.
-      footstep_scale: times the squared distance between swing foot and landing place.
-      contact_block, plan_block: first columns.
+      shortest, longest: bounds of the step length, m.
+      change: probability that the step length is redrawn.
+      max_landing_error: landing error above which the episode fails, m.
+      footstep_scale: factor of the squared distance between swing foot and landing place.
+      contact_block, plan_block: first columns of these blocks.
     """
 
     shortest: float
@@ -85,7 +87,7 @@ class Options(NamedTuple):
 
 @compiled
 def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
-    """Landing, reward, failure and observation, after the physics has advanced."""
+    """Computes landing, reward, failure and observation, after the physics was advanced."""
     imitation_rules.advance_clock(i, rules.clip, rules.state)
     diverged = imitation_rules.breaks_down(i, rules)
     missed = land(i, diverged, rules, plan, options)
@@ -100,7 +102,7 @@ def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Optio
 
 @compiled
 def read_clock(i: int, rules: imitation_rules.Rules) -> int:
-    """Writes the phase; returns which foot stands by it."""
+    """Writes the phase; returns the stance foot that it implies."""
     cycles = np.rint(rules.state.cycles[i] * _DIGITS) / _DIGITS
     rules.state.phase[i] = cycles % 1.0
     return LEFT if rules.state.phase[i] >= 0.5 else RIGHT
@@ -110,9 +112,9 @@ def read_clock(i: int, rules: imitation_rules.Rules) -> int:
 def land(
     i: int, diverged: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> bool:  # fmt: skip
-    """At a switch of stance, looks where the foot has landed and plans on; whether it has missed."""
+    """At a switch of stance, writes landing error and next plan; returns whether the step failed."""
     stance = read_clock(i, rules)
-    plan.landed[i] = stance != plan.stance[i] and not diverged  # what breaks down lands nowhere
+    plan.landed[i] = stance != plan.stance[i] and not diverged
     if not plan.landed[i]:
         return False
     plan.stance[i] = stance  # the foot that has just landed
@@ -127,7 +129,7 @@ def land(
 
 @compiled
 def next_length(i: int, plan: Plan, options: Options) -> float:
-    """Returns how long the next step of a plan is, which perhaps is drawn anew, m."""
+    """Returns the length of the next step, m; redraws it with probability `change`."""
     if random(i, plan.random) < options.change:
         plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
     return plan.length[i]
@@ -135,7 +137,7 @@ def next_length(i: int, plan: Plan, options: Options) -> float:
 
 @compiled
 def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
-    """Gives the landing places the heights of the ground; notes where the plan was made."""
+    """Writes ground heights to the landing places, and the clock and root position to `begun`."""
     for which in range(2):
         x = plan.landing[i, which, 0]
         plan.landing[i, which, 2] = planar_ground.height(i, x, rules.ground)
@@ -154,7 +156,7 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
     end_effector = 0.0
     for k in range(found.effectors.shape[1]):
         if k == swing and late:
-            continue  # its place is the plan's
+            continue  # compared with the landing place below
         off = found.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
         end_effector += off * off
     if late:
@@ -172,7 +174,7 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
 
 @compiled
 def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
-    """Writes the blocks behind velocity: muscles, phase, contacts, and the plan."""
+    """Writes the blocks after velocity: strain, phase, contact and plan."""
     imitation_rules.observe(i, rules)
     observation, body, physics = rules.outcome.observation, rules.body, rules.physics
     for k in range(len(body.contact)):
@@ -180,7 +182,7 @@ def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
         observation[i, options.contact_block + k] = 1.0 if touches else 0.0
     for k in range(12):
         observation[i, options.plan_block + k] = 0.0
-    for which in range(2):  # first and second step, as seen from the foot that lands there
+    for which in range(2):  # first and second landing place, relative to the foot that lands there
         foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
         x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
         place = options.plan_block + 6 * which + 3 * foot
@@ -216,7 +218,7 @@ def draw_plans(
 def finish_steps(
     env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> int:
-    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -231,7 +233,10 @@ def finish_steps(
 def observe_all(
     env_ids: np.ndarray, fresh: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
 ) -> int:
-    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    """Writes observations; returns how many simulations are waiting for ground, see `must_wait`.
+
+    If `fresh`, episodes have just begun, and outcomes are reset.
+    """
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -260,17 +265,16 @@ class PlanarFootstepsConfig(PlanarConfig):
 
 
 class PlanarFootsteps(PlanarImitation):
-    """A planar biped tracks a plan of footsteps; its single steps are the halves of a clip.
+    """A planar biped tracks a plan of footsteps; the reference of a step is one half of a clip.
 
     Observation blocks, in this order (N links; heading frame as for `PlanarImitation`), N = 12: 69 numbers:
-      terrain, pose, velocity, phase: as for `PlanarImitation`; the right foot stands while the phase is
+      terrain, pose, velocity, phase: as for `PlanarImitation`; right stance while the phase is
         below 0.5.
       contact: whether right and left foot touch the ground; 2.
-      plan: as in three dimensions, where (x, y, z) stand for each place and y is 0: where the first
-        step lands as seen from the right foot, zero while that one stands, and from the left foot,
-        zero while that one does; where the second lands as seen from the right foot, zero unless that
-        one stands, and from the left foot; z from the ground under the root; then 0 for the heading;
-        13.
+      plan: as in three dimensions, with y = 0 in each position (x, y, z): first landing place
+        relative to the right foot, 0 in right stance, and to the left foot, 0 in left stance;
+        second landing place relative to the right foot, 0 in left stance, and to the left foot, 0
+        in right stance; z is relative to the ground under the root; then 0 for the heading; 13.
 
     Attributes:
       plan: the footsteps; see `Plan`.
@@ -296,14 +300,14 @@ class PlanarFootsteps(PlanarImitation):
         Args:
           character: a planar character with a right and a left foot, without actuators; it is
             attached to the arena.
-          arena: where it moves.
-          clip: a looping planar clip for this character, of two steps; the right foot stands first.
+          arena: the arena with its terrain.
+          clip: a looping planar clip of two steps for this character, with right stance first.
           config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other, a character without two feet, or a clip that
-            does not fit it; when the world is bound, a clip whose left foot stands first.
+          ValueError: incompatible options, a character without two feet, or a clip that does not
+            fit it; `bind` raises it for a clip with left stance first.
         """
         check_feet(character.spec)
         super().__init__(character, arena, clip, config, actuation_model=actuation_model)
@@ -316,7 +320,9 @@ class PlanarFootsteps(PlanarImitation):
         n = world.n
         columns = self.reference.columns['effectors']
         table = self.reference.features(np.arange(64) / 64)[:, columns]
-        higher = (table[:, 2] - table[:, 3]).reshape(2, -1).mean(1)  # the right foot, by halves
+        higher = (
+            (table[:, 2] - table[:, 3]).reshape(2, -1).mean(1)
+        )  # right above left foot, by halves
         if not higher[0] < 0 < higher[1]:
             raise ValueError(
                 f'clip {self.clip.name!r}: its right foot does not stand in the first half of the '
@@ -332,7 +338,7 @@ class PlanarFootsteps(PlanarImitation):
         self.info_arrays |= {
             'landed': self.plan.landed,
             'landing_error': self.plan.landing_error,
-            'heading_error': np.zeros(n),  # it cannot turn
+            'heading_error': np.zeros(n),  # a planar character does not turn
         }
         plans = self.plans
         options = Options(
@@ -355,7 +361,7 @@ class PlanarFootsteps(PlanarImitation):
             observe_all(self._widened(env_ids), fresh, *self._packs)
 
     def markers(self, env_id: int) -> list[Marker]:
-        """Where the feet are to land."""
+        """Returns markers of the landing places."""
         return [
             Marker('box', (x + SOLE_AHEAD, y, z + SOLE[2]), SOLE, colour)
             for (x, y, z), colour in zip(
@@ -364,7 +370,7 @@ class PlanarFootsteps(PlanarImitation):
         ]
 
     def reference_pose(self, env_id: int) -> np.ndarray:
-        """Pose of the reference where the character was at the last switch: x, z, pitch, joints."""
+        """Returns the reference pose, aligned with x at the last switch: x, z, pitch, joints."""
         begun, x = self.plan.begun[env_id]
         first, pose = self.clip.pose(
             np.array([begun, self.state.cycles[env_id]]) * self.reference.period
@@ -382,6 +388,6 @@ def check_feet(character: CharacterSpec) -> None:
     """
     if character.end_effectors not in character.mirror:
         raise ValueError(
-            f'character {character.name!r} has no right and left foot to place, but '
+            f'character {character.name!r} has no right and left foot, but '
             f'{", ".join(character.end_effectors) or "no end effectors"}; biped2d_full has them'
         )

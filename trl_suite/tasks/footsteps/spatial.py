@@ -1,4 +1,4 @@
-"""Walking where the feet are told to go: the footstep-tracking low-level controllers.
+"""Walking along planned footsteps in three dimensions: the low-level footstep controllers.
 
 Source: the step scenario of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
 deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
@@ -66,25 +66,25 @@ class SpatialFootstepsConfig(MirroredConfig):
     """Options of `SpatialFootsteps`."""
 
     plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
-    goal: bool = option(False, 'plans head for a goal on the terrain, one after the other')
+    goal: bool = option(False, 'plans lead to goals on the terrain, one after the other')
     pushes: Any = option(
         None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
     )
     max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
     grace_period: float = option(
-        0.0, 'time after a push or a sharp turn in which no landing error ends the episode', unit='s',
+        0.0, 'time after a push or a sharp turn in which landing errors do not end the episode', unit='s',
         at_least=0,
     )  # fmt: skip
     footstep_scale: float | Sequence[float] = option(
-        1.0, f'{FOOTSTEP_SCALE}; of several the mean of their rewards counts', at_least=0
+        1.0, f'{FOOTSTEP_SCALE}; with several values, the term is the mean over them', at_least=0
     )
     heading_scale: float = option(
-        1.0, 'factor of the squared error of the heading in the reward', at_least=0
+        1.0, 'factor of the error of the heading in the reward', at_least=0
     )
     hidden_plan: bool = option(
         False,
-        'observe bearing and distance of a goal that stays where it is instead of contact and plan, '
-        "which the reward is still about, as the original's 'Hard' environments do",
+        'observe bearing and distance of a fixed goal instead of contact and plan, although the reward '
+        "depends on the plan, as in the original's 'Hard' environments",
     )
 
     def __post_init__(self) -> None:
@@ -93,7 +93,7 @@ class SpatialFootstepsConfig(MirroredConfig):
         if self.pushes is not None:
             self._set('pushes', options(Pushes, 'pushes', self.pushes))
         if self.hidden_plan and self.mirrored:
-            raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+            raise ValueError('hidden_plan and mirrored cannot be combined: give only one of them')
 
 
 class SpatialFootsteps(SpatialTask):
@@ -101,17 +101,19 @@ class SpatialFootsteps(SpatialTask):
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
     left, z up), N = 8: 125 numbers:
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, with the option terrain_observation.
       pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
-      phase: phase in [0, 1), then the one-hot of its quarter; 5. The right foot stands below 0.5.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. Right stance below 0.5.
       contact: whether right and left foot touch the ground; 2.
-      plan: where the first step lands as seen from the right foot, zero while that one stands, and
-        from the left foot, zero while that one does; where the second lands as seen from the right
-        foot, zero unless that one stands, and from the left foot; (x, y, z) each, z from the ground
-        under the root; then the planned heading, rad to the left of the present one; 13.
-    Mirrored, 117 numbers: all of it reflected in left stance, actions too; the phase is that of the
-    single step, with the one-hot of its half (3), and the plan (7) has the heading first, then the
-    first landing place as seen from the swing foot, then the second from the stance foot.
+      plan: first landing place relative to the right foot, 0 in right stance, and to the left foot,
+        0 in left stance; second landing place relative to the right foot, 0 in left stance, and to
+        the left foot, 0 in right stance; (x, y, z) each, z relative to the ground under the root;
+        then the planned heading, rad to the left of the current one; 13.
+    With the option mirrored, 117 numbers: observations and actions are reflected in left stance;
+      the
+    phase is that of the single step, with the one-hot of its half (3), and the plan (7) has the
+    heading first, then the first landing place relative to the swing foot, then the second relative
+    to the stance foot.
     """
 
     TERMS = rewards.STEP_TERMS
@@ -132,13 +134,14 @@ class SpatialFootsteps(SpatialTask):
 
         Args:
           character: a spatial biped without actuators; it is attached to the arena.
-          arena: where it moves.
-          steps: library of single steps of this character; the clock has the period of two.
-          config: the options; the middle of position control is the mean pose of a straight step.
+          arena: the arena with its terrain.
+          steps: library of single steps of this character; the clock has the period of two steps.
+          config: the options; with action_offset 'clip', action 0 is the mean pose of a straight
+            step.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other, or steps that do not fit the character.
+          ValueError: incompatible options, or steps that do not fit the character.
         """
         check_two_feet(character.spec)
         self._footstep_scales = np.atleast_1d(config.footstep_scale).astype(float)
@@ -147,10 +150,10 @@ class SpatialFootsteps(SpatialTask):
         self.pushes: Pushes | None = config.pushes
         self.steps, self.period = steps, 2 * steps.duration
         self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
-        # The original meant to fail at 1 m and does not.
+        # The original has a limit of 1 m that has no effect.
         self.max_landing_error = config.max_landing_error
         self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
-        # The straight step of about the planned length, from which episodes start.
+        # Episodes start from the straight step whose length is nearest to the planned one.
         self._first = straight_step(steps, float(np.mean(self.plans.length)))
         extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * config.hidden_plan}
         super().__init__(
@@ -160,7 +163,7 @@ class SpatialFootsteps(SpatialTask):
             self._hide_plan()
 
     def _hide_plan(self) -> None:
-        """Leaves the plan out of what is observed."""
+        """Removes contact and plan from the observation."""
         names = [name for name in self._full if name not in HIDDEN]
         self.blocks = consecutive({
             name: self._full[name].stop - self._full[name].start for name in names
@@ -202,16 +205,16 @@ class SpatialFootsteps(SpatialTask):
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
 
-    # The plan, by short names.
+    # Short names for the plan.
 
     @property
     def stance(self) -> np.ndarray:
-        """Foot that stands, `RIGHT` or `LEFT`, (n,)."""
+        """Stance foot, `RIGHT` or `LEFT`, (n,)."""
         return self.plan.stance
 
     @property
     def landing(self) -> np.ndarray:
-        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        """Landing places of the swing foot, then of the stance foot, (n, 2, 3) m."""
         return self.plan.landing
 
     @property
@@ -221,7 +224,7 @@ class SpatialFootsteps(SpatialTask):
 
     @property
     def goal(self) -> np.ndarray:
-        """Where to go, (n, 3) m."""
+        """Position of the goal, (n, 3) m."""
         return self.state.goal
 
     @property
@@ -261,7 +264,7 @@ class SpatialFootsteps(SpatialTask):
         if self.goal_given:
             self._head_for_goals(env_ids, found.root[env_ids, :2])
         else:
-            # The line of the plan goes through the start, half a width beside each foot.
+            # The feet land on both sides of a line through the start, at half a width from it.
             line = quaternion.turned(anchors - places, -angles)
             line[:, 1] = 0.5 * SIDE[stance] * aside
             anchors = places + quaternion.turned(line, angles)
@@ -274,14 +277,14 @@ class SpatialFootsteps(SpatialTask):
                 state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
 
     def _redraw_step(self, i: int, always: bool = False) -> None:
-        """Draws length and width of the steps to come, perhaps."""
+        """Redraws length and width of steps, always or with probability `change`."""
         plans, random = self.plans, self._random[i]
         if always or random.uniform() < plans.change:
             self.state.length[i] = random.uniform(*plans.length)
             self.state.width[i] = random.uniform(*plans.width)
 
     def _next_size(self, i: int) -> tuple[float, float]:
-        """Returns length and width of the next step, which perhaps are drawn anew, m."""
+        """Returns length and width of the next step, m; redraws them with probability `change`."""
         self._redraw_step(i)
         return float(self.state.length[i]), float(self.state.width[i])
 
@@ -293,13 +296,13 @@ class SpatialFootsteps(SpatialTask):
         places: np.ndarray,
         sizes: np.ndarray,
     ) -> np.ndarray:
-        """Enters into the plans where feet land while the other ones stand at places, on the ground.
+        """Writes one landing place to each plan: a step from the position of the other foot.
 
         Args:
-          env_ids: which simulations, (m,).
-          which: of the plan's two steps.
-          feet: which ones step, (m,).
-          places: (m, 2) m.
+          env_ids: numbers of simulations, (m,).
+          which: which of the plan's two landing places, 0 or 1.
+          feet: the feet that step, (m,).
+          places: positions of the other feet, (m, 2) m.
           sizes: lengths and widths of the steps, (m, 2) m.
 
         Returns:
@@ -314,7 +317,7 @@ class SpatialFootsteps(SpatialTask):
         return places
 
     def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
-        """Plans to head from places (m, 2) for the goals, where these are not too near."""
+        """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
         way = self.goal[env_ids, :2] - places
         headings = np.arctan2(way[:, 1], way[:, 0])
         far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
@@ -332,7 +335,7 @@ class SpatialFootsteps(SpatialTask):
             self._push(env_ids, self.pushes)
 
     def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
-        """Applies the forces of pushes, and draws those that begin."""
+        """Draws pushes that begin, and applies the forces."""
         state, count = self.state, self.clock.steps
         for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
             angle = self._random[i].uniform(-np.pi, np.pi)
@@ -356,7 +359,7 @@ class SpatialFootsteps(SpatialTask):
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
     def _replan(self, env_ids: np.ndarray, found: SpatialMeasurement) -> None:
-        """Makes the next plans of some simulations, at a switch of stance."""
+        """Updates the plans of some simulations at a switch of stance."""
         plans, count = self.plans, len(env_ids)
         by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
         for k, i in enumerate(env_ids.tolist()):
@@ -396,7 +399,7 @@ class SpatialFootsteps(SpatialTask):
                 places = self._lay(going, which, feet, places, sizes[by_root, which])
 
     def _choose(self, env_ids: np.ndarray, found: SpatialMeasurement) -> np.ndarray:
-        """Returns the steps nearest to the plans of some simulations."""
+        """Returns the steps of the library that are nearest to the plans of some simulations."""
         feet = found.feet[env_ids]
         query = step_features(
             found.root[env_ids, :2], found.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
@@ -407,7 +410,7 @@ class SpatialFootsteps(SpatialTask):
     def _put_reference(
         self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
     ) -> None:
-        """Has the chosen steps begin where the characters are and as they head."""
+        """Aligns the chosen steps with position and heading of the characters."""
         self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
         columns = self.reference.columns
         now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
@@ -417,7 +420,7 @@ class SpatialFootsteps(SpatialTask):
             now[:, columns['root']], turned
         )
 
-    # Left and right, and pictures.
+    # Reflection and rendering.
 
     def _extra_mirror(self, name: str) -> Reflection:
         return (np.arange(2), np.array([-1.0, 1.0])) if name == 'goal' else plan_mirror(name)
@@ -429,11 +432,11 @@ class SpatialFootsteps(SpatialTask):
         columns = super()._canonical_extra_columns(name)
         if name == 'contact':
             return columns
-        # Heading; the first step as seen from the left foot, the second from the right one.
+        # Heading; first landing place from the left foot, second from the right foot.
         return columns[[12, 3, 4, 5, 6, 7, 8]]
 
     def markers(self, env_id: int) -> list[Marker]:
-        """Where the feet are to land, which way the body is to head, and the goal."""
+        """Returns markers of the landing places, the planned heading and the goal."""
         root = self.world.xpos[env_id, self.figure.links[0]]
         found = plan_markers(env_id, root, self.plan)
         if self.goal_given:
@@ -443,7 +446,7 @@ class SpatialFootsteps(SpatialTask):
         return found
 
     def reference_pose(self, env_id: int) -> np.ndarray:
-        """Pose of the reference where it was put: root, then joints."""
+        """Returns the pose of the aligned reference: root, then joints."""
         state = self.state
         mirrored, index = divmod(int(state.track[env_id]), len(self.steps))
         time = self.step_phase[env_id] * self.steps.duration
@@ -457,13 +460,13 @@ class SpatialFootsteps(SpatialTask):
 
 
 def straight_step(steps: Steps, length: float) -> int:
-    """Returns the step of a library that is straight on and of about this length, m."""
+    """Returns the straight step of a library whose length is nearest to `length`, m."""
     straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
     return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
 
 
 def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses over the origin, and rates, at phases (m,) of two steps like this one."""
+    """Returns poses with x = y = 0, and rates, at phases (m,) of a step and its mirror image."""
     times = (2 * phase - np.floor(2 * phase)) * steps.duration
     poses, rates = (
         part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)

@@ -1,4 +1,4 @@
-"""The rules of following planned footsteps in three dimensions, as compiled functions."""
+"""Tracking planned footsteps in three dimensions: compiled functions."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ from trl_suite.tasks.components.spatial_rules import (
 from trl_suite.tasks.task import conclude
 from trl_suite.util.compiled import compiled, compiled_loop
 
-NEAR_GOAL = 0.1  # m; nearer a goal gives no direction
-GOAL_REACHED = 1.0  # m; a goal is drawn anew there
-TYPICAL_POSES = 31  # of a step, whose mean is the middle of position control
-HIDDEN = ('contact', 'plan')  # blocks of a hidden plan
+NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading
+GOAL_REACHED = 1.0  # m; a nearer goal is redrawn
+TYPICAL_POSES = 31  # poses of a step; their mean is action 0 of position control
+HIDDEN = ('contact', 'plan')  # blocks that the option hidden_plan removes
 
 POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING = range(len(rewards.STEP_TERMS))
 
 
 class FootstepState(NamedTuple):
-    """What the task knows beside the plan, (n, ...).
+    """State of the task in addition to the plan, (n, ...).
 
     Attributes:
-      length, width: of the current steps, m.
-      track: of the reference.
-      turned: by which the reference is turned, rad.
-      shift: where the origin of its track is, (n, 2) m.
-      goal: (n, 3) m.
+      length, width: length and width of the current steps, m.
+      track: track of the reference, see `SpatialReference`.
+      turned: rotation of the reference about z, rad.
+      shift: position of the origin of its track, (n, 2) m.
+      goal: position of the goal, (n, 3) m.
       push: force on the torso, (n, 3) N.
       push_end, push_begin: control steps of an episode at which the push ends and the next begins.
-      excused: control step of an episode until which no foot misses.
-      missed: whether a foot landed too far from its place in the last step.
+      excused: control step of an episode until which landing errors do not count.
+      missed: whether the landing error was too large in the last step.
     """
 
     length: np.ndarray
@@ -71,13 +71,13 @@ class FootstepState(NamedTuple):
 
 
 class FootstepRules(NamedTuple):
-    """All that the rules of footsteps work on.
+    """Data for the compiled functions of footsteps.
 
     Attributes:
-      contact, plan_block: where these blocks begin in the full observation.
-      goal_block: where the goal is seen; -1: it is not.
-      footstep_scales, heading_scale: of errors in the reward.
-      largest_miss: of a foot that lands, m.
+      contact, plan_block: first columns of these blocks in the full observation.
+      goal_block: first column of the block goal; -1: not observed.
+      footstep_scales, heading_scale: factors of errors in the reward.
+      largest_miss: landing error above which the episode fails, m.
     """
 
     common: SpatialRules
@@ -92,12 +92,12 @@ class FootstepRules(NamedTuple):
     largest_miss: float
 
 
-# A step of simulation i: `land`, the next plan where stance switches, `finish`.
+# A step of simulation i: `land`, the next plan if stance switches, `finish`.
 
 
 @compiled
 def land(i: int, rules: FootstepRules) -> bool:
-    """Measures the body and looks at what has landed; returns whether it wants another plan."""
+    """Advances the clock, measures, and detects landings; returns whether a new plan is needed."""
     common, plan, state = rules.common, rules.plan, rules.state
     tick(i, common)
     plan.landed[i] = state.missed[i] = False
@@ -112,9 +112,9 @@ def land(i: int, rules: FootstepRules) -> bool:
 
 @compiled
 def finish(i: int, rules: FootstepRules) -> None:
-    """Reward, failure and observation."""
+    """Computes reward, failure and observation."""
     outcome = rules.common.outcome
-    if outcome.diverged[i]:  # the last finite observation stands
+    if outcome.diverged[i]:  # keeps the last finite observation
         conclude(i, True, outcome)
         return
     compare(i, rules)
@@ -124,20 +124,20 @@ def finish(i: int, rules: FootstepRules) -> None:
 
 @compiled
 def step_phase(phase: float) -> float:
-    """Share of the single step that has passed, of the phase of two."""
+    """Returns the phase of the single step from the phase of the cycle of two."""
     return 2 * phase - np.floor(2 * phase)
 
 
 @compiled
 def compare(i: int, rules: FootstepRules) -> None:
-    """Writes the reward terms: the reference's pose and motion, and where and how feet land."""
+    """Writes the reward terms, from errors to the reference and to the plan."""
     common, plan, by = rules.common, rules.plan, rules.comparison
     found, terms, state = common.found, common.outcome.reward_terms, rules.state
     share = step_phase(common.clock.phase[i])
     row, rest = moment(share, state.track[i], by.tracks)
     terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
     terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
-    # The reference heads where the character did when it was put there.
+    # The reference was aligned with the heading of the character at the switch of stance.
     terms[i, COM] = term(COM, com_error(i, row, rest, state.turned[i], by, found), by)
     terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
 
@@ -145,7 +145,7 @@ def compare(i: int, rules: FootstepRules) -> None:
     feet = step = 0.0
     for foot in range(2):
         for k in range(3):
-            # In the second half the plan takes the place of the reference.
+            # In the second half, x and y of the swing foot are compared with the plan instead.
             if not (late and foot == swing and k < 2):
                 column = by.effectors + 3 * foot + k
                 off = found.features[i, column] - feature(row, rest, column, by.tracks)
@@ -185,7 +185,7 @@ def observe(i: int, rules: FootstepRules) -> None:
 
 @compiled_loop
 def land_all(env_ids: np.ndarray, rules: FootstepRules) -> int:
-    """Looks at what has landed; returns how many want another plan."""
+    """Detects landings; returns how many simulations need a new plan."""
     switched = 0
     for i in env_ids:
         switched += land(i, rules)
@@ -201,7 +201,7 @@ def finish_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
 
 @compiled_loop
 def observe_all(env_ids: np.ndarray, rules: FootstepRules) -> None:
-    """Observes, and compares as if a step had been taken."""
+    """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
         measure(i, rules.common)
         compare(i, rules)

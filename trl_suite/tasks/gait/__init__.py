@@ -1,4 +1,4 @@
-"""The TerrainRL family: an agent sets the parameters of a gait state machine."""
+"""The TerrainRL family: actions set the parameters of a gait state machine."""
 
 from trl_suite.tasks.components import differences
 from trl_suite.tasks.components.differences import Difference
@@ -19,18 +19,18 @@ TYPES = (
         samples='cycles',
         differences=(
             Difference(
-                'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these at 30 Hz, at '
-                'which they fall here'
+                'MuJoCo at 1200 Hz, control at 600 Hz; the original controls most of these characters at 30 '
+                'Hz, at which they fall in this suite'
             ),
             Difference(
-                'actions are in [-1, 1], clipped, and mapped to the parameters that are learnt; the original '
-                'takes them for the first of all parameters, so that most mean another'
+                'actions are in [-1, 1], clipped, and mapped to the learnt parameters; the original assigns '
+                'them to the first of all parameters, so that most set the wrong one'
             ),
             Difference(
                 'a step ends with its cycle or a fall, not up to 1/30 s later; the first action of an '
-                'episode counts'
+                'episode takes effect'
             ),
-            Difference('the reward is of the cycle that the action made, and never NaN'),
+            Difference('the reward is that of the cycle that the action controlled, and never NaN'),
             differences.FACES,
             differences.CUT,
         ),

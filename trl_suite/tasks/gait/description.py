@@ -1,4 +1,4 @@
-"""Gait state machines in words and tables."""
+"""Descriptions of gait tasks in text and tables."""
 
 from __future__ import annotations
 
@@ -21,35 +21,41 @@ if TYPE_CHECKING:
 _BLOCKS = {
     'terrain': (
         'm',
-        'ground heights from 0.5 m behind to 10 m ahead, above the ground at the root',
+        'ground heights from 0.5 m behind to 10 m ahead, relative to the ground under the root',
     ),
-    'pose': ('m', 'root height above ground; then x, z of each other link centre from the root'),
+    'pose': (
+        'm',
+        'root height above the ground; then x, z of each other link centre from the root',
+    ),
     'velocity': ('m/s', 'x, z velocity of each link centre'),
 }
 _STANCE_FIRST = '; the stance leg first, then the swing leg'
-_PITCH_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
-# Units of gait parameters that are no angles, by name without state.
+_PITCH_ENDS = {
+    'pose': '; the last number is the pitch of the root (rad)',
+    'velocity': '; the last number is the pitch rate of the root (rad/s)',
+}
+# Units of gait parameters that are not angles, by name without state.
 _UNITS = {
     'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
     **dict.fromkeys(
         ('BackForceX', 'BackForceY', 'FrontForceX', 'FrontForceY', 'ForceX', 'ForceY'), 'N'
     ),
 }  # fmt: skip
-# What parameters do, by name without state; the others are targets of the joints that they name.
+# Effects of parameters, by name without state; the others are targets of the joints that they name.
 _EFFECTS = {
-    'TransTime': 'length of the states that end after it',
-    'BackForceX': 'push of the hind foot on the body, ahead, in BackStance and Extend',
-    'BackForceY': 'the same, upwards',
-    'FrontForceX': 'push of the fore foot on the body, ahead, in FrontStance and Gather',
-    'FrontForceY': 'the same, upwards',
+    'TransTime': 'duration of the states that end after TransTime',
+    'BackForceX': 'forward virtual force of the hind foot on the body, in BackStance and Extend',
+    'BackForceY': 'upward virtual force of the hind foot on the body, in BackStance and Extend',
+    'FrontForceX': 'forward virtual force of the fore foot on the body, in FrontStance and Gather',
+    'FrontForceY': 'upward virtual force of the fore foot on the body, in FrontStance and Gather',
     'SpineCurve': 'target of every joint of the spine',
-    'Cd': 'in Passing and Up, times the way from the stance foot to the centre of mass: added to SwingHip',
-    'RootPitch': 'pitch at which the hip of a stance foot on the ground holds the root',
-    'MagicGain': 'of the torque that keeps the root upright on the ground, by the hip',
+    'Cd': 'gain from the distance of the centre of mass ahead of the stance foot to SwingHip, in Passing and Up',
+    'RootPitch': 'target of the root pitch, controlled by the hip of a stance foot on the ground',
+    'MagicGain': 'factor of the hip torque that keeps the root upright on the ground',
 }
-_FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
-    True: 'in Contact and Down, times the forward speed: added to SwingHip',
-    False: 'times the forward speed: added to Hip and Shoulder of a leg in the air',
+_FROM_SPEED = {  # Cv: gain from the forward speed of the centre of mass
+    True: 'gain from the forward speed to SwingHip, in Contact and Down',
+    False: 'gain from the forward speed to Hip and Shoulder of a leg in the air',
 }
 
 
@@ -63,10 +69,10 @@ def blocks(task: Any) -> Meanings:
 
 
 def before(task: Any) -> Iterator[Section]:
-    """Yields the machine's states and parameters."""
+    """Yields the sections on states and parameters of the gait."""
     figures = task.gait.parameters
     yield section(
-        f'Gait: {len(figures.states)} states; joints are driven to targets by stable PD',
+        f'Gait: {len(figures.states)} states; stable PD control of joint targets',
         Table(('state', 'ends'), list(zip(figures.states, task.gait.endings, strict=True))),
     )
     chosen = [
@@ -89,19 +95,19 @@ def before(task: Any) -> Iterator[Section]:
         f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
         Table(('base action', 'parameter set'), blends),
         f'action 0 is {" = ".join(chosen)}',
-        f'taken without their sign: {", ".join(figures.names[i] for i in figures.absolute)}',
+        f'only the absolute value counts: {", ".join(figures.names[i] for i in figures.absolute)}',
         *([f'fixed: {", ".join(fixed)}'] if fixed else []),
     )
 
 
 def action(environment: Environment) -> Section:
-    """Returns what the actions set."""
+    """Returns the table of what each action sets."""
     task: Any = environment.task
     action_map, count = task.action_map, len(task.action_map)
     if task.interface == 'base_action':
         return section(
-            f'Action: {count} numbers in [-1, 1]; the largest chooses the base action',
-            'it begins with the next cycle',
+            f'Action: {count} numbers in [-1, 1]; the largest one selects the base action',
+            'the selected base action begins with the next cycle',
         )
     units = [_unit(task, name) for name in action_map.names]
     effects = [_effect(task, name) for name in action_map.names]
@@ -111,7 +117,7 @@ def action(environment: Environment) -> Section:
     return section(
         f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
         Table(
-            ('sets', 'action_offset', 'action_scale', 'unit', 'which is'),
+            ('sets', 'action_offset', 'action_scale', 'unit', 'meaning'),
             list(zip(*columns, strict=True)),
             numbered=True,
         ),
@@ -128,22 +134,22 @@ def _effect(task: Any, parameter: str) -> str:
     own = parameter.split('.')[-1]
     if own == 'Cv':
         return _FROM_SPEED['Cd' in task.gait.parameters.names]
-    return _EFFECTS.get(own, 'a target')
+    return _EFFECTS.get(own, 'joint target')
 
 
 def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
-    """Yields reward and termination."""
+    """Yields the sections on reward and termination."""
     figure, parameters = task.character.spec, task.gait.parameters
     weights = parameters.reward
     weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
     lines = [
         f'{weight}exp(-{gait_rules.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
-        'v: mean forward speed of the centre of mass, m/s',
+        'v: mean forward speed of the centre of mass in the cycle, m/s',
     ]
     if weights['stumble']:
         lines[0] += f' + {weights["stumble"]:g} / (1 + {gait_rules.STUMBLE_SHARPNESS:g} s)'
         lines.append(
-            's: share of the time in which a link other than '
+            's: fraction of time in which a link other than '
             f'{", ".join(figure.stumble_exempt)} touches the ground'
         )
     if not parameters.backward_reward:
@@ -153,14 +159,14 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
     share = gait_rules.FALL_THRESHOLD, gait_rules.CONTACT_DECAY, gait_rules.CONTACT_GAIN
     ends = [
         f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
-        f'{description.samples_until_fall(*share)} samples in a row, or so often that '
+        f'{description.samples_until_fall(*share)} consecutive samples, or so often that '
         f'{description.contact_share(*share)}',
-        f'the root is turned by more than {np.degrees(gait_rules.TURNED):.0f} degrees',
-        f'it has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
+        f'the pitch of the root is more than {np.degrees(gait_rules.TURNED):.0f} degrees',
+        f'the root has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
         'the physics diverges',
     ]
     if parameters.forward_only:
-        ends.insert(2, 'it moves backwards')
+        ends.insert(2, 'the root moves backwards')
     yield section(
         f'Termination (discount 0), sampled every {gait_rules.SAMPLE:g} s',
         '\n'.join(f'- {end}' for end in ends),
@@ -168,23 +174,25 @@ def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
 
 
 def time(spec: EnvSpec, task: Any) -> Section:
-    """Returns rates, and how long a step and an episode are."""
+    """Returns rates, and the duration of a step and an episode."""
     control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
     step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * gait_rules.FRAME:.3g} s'
     if task.interface == 'base_action':
         step = f'{gait_rules.FRAME:.3g} s'
     return section(
         'Time',
-        f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
+        f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is truncated\n'
         f'(discount 1) after {spec.step_limit} steps',
     )
 
 
 def joints(task: Any) -> tuple[str, list[object]]:
-    """Returns what the target of each joint is relative to."""
+    """Returns what the target angle of each joint is relative to."""
     hips = task.gait.hips
     joints = task.character.spec.joints
-    return 'target is to', ['the world' if joint in hips else 'its parent' for joint in joints]
+    return 'target relative to', [
+        'the world' if joint in hips else 'its parent' for joint in joints
+    ]
 
 
 GAIT = Description(

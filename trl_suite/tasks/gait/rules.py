@@ -1,4 +1,4 @@
-"""The rules of the gait task, as compiled functions of one simulation."""
+"""Gait tasks: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -26,25 +26,29 @@ from trl_suite.tasks.task import (
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
-SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m
+SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # number of observed ground heights, and their range, m
 SUBSTEPS = 2  # physics steps per control step: 1/1200 s
-FRAME = 1 / 30  # s; nominal control step, and the real one with interface 'base_action'
+FRAME = 1 / 30  # s; nominal step, and the actual one with interface 'base_action'
 LONGEST_CYCLE = 50  # frames
-UPSTREAM_CENTRE = 3.0  # m; where the original's first two stretches of ground meet
+UPSTREAM_CENTRE = 3.0  # m; boundary of the original's first two segments of ground
 INTERFACES = ('parameters', 'base_action')
 
-# Falls, all looked at every SAMPLE.
+# Conditions of failure, tested every SAMPLE.
 SAMPLE = 0.1  # s
 CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
     0.9,
     1 / 11,
     0.25,
-)  # of the running share of samples with a fall link down
-TURNED = 0.8 * np.pi  # rad
-PATIENCE, PROGRESS = 5.0, 0.5  # s, m; who moves less than that in that time is stuck
-MAX_JOINT_SPEED = 1000.0  # rad/s; feet whip: there is no damping in these joints
+)  # of the decaying average of samples with a fall link on the ground
+TURNED = 0.8 * np.pi  # rad; largest pitch
+PATIENCE, PROGRESS = (
+    5.0,
+    0.5,
+)  # s, m; an episode fails if the root moves less than this in this time
+MAX_JOINT_SPEED = 1000.0  # rad/s; high, since these joints have no damping
 
-# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 share of time stumbling).
+# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 * stumbling time
+# fraction).
 SPEED_SHARPNESS, STUMBLE_SHARPNESS = 0.5, 10.0
 TERMS = ('speed', 'stumble')
 SPEED, STUMBLE = range(len(TERMS))
@@ -52,23 +56,23 @@ SPEED, STUMBLE = range(len(TERMS))
 _FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
 _SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
 _PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
-_OVER, _GROUND, _LOOK = range(3)  # why a step is interrupted: not at all, for ground, for `watch`
+_OVER, _GROUND, _LOOK = range(3)  # why `go_on` returns: the step is over, the ground, or `watch`
 
 
 class GaitTaskState(NamedTuple):
-    """What the task remembers of each simulation, (n,); times are in control steps.
+    """State of the task for each simulation, (n,); times are in control steps.
 
     Attributes:
-      action: in [-1, 1], (n, k).
+      action: clipped action, (n, k).
       going: whether the current step is not over.
-      waiting: whether a gait's cycle is over and wants parameters.
-      lasted, stumbled: time of the last step, and that with a link on the ground that should not be.
-      age: time in the episode.
-      start: where the centre of mass was at the beginning of the step, m.
-      down: running share of samples with a fall link on the ground.
+      waiting: whether a cycle is over and the next one needs parameters.
+      lasted, stumbled: duration of the step, and time with a stumble link on the ground in it.
+      age: time since the start of the episode.
+      start: x of the centre of mass at the beginning of the step, m.
+      down: decaying average of samples with a fall link on the ground.
       milestone: x and z of the root at the last test of progress, (n, 2) m.
-      fell, stuck: how the episode has ended.
-      duration, stumbling: the times in s, of steps that are finished.
+      fell, stuck: whether the episode has ended with a fall, or without progress.
+      duration, stumbling: `lasted` and `stumbled` of the last finished step, s.
     """
 
     action: np.ndarray
@@ -87,23 +91,23 @@ class GaitTaskState(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What tells one task from another.
+    """Constants of a gait task.
 
     Attributes:
-      by_cycle: whether a step is a cycle, not a frame.
+      by_cycle: whether a step is a cycle, not a frame of 1/30 s.
       substeps: physics steps per control step.
       action_offset: parameters of the gait at action 0, (P,).
-      action_scale: what action 1 adds to those that actions set, (k,).
-      places: which these are, (k,).
-      base_actions: parameters that a preference chooses, (B, P).
+      action_scale: change of the parameters that actions set, per unit action, (k,).
+      places: indices of these parameters, (k,).
+      base_actions: parameters of the base actions, (B, P).
       controls: addresses of the joints' torques in ctrl, (J,).
-      fall, stumble: numbers of links that must not touch the ground, or should not.
+      fall, stumble: numbers of links whose ground contact is a fall, or reduces the reward.
       forward_only: whether moving backwards is a fall.
-      backward_reward: whether a cycle backwards earns anything.
+      backward_reward: whether the reward of a cycle with negative speed can be positive.
       target_speed: m/s.
-      weights: of the reward terms, (2,).
-      columns: of the measurement, which make an observation, by stance leg, (2, size).
-      pitch, pitch_rate: columns of the observation that they take, -1 for none.
+      weights: weights of the reward terms, (2,).
+      columns: columns of the measurement in the observation, by stance leg, (2, size).
+      pitch, pitch_rate: columns of the observation for pitch and its rate; -1: not observed.
     """
 
     by_cycle: bool
@@ -125,12 +129,12 @@ class Options(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """All that the rules of gait tasks work on.
+    """Data for the compiled functions of gait tasks.
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      measured: terrain, pose and velocity as `measure` writes them, (n, ...).
-      interruption: why the step of each was interrupted, (n,).
+      measured: blocks terrain, pose and velocity as `measure` writes them, (n, ...).
+      interruption: why `go_on` returned last, (n,).
     """
 
     engine: native.Engine
@@ -151,7 +155,7 @@ class Rules(NamedTuple):
 
 @compiled
 def begin_step(i: int, action: np.ndarray, rules: Rules) -> None:
-    """Takes an action; it sets the gait of the cycle that begins."""
+    """Begins a step; the action sets the gait of a cycle that begins with it."""
     state = rules.state
     for k in range(state.action.shape[1]):
         state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
@@ -164,7 +168,7 @@ def begin_step(i: int, action: np.ndarray, rules: Rules) -> None:
 
 @compiled
 def set_gait(i: int, rules: Rules) -> None:
-    """Begins a cycle with the parameters that the action means."""
+    """Begins a cycle with the parameters of the current action."""
     options, action, vector = rules.options, rules.state.action, rules.gait.state.vector
     rules.state.waiting[i] = False
     if options.by_cycle:
@@ -184,7 +188,7 @@ def set_gait(i: int, rules: Rules) -> None:
 
 @compiled
 def go_on(i: int, watched: bool, rules: Rules) -> int:
-    """Goes on with a step until it is over, or is interrupted; returns why."""
+    """Continues a step until it is over or interrupted; returns the reason."""
     state, options = rules.state, rules.options
     while state.going[i]:
         if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
@@ -211,7 +215,7 @@ def go_on(i: int, watched: bool, rules: Rules) -> int:
 
 @compiled
 def account(i: int, rules: Rules) -> None:
-    """Time, stumbling and falls after a control step."""
+    """Updates times, stumbling and failure after a control step."""
     state = rules.state
     state.lasted[i] += 1
     state.age[i] += 1
@@ -222,7 +226,7 @@ def account(i: int, rules: Rules) -> None:
 
 @compiled
 def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
-    """Whether any of some links touches the ground."""
+    """Returns whether any of these links touches the ground."""
     for link in links:
         if touches(i, link, gait):
             return True
@@ -231,7 +235,7 @@ def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
 
 @compiled
 def look(i: int, rules: Rules) -> None:
-    """Looks whether the episode has failed."""
+    """Tests whether the episode has failed."""
     state, body, physics = rules.state, rules.body, rules.gait.physics
     state.down[i] *= CONTACT_DECAY
     if any_touches(i, rules.options.fall, rules.gait):
@@ -251,7 +255,7 @@ def look(i: int, rules: Rules) -> None:
 
 @compiled
 def breaks_down(i: int, rules: Rules) -> bool:
-    """Whether the physics has diverged; the last finite observation then stands."""
+    """Returns whether the physics has diverged; the caller then keeps the last observation."""
     joints = rules.body.dof[3:]
     diverged = native.diverged(i, rules.engine) or too_fast(
         i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel
@@ -262,7 +266,7 @@ def breaks_down(i: int, rules: Rules) -> bool:
 
 @compiled
 def finish_step(i: int, rules: Rules) -> None:
-    """Reward, failure and observation of a step that is over."""
+    """Computes reward, failure and observation of a step that is over."""
     state, outcome = rules.state, rules.outcome
     state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
     state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
@@ -278,7 +282,7 @@ def finish_step(i: int, rules: Rules) -> None:
 
 @compiled
 def reward(i: int, rules: Rules) -> None:
-    """Writes the reward terms: speed, and how long it has not stumbled."""
+    """Writes the reward terms, from mean speed and stumbling time of the cycle."""
     state, options, terms = rules.state, rules.options, rules.outcome.reward_terms
     travelled = rules.gait.physics.subtree_com[i, rules.body.links[0], 0] - state.start[i]
     speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
@@ -292,7 +296,7 @@ def reward(i: int, rules: Rules) -> None:
 
 @compiled
 def observe(i: int, rules: Rules) -> None:
-    """Writes the observation: the swing leg comes last."""
+    """Writes the observation, with the stance leg first."""
     options, body, physics = rules.options, rules.body, rules.gait.physics
     measured, observation = rules.measured, rules.outcome.observation
     measure(i, body, physics, rules.ground, measured, rules.found)
@@ -306,7 +310,7 @@ def observe(i: int, rules: Rules) -> None:
 
 @compiled
 def begin_episode(i: int, rules: Rules) -> None:
-    """Puts machine, outcome and what the task remembers to their starts."""
+    """Resets state machine, outcome and state of the task."""
     state, body, physics = rules.state, rules.body, rules.gait.physics
     gaits.begin(i, rules.options.action_offset, rules.gait)
     begin(i, rules.outcome)
@@ -323,14 +327,14 @@ def begin_episode(i: int, rules: Rules) -> None:
 
 @compiled_loop
 def begin_steps(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> None:
-    """Takes actions."""
+    """Begins steps."""
     for i in env_ids:
         begin_step(i, action, rules)
 
 
 @compiled_loop
 def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
-    """Goes on with steps; returns how many were interrupted."""
+    """Continues steps; returns how many were interrupted."""
     interrupted = 0
     for i in env_ids:
         rules.interruption[i] = go_on(i, watched, rules)
@@ -340,7 +344,7 @@ def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
 
 @compiled_loop
 def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
-    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
@@ -353,7 +357,10 @@ def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
 
 @compiled_loop
 def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
-    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    """Writes observations; returns how many simulations are waiting for ground, see `must_wait`.
+
+    If `fresh`, episodes have just begun, and their state is reset.
+    """
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)

@@ -1,7 +1,7 @@
-"""The TerrainRL family: an agent sets the parameters of a gait once per cycle.
+"""The TerrainRL family: an action sets the parameters of a gait, once per cycle.
 
-One step of the environment is one gait cycle: it ends with the cycle, with a fall inside it, or after
-`LONGEST_CYCLE`. A user who discounts by time raises gamma to `info['duration']` / their own unit;
+A step of the environment is one gait cycle: it ends with the cycle, with a fall within it, or after
+`LONGEST_CYCLE`. To discount by time, use gamma ** (`info['duration']` / unit of time) for a step;
 the environment's discount is 0 after a fall and 1 otherwise.
 """
 
@@ -64,9 +64,10 @@ class GaitConfig(Config):
 
     interface: str = option(
         'parameters',
-        "'parameters': a step is a cycle, and an action sets the gait's parameters, 0 the default and +-1 "
-        "the largest deviation of any base action; 'base_action': a step is 1/30 s, and an action is one "
-        'preference per base action, of which the largest counts when the next cycle begins',
+        "'parameters': a step is a cycle, and an action sets the gait's parameters, where 0 is the default "
+        "and +-1 the largest deviation of any base action from it; 'base_action': a step is 1/30 s, an "
+        'action has one preference per base action, and the base action with the largest one is used '
+        'when the next cycle begins',
         choices=INTERFACES,
     )
     substeps: int = option(
@@ -74,32 +75,33 @@ class GaitConfig(Config):
     )
     spawn: str = option(
         'intended',
-        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
-        'original builds it',
+        "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
+        "'upstream', as in the original",
         choices=SPAWNS,
     )
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
     start_noise: float = option(
         0.0,
-        'standard deviation of what is added to joint angles at the start; ten times that to their rates '
-        'and to the speed (m/s)',
+        'standard deviation of the noise on joint angles at the start; that on joint rates (rad/s) and '
+        'forward speed (m/s) is ten times as large',
         unit='rad', at_least=0,
     )  # fmt: skip
 
 
 class GaitTask(Task):
-    """Travel at the target speed by setting a gait's parameters.
+    """A planar character travels at a target speed; actions set the parameters of its gait.
 
     Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
-    relative to the ground under it; 'pose', height of the root and (x, z) of every other link
-    relative to it; 'velocity', (x, z) of every link. Bipeds show the leg that is to swing last; of
-    the hopper's last link z becomes the root's pitch in pose and its rate in velocity.
+    relative to the ground under it, m; 'pose', height of the root above the ground and (x, z) of
+    every other link relative to the root, m; 'velocity', (x, z) of every link, m/s. For bipeds the
+    stance leg comes first, then the swing leg. For the hopper, z of the last link is replaced by
+    the root's pitch in 'pose' and by its rate in 'velocity'.
 
     Attributes:
       gait: the state machines.
-      state: what the task remembers, after `bind`.
-      watch: called at every multiple of 1/30 s of the first simulation's episode, within steps too;
-        for pictures.
+      state: state of the task, after `bind`.
+      watch: callback at every multiple of 1/30 s of the first simulation's episode, also within
+        steps; for rendering.
     """
 
     state: GaitTaskState
@@ -117,12 +119,12 @@ class GaitTask(Task):
         """Attaches character and gait to an arena.
 
         Args:
-          character: one with a gait, see `trl_suite.controllers.available`.
-          arena: planar terrain.
+          character: a character with a gait, see `trl_suite.controllers.available`.
+          arena: the arena with its planar terrain.
           config: the options.
 
         Raises:
-          ValueError: no gait drives the character.
+          ValueError: the character has no gait.
         """
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
@@ -132,7 +134,7 @@ class GaitTask(Task):
         timestep = CONTROL_TIMESTEP / config.substeps
         self.set_timesteps(FRAME, timestep)
         actuation.add(character, 'torque', timestep)
-        for joint in character.joints:  # the gaits were tuned without
+        for joint in character.joints:  # the gaits were tuned for joints without these
             joint.damping = joint.armature = 0
         parameters = self.gait.parameters
         if interface == 'parameters':
@@ -231,7 +233,7 @@ class GaitTask(Task):
         )
 
     def _columns(self, body: PlanarBody) -> np.ndarray:
-        """Columns of the measurement that make an observation, by stance leg, (2, size)."""
+        """Returns the columns of the measurement in an observation, by stance leg, (2, size)."""
         links = self.character.spec.links
         order = np.arange(len(links))
         mirrored = order.copy()
@@ -248,7 +250,7 @@ class GaitTask(Task):
         return np.array(arranged)
 
     def _start_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pose and rates of the first instant, (1, D), and extents of the geoms, (1, 3, G)."""
+        """Returns initial pose and rates, (1, D), and extents of the geoms, (1, 3, G)."""
         start, figure = self.gait.parameters.start, self.figure
         pose, rates = np.zeros((2, 1, len(figure.pose_qpos)))
         pose[0, 1:3], rates[0, :3] = (start['height'], start['pitch']), start['velocity']
@@ -283,7 +285,7 @@ class GaitTask(Task):
         begin_steps(env_ids, action, self._pack)
 
     def simulate(self, env_ids: np.ndarray) -> None:
-        """Runs each simulation to the end of its cycle, or for a frame."""
+        """Runs each simulation to the end of its cycle, or for 1/30 s."""
         interruption = self.rules.interruption
         while run(env_ids, self.watch is not None, self._pack):
             leaving = env_ids[interruption[env_ids] == _GROUND]
@@ -305,7 +307,7 @@ class GaitTask(Task):
             observe_all(self._widened(env_ids), fresh, self._pack)
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
         waiting = env_ids[self.rules.found.waiting[env_ids]]
         for i in waiting.tolist():
             self.arena.widen(i)

@@ -19,7 +19,7 @@ TYPES = (
         motion=Clip,
         differences=(
             Difference(
-                'MuJoCo at 600 Hz instead of Bullet at 3000 Hz; task option substeps',
+                'MuJoCo at 600 Hz instead of Bullet at 3000 Hz; see the option substeps',
                 lambda spec: 'substeps' in spec.options,
             ),
             Difference(
@@ -41,8 +41,8 @@ TYPES = (
             differences.FROM_3000, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,
             differences.CONES,
             Difference(
-                'the goal is straight on, 3 m ahead on the line of the start; the original observes where '
-                'the start was'
+                'the goal is 3 m ahead on the line along +x through the start; the original observes bearing '
+                'and distance of the start'
             ),
             differences.START_PHASE, differences.CUT,
         ),

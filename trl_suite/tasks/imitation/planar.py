@@ -61,11 +61,11 @@ from trl_suite.util.options import Config, option
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlanarConfig(Config):
-    """Options of tasks that follow a clip in the plane."""
+    """Options of tasks that track a clip in the plane."""
 
     terrain_observation: int = option(
         0,
-        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        'number of observed ground heights, from 0.5 m behind to 3 m ahead of the root; 0: none',
         at_least=0,
         at_most=MOST_SAMPLES,
     )
@@ -74,8 +74,8 @@ class PlanarConfig(Config):
     )
     action_offset: str = option(
         'clip',
-        "pose at action 0: the mean of the 'clip', the working 'posture', or the 'original' map, whose "
-        '[-1, 1] spans four times the joint range about its middle',
+        "pose at action 0: the mean of the 'clip', or the working 'posture'; 'original': the original's "
+        'map, where [-1, 1] spans four times the joint range about its middle',
         choices=ACTION_OFFSETS, actuation='position',
     )  # fmt: skip
     action_scale: float | None = option(
@@ -88,8 +88,8 @@ class PlanarConfig(Config):
     start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
     spawn: str = option(
         'intended',
-        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
-        'original builds it',
+        "position of the flat ground at the start: 'intended', up to 1 m to both sides of the root, or "
+        "'upstream', as in the original",
         choices=SPAWNS,
     )  # fmt: skip
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
@@ -106,30 +106,30 @@ class PlanarImitationConfig(PlanarConfig):
     """Options of `PlanarImitation`."""
 
     reference_observation: bool = option(
-        False, "observe the reference's state instead of the phase"
+        False, 'observe the state of the reference instead of the phase'
     )
     muscle_set: str = option(
-        PLAIN, "'plain', or the motion that the muscles were optimised for", actuation='muscle'
+        PLAIN, "'plain', or the clip for which the muscles were optimised", actuation='muscle'
     )
 
 
 class PlanarImitation(Task):
     """A planar character tracks a looping clip over random terrain.
 
-    Observation blocks, in this order (N links, J joints; heading frame: x is mirrored while the
-    trunk points backwards, heights are relative to the ground under the root):
-      terrain: heights of the ground along the line of samples, m.
+    Observation blocks, in this order (N links; heading frame: x is mirrored while the trunk points
+    backwards, heights are relative to the ground under the root):
+      terrain: heights of the ground at the sample points, m.
       pose: height of the root, then (x, z) of every link centre relative to the root, m; 2N + 1.
       velocity: (x, z) velocity of every link centre, m/s; 2N.
-      strain: fibre strain of every muscle, if the character is driven by muscles.
+      strain: fibre strain of every muscle, with muscle control.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
       reference: height of the reference's root, then its link positions relative to its root and its
         link velocities; 4N + 1.
     """
 
     TERMS: Mapping[str, tuple[float, float]] = rewards.IMITATION_TERMS  # weight, scale of the error
-    ABOUT = 'com'  # from where end effectors are measured, or 'root'
-    EXTRAS: Mapping[str, int] = MappingProxyType({})  # blocks of a subclass, with their sizes
+    ABOUT = 'com'  # origin of end effector positions: 'com' or 'root'
+    EXTRAS: Mapping[str, int] = MappingProxyType({})  # sizes of the blocks of a subclass
 
     CONFIG: Any = PlanarImitationConfig
 
@@ -146,13 +146,13 @@ class PlanarImitation(Task):
 
         Args:
           character: a planar character without actuators; it is attached to the arena.
-          arena: where it moves.
+          arena: the arena with its terrain.
           clip: a looping planar clip for this character.
           config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other, or a clip that does not fit the character.
+          ValueError: incompatible options, or a clip that does not fit the character.
         """
         _check(character, clip, actuation_model, config)
         self.character, self.arena, self.clip, self.config = character, arena, clip, config
@@ -173,7 +173,9 @@ class PlanarImitation(Task):
             options = {'muscle_set': muscle_set}
             muscles = actuation.character_muscles(character, muscle_set)
         if muscle_set != PLAIN and not muscles:
-            raise ValueError(f'muscle_set is for muscle control, not for {actuation_model} control')
+            raise ValueError(
+                f'muscle_set is an option of muscle control, not {actuation_model} control'
+            )
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
@@ -204,7 +206,7 @@ class PlanarImitation(Task):
         figure.bind(world, self.blocks, self.ABOUT)
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
-        # They were added one after the other.
+        # The controls are consecutive.
         by = self.action_map.drive(int(controls[0]))
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
@@ -249,11 +251,12 @@ class PlanarImitation(Task):
         terrain, centre = self.arena.terrain, 0.0
         phases = np.empty(len(env_ids))
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
-            # Drawn even where it is not asked for, so that the terrain does not depend on it.
+            # Drawn even if start_phase is a constant, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
             phases[k] = self._start_phase(drawn)
             if self.config.spawn == 'upstream':
-                # Where the original's segments meet: it builds them before it moves the root to 0.
+                # The boundary of the original's segments: it builds them before it moves the root
+                # to 0.
                 centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
             seed = drawn_seed(random_state)
             strip = PlanarGround(
@@ -271,11 +274,11 @@ class PlanarImitation(Task):
         self._observe(env_ids, True)
 
     def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        """What a subclass draws at the start, once characters stand."""
+        """Called by `reset` after the characters were placed; for subclasses."""
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if apply_actions(env_ids, action, self._pack):
-            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
+            # Before the physics steps, so that images rendered afterwards are up to date.
             self.figure.follow(env_ids[self._found.leaving[env_ids]])
 
     def finish_step(self, env_ids: np.ndarray) -> None:
@@ -290,14 +293,14 @@ class PlanarImitation(Task):
             observe_all(self._widened(env_ids), fresh, self._pack)
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
         waiting = env_ids[self._found.waiting[env_ids]]
         for i in waiting.tolist():
             self.arena.widen(i)
         return waiting
 
     def clip_action(self, env_id: int) -> np.ndarray:
-        """Action that drives joints along the clip, without feedback on balance.
+        """Returns the action that moves the joints along the clip, in open loop.
 
         Raises:
           ValueError: torque and muscle control have no such action.
@@ -312,7 +315,7 @@ class PlanarImitation(Task):
         return self.action_map.action(sample(time)[0, 3:])
 
     def reference_pose(self, env_id: int) -> np.ndarray:
-        """Pose of the reference beside the simulated character: x, z, pitch, joints."""
+        """Returns the pose of the reference from the same start: x, z, pitch, joints."""
         cycles = np.array([self.state.start[env_id], self.state.cycles[env_id]])
         first, pose = self.clip.pose(cycles * self.reference.period)
         pose[0] -= first[0]
@@ -328,14 +331,16 @@ def _check(character: Character, clip: Clip, model: str, config: PlanarConfig) -
             f'{", ".join(character.spec.joints)}'
         )
     if not clip.loop:
-        raise ValueError(f'clip {clip.name!r} does not loop; an imitation task needs a cycle')
+        raise ValueError(
+            f'clip {clip.name!r} does not loop; an imitation task needs a looping clip'
+        )
     check_position_options(model, config.action_offset, config.action_scale)
 
 
 def position_range(
     character: Character, clip: Clip, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
-    """Centre and half range of position control, rad (see `PlanarImitation`)."""
+    """Returns action_offset and action_scale of position control, rad; see `PlanarConfig`."""
     if action_offset == 'original':
         ranges = np.array([
             joint.original_range or limits

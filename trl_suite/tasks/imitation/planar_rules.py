@@ -1,4 +1,4 @@
-"""The rules of tracking a clip in the plane, as compiled functions of one simulation."""
+"""Tracking a clip in the plane: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from trl_suite.util.compiled import compiled, compiled_loop
 
 CONTROL_TIMESTEP = 1 / 30  # s
 SUBSTEPS = 10  # physics at 300 Hz; trained policies score the same from 240 to 1200 Hz
-VIEW_BEHIND = 0.5  # m; where the line of terrain samples begins
-VIEW_AHEAD = 3.0  # m; where it ends
+VIEW_BEHIND = 0.5  # m; terrain samples begin this far behind the root
+VIEW_AHEAD = 3.0  # m; they end this far ahead of it
 PHASE_BINS = 4
 ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
 
@@ -40,11 +40,11 @@ POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
 
 class ImitationState(NamedTuple):
-    """Where each simulation is in the clip, (n,).
+    """Phase of each simulation in the clip, (n,).
 
     Attributes:
-      phase: in [0, 1).
-      cycles: time on the clip in periods: the phase, not wrapped.
+      phase: phase in [0, 1).
+      cycles: time in periods of the clip: the phase, not wrapped.
       start: `cycles` at the start of the episode.
     """
 
@@ -54,11 +54,11 @@ class ImitationState(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Where things lie: columns of the clip's table, and of the observation (-1: not observed).
+    """Columns of the clip's table, and of the observation (-1: not observed).
 
     Attributes:
       angles, rates, effectors, com_velocity, height, positions, phase: first columns of features.
-      strain_block, phase_block, reference_block: where these blocks begin.
+      strain_block, phase_block, reference_block: first columns of these blocks.
       reference: number of columns in the reference block.
     """
 
@@ -75,17 +75,18 @@ class Layout(NamedTuple):
     reference: int
 
 
-_FEATURES = Layout._fields[:7]  # that are columns of the clip's table
+_FEATURES = Layout._fields[:7]  # fields that are columns of the clip's table
 
 
 class Rules(NamedTuple):
-    """All that the rules of imitation work on.
+    """Data for the compiled functions of imitation.
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      weights: of pitch and joints in the errors of pose and velocity, (1 + J,).
-      term_weights, term_scales: of the reward terms, (5,).
-      rest, scale: length of every muscle at rest, and of its fibre, m.
+      weights: weights of pitch and joints in the errors of pose and velocity, (1 + J,).
+      term_weights, term_scales: weights and error scales of the reward terms, (5,).
+      rest, scale: of every muscle, tendon length at which the strain is 0, and length of unit
+        strain, m.
     """
 
     engine: native.Engine
@@ -111,7 +112,7 @@ class Rules(NamedTuple):
 
 @compiled
 def finish_step(i: int, rules: Rules) -> None:
-    """Reward, failure and observation, after the physics has advanced."""
+    """Computes reward, failure and observation, after the physics was advanced."""
     advance_clock(i, rules.clip, rules.state)
     if breaks_down(i, rules):
         conclude(i, True, rules.outcome)
@@ -124,14 +125,14 @@ def finish_step(i: int, rules: Rules) -> None:
 
 @compiled
 def advance_clock(i: int, clip: ClipTable, state: ImitationState) -> None:
-    """Moves on along the clip by a control step."""
+    """Advances the phase by a control step."""
     state.cycles[i] += CONTROL_TIMESTEP / clip.period
     state.phase[i] = state.cycles[i] % 1.0
 
 
 @compiled
 def breaks_down(i: int, rules: Rules) -> bool:
-    """Whether the physics has diverged; the last finite observation then stands."""
+    """Returns whether the physics has diverged; the caller then keeps the last observation."""
     joints = rules.body.dof[2:]
     diverged = native.diverged(i, rules.engine) or too_fast(
         i, joints, MAX_JOINT_SPEED, rules.physics.qvel
@@ -142,7 +143,7 @@ def breaks_down(i: int, rules: Rules) -> bool:
 
 @compiled
 def compare(i: int, rules: Rules) -> None:
-    """Writes the reward terms: how near pose, velocities and feet are to those of the clip."""
+    """Writes the reward terms, from errors of pose, velocities and end effectors."""
     body, physics, clip, layout = rules.body, rules.physics, rules.clip, rules.layout
     phase, found, terms = rules.state.phase[i], rules.found, rules.outcome.reward_terms
     pose = velocity = 0.0
@@ -174,7 +175,7 @@ def compare(i: int, rules: Rules) -> None:
 
 @compiled
 def observe(i: int, rules: Rules) -> None:
-    """Writes the blocks behind terrain, pose and velocity: muscles, and phase or reference."""
+    """Writes the blocks after terrain, pose and velocity: strain, and phase or reference."""
     layout, clip, observation = rules.layout, rules.clip, rules.outcome.observation
     phase = rules.state.phase[i]
     for k in range(len(rules.rest)):
@@ -192,7 +193,7 @@ def observe(i: int, rules: Rules) -> None:
 
 @compiled_loop
 def apply_actions(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> int:
-    """Takes actions; returns how many windows of ground must be laid anew."""
+    """Applies actions; returns how many ground windows must be moved."""
     leaving = 0
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
@@ -202,7 +203,7 @@ def apply_actions(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> int:
 
 @compiled_loop
 def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
-    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -215,7 +216,10 @@ def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
 
 @compiled_loop
 def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
-    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    """Writes observations; returns how many simulations are waiting for ground, see `must_wait`.
+
+    If `fresh`, episodes have just begun, and outcomes are reset.
+    """
     waiting = 0
     for i in env_ids:
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)

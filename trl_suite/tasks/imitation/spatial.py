@@ -1,6 +1,6 @@
-"""Tracking a motion clip in three dimensions: the 3D rows of the Imitation family.
+"""Tracking a motion clip in three dimensions: the 3D environments of the Imitation family.
 
-Source: the imitation scenario of the original, as for `trl_suite.tasks.imitation.planar.planar`.
+Source: the imitation scenario of the original, as for `trl_suite.tasks.imitation.planar`.
 """
 
 from __future__ import annotations
@@ -44,18 +44,20 @@ from trl_suite.terrain import SpatialGround
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 from trl_suite.util.options import option
 
-GOAL_AHEAD = 3.0  # m along x; where the goal on the line through the start lies
-TYPICAL_POSES = 256  # of a cycle, whose mean is the middle of position control
+GOAL_AHEAD = (
+    3.0  # m; distance of the goal ahead of the root, on the line along +x through the start
+)
+TYPICAL_POSES = 256  # poses of a cycle; their mean is action 0 of position control
 
 POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
 
 class ImitationRules(NamedTuple):
-    """All that the rules of imitation work on.
+    """Data for the compiled functions of imitation.
 
     Attributes:
-      reference: where the reference block begins in the full observation; -1: not observed.
-      goal: where the goal block begins.
+      reference: first column of the block reference in the full observation; -1: not observed.
+      goal: first column of the block goal.
       links: number of links.
     """
 
@@ -71,7 +73,7 @@ class ImitationRules(NamedTuple):
 
 @compiled
 def finish_step(i: int, rules: ImitationRules) -> None:
-    """Reward, failure and observation, after the physics has advanced."""
+    """Computes reward, failure and observation, after the physics was advanced."""
     common = rules.common
     tick(i, common)
     if breaks_down(i, common):
@@ -85,7 +87,7 @@ def finish_step(i: int, rules: ImitationRules) -> None:
 
 @compiled
 def look(i: int, rules: ImitationRules) -> None:
-    """Measures the body; what was travelled counts along +x."""
+    """Measures the body; the distance travelled is that along +x."""
     common = rules.common
     measure(i, common)
     common.travel.distance[i] = common.found.root[i, 0] - common.travel.origin[i, 0]
@@ -93,7 +95,7 @@ def look(i: int, rules: ImitationRules) -> None:
 
 @compiled
 def compare(i: int, rules: ImitationRules) -> None:
-    """Writes the reward terms: how near pose, velocities and feet are to those of the clip."""
+    """Writes the reward terms, from errors of pose, velocities and end effectors."""
     by, found = rules.comparison, rules.common.found
     row, rest = moment(rules.common.clock.phase[i], 0, by.tracks)
     terms = rules.common.outcome.reward_terms
@@ -133,7 +135,7 @@ def finish_steps(env_ids: np.ndarray, rules: ImitationRules) -> None:
 
 @compiled_loop
 def observe_all(env_ids: np.ndarray, rules: ImitationRules) -> None:
-    """Observes, and compares as if a step had been taken."""
+    """Measures, writes reward terms for the current state, and observes."""
     for i in env_ids:
         look(i, rules)
         compare(i, rules)
@@ -145,7 +147,7 @@ class SpatialImitationConfig(MirroredConfig):
     """Options of `SpatialImitation`."""
 
     reference_observation: bool = option(
-        False, "observe the reference's state instead of the phase"
+        False, 'observe the state of the reference instead of the phase'
     )
 
 
@@ -154,20 +156,19 @@ class SpatialImitation(SpatialTask):
 
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
     left, z up; heights are relative to the ground under the root):
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, with the option terrain_observation.
       pose: height of the root, then of every link the position of its centre relative to the root
         (3), m, and its orientation (4) as a quaternion wxyz with w not negative; 7N + 1.
-      velocity: of every link the velocity of its centre (3), m/s, against the ground under the
+      velocity: of every link the velocity of its centre (3), m/s, relative to the ground under the
         root, and its angular velocity (3), rad/s; 6N.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
       reference: height of the reference's root, then its link positions relative to its root, then
         its link velocities, in the reference's heading frame; 6N + 1.
       goal: bearing (rad, positive to the left) and distance (m) of the point on the line through
-        the start along +x that is 3 m further along than the root: which way is straight on. The
-        original has bearing and distance of the start there, of no use to anybody, and its walkers
-        cannot tell where +x is.
-    Mirrored observations are reflected while the phase is 0.5 or more, and so are their actions; of
-    the phase they keep that of the single step and the one-hot of its half.
+        the start along +x that is 3 m ahead of the root. The original observes bearing and distance
+        of the start instead, from which the direction +x cannot be derived.
+    Mirrored observations and actions are reflected while the phase is 0.5 or more; the block phase
+    then has the phase of the single step and the one-hot of its half.
     """
 
     TERMS = rewards.IMITATION_TERMS
@@ -187,13 +188,13 @@ class SpatialImitation(SpatialTask):
 
         Args:
           character: a spatial character without actuators; it is attached to the arena.
-          arena: where it moves.
+          arena: the arena with its terrain.
           clip: a looping clip for this character, with a free root.
           config: the options.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other, or a clip that does not fit the character.
+          ValueError: incompatible options, or a clip that does not fit the character.
         """
         check_cycle(clip)
         self.clip, self.period = clip, clip.duration
@@ -225,7 +226,7 @@ class SpatialImitation(SpatialTask):
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
-            # Drawn even where it is not asked for, so that the terrain does not depend on it.
+            # Drawn even if start_phase is a constant, so that the terrain does not depend on it.
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
             ground = SpatialGround(
@@ -248,7 +249,7 @@ class SpatialImitation(SpatialTask):
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
     def clip_action(self, env_id: int) -> np.ndarray:
-        """Action that drives joints along the clip, without feedback on balance.
+        """Returns the action that moves the joints along the clip, in open loop.
 
         Raises:
           ValueError: torque control has no such action.
@@ -260,7 +261,7 @@ class SpatialImitation(SpatialTask):
         return action
 
     def reference_pose(self, env_id: int) -> np.ndarray:
-        """Pose of the reference beside the simulated character: root, then joints."""
+        """Returns the pose of the reference from the same start: root, then joints."""
         cycles = np.array([self.clock.start[env_id], self.cycles[env_id]])
         first, pose = self.clip.pose(cycles * self.period)
         pose[:2] += self.travel.origin[env_id, :2] - first[:2]
@@ -270,27 +271,27 @@ class SpatialImitation(SpatialTask):
 
 
 def check_cycle(clip: Clip) -> None:
-    """Checks that a clip can be tracked for ever in three dimensions.
+    """Checks that a clip loops and has a free root.
 
     Raises:
-      ValueError: it cannot.
+      ValueError: it does not.
     """
     if clip.root != 'free' or not clip.loop:
         raise ValueError(
             f'clip {clip.name!r} (root {clip.root}, {"looping" if clip.loop else "not looping"})'
-            ' does not serve a spatial imitation task: it needs a free root and a cycle'
+            ' cannot be used for a spatial task: expected a looping clip with a free root'
         )
 
 
 def pose_of_clip(clip: Clip, cycles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses over the origin, and rates, where a clip is after some cycles (m,)."""
+    """Returns poses with x = y = 0, and rates, of a clip at times in cycles (m,)."""
     poses, rates = clip.state(cycles * clip.duration)
     poses[:, :2] = 0.0
     return poses, rates
 
 
 def clip_action(task: SpatialTask, clip: Clip, env_id: int) -> np.ndarray:
-    """Returns the action that drives joints along a clip, without feedback on balance.
+    """Returns the action that moves the joints along a clip, in open loop.
 
     Raises:
       ValueError: torque control has no such action.
@@ -307,7 +308,7 @@ def clip_action(task: SpatialTask, clip: Clip, env_id: int) -> np.ndarray:
 
 
 def joint_targets(clip: Clip, pose: np.ndarray) -> np.ndarray:
-    """Returns targets of position control that hold a pose (columns,): rotation vectors, angles."""
+    """Returns targets of position control for a pose (columns,): rotation vectors and angles."""
     parts, column = [], 7
     for size in clip.sizes:
         value = pose[column : column + size]

@@ -1,4 +1,4 @@
-"""Tasks that go to places in three dimensions, by joint targets or by plans of footsteps."""
+"""Navigation to goals in three dimensions, by joint targets or by footstep plans."""
 
 from typing import Any
 
@@ -29,28 +29,29 @@ def _direct(parts: Parts, config: Any) -> Task:
 _HIERARCHICAL = (
     differences.AXES, differences.CONES,
     Difference(
-        'a step is a whole footstep, from one switch of stance to the next; that of the original is 1/30 s '
-        'and leaves the cadence to the caller; task option interface'
+        'a step is a whole footstep, from one switch of stance to the next; in the original it is 1/30 s, '
+        'and the caller decides when to plan; see the option interface'
     ),
     Difference(
-        'the footstep controller is inside, and trained by us; the original leaves it to the caller; task '
-        'option controller'
+        'the footstep controller is part of the environment, and its policy was trained for this suite; in '
+        'the original the caller runs it; see the option controller'
     ),
     Difference(
-        'actions are in [-1, 1], clipped, and scaled as by the native learner of the original; its Python '
+        'actions are in [-1, 1], clipped, and scaled as in the native learner of the original, whose Python '
         'interface takes m and rad'
     ),
     Difference(
-        'the reward is over the whole step; that of the original is since the last plan, down to a few ms'
+        'the reward is for the whole step; in the original it is for the time since the last plan, which '
+        'may be a few ms'
     ),
     Difference(
-        'episodes are cut after 200 s (discount 1); the limit that the original configures ends none'
+        'episodes are truncated after 200 s (discount 1); the configured limit of the original has no effect'
     ),
 )  # fmt: skip
 _DIRECT = (
     differences.FROM_1200, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,
     differences.CONES,
-    Difference("the clip is our own, 1.3 m/s; the original's walks at 1.535 m/s"),
+    Difference("the clip was made for this suite, 1.3 m/s; the original's walks at 1.535 m/s"),
     differences.START_PHASE, differences.CUT,
 )  # fmt: skip
 
@@ -67,7 +68,7 @@ TYPES = (
         samples='plans',
         differences=(
             *_HIERARCHICAL,
-            Difference('whether a goal is reached or its time over is looked at once a step'),
+            Difference('whether a goal is reached or has expired is tested once per step'),
         ),
     ),
     TaskType(
@@ -84,7 +85,7 @@ TYPES = (
         samples='plans',
         differences=(
             *_HIERARCHICAL,
-            Difference('the times of ball and goal are looked at once a step'),
+            Difference('whether ball and goal have expired is tested once per step'),
         ),
     ),
     TaskType(
@@ -98,8 +99,8 @@ TYPES = (
         differences=(
             *_DIRECT,
             Difference(
-                'the reward leads to the goal, and a goal that is reached is drawn anew; that of the '
-                'original is for footsteps that are not observed, and its goal stays; task option reward'
+                'the reward depends on the goal, and a goal that is reached is redrawn; in the original, the '
+                'reward is for footsteps that are not observed, and the goal is fixed; see the option reward'
             ),
         ),
     ),
@@ -117,8 +118,8 @@ TYPES = (
         differences=(
             *_DIRECT,
             Difference(
-                'there is a ball, and half of the reward is for it; the configuration of the original has '
-                'none'
+                'there is a ball, which half of the reward depends on; the configuration of the original '
+                'has none'
             ),
         ),
     ),

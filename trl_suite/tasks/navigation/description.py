@@ -1,4 +1,4 @@
-"""Navigation in words and tables: joints driven directly, or by plans of footsteps."""
+"""Descriptions of navigation tasks, direct and hierarchical, in text and tables."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.registry.spec import EnvSpec
 
-_BEADS = ' Beads: where the centre of mass has been; red: the goal.'
+_BEADS = ' Yellow spheres: past positions of the centre of mass; red: the goal.'
 _BLOCKS: Meanings = {
     'surface': (
         'm/s',
-        'velocities of the ground against that under the root, at 32 lines from the left to the right (5.5 m '
-        'to each side), each of 32 from 1 m behind to 10 m ahead: all ahead, then all to the right',
+        'velocity of the ground relative to that under the root, on 32 lines from left to right (5.5 m to '
+        'each side), each with 32 points from 1 m behind to 10 m ahead: first all components ahead, then '
+        'all components to the right',
     ),
     'ball': spatial_description.BALL_BLOCK,
-    'low_level': ('', 'what the footstep controller observes'),
+    'low_level': ('', 'observation of the footstep controller'),
 }
 _MEANINGS = {
-    'first_x': 'm; where the foot that swings lands, ahead of the root',
-    'first_y': 'm; the same, to the left of the root',
-    'second_x': 'm; where the other foot lands after it, ahead of the root',
-    'second_y': 'm; the same, to the left of the root',
-    'turn': 'rad; heading to have, to the left of the present one',
+    'first_x': 'm; landing place of the swing foot, ahead of the root',
+    'first_y': 'm; landing place of the swing foot, to the left of the root',
+    'second_x': 'm; next landing place of the stance foot, ahead of the root',
+    'second_y': 'm; next landing place of the stance foot, to the left of the root',
+    'turn': 'rad; planned heading relative to the current one, positive to the left',
 }
 
 
@@ -45,10 +46,15 @@ def blocks(task: Any) -> Meanings:
 
 
 def action(environment: Environment) -> Section:
-    """Returns what the actions plan."""
+    """Returns the table of what each action plans."""
     action_map = environment.action_map
     cells = [
-        (name, action_offset, action_scale, _MEANINGS.get(name, 'of the footstep controller'))
+        (
+            name,
+            action_offset,
+            action_scale,
+            _MEANINGS.get(name, 'action of the footstep controller'),
+        )
         for name, action_offset, action_scale in zip(
             action_map.names,
             floats(action_map.action_offset),
@@ -63,10 +69,11 @@ def action(environment: Environment) -> Section:
 
 
 def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
-    """Yields controller, goal, reward and termination."""
+    """Yields the sections on controller, start, goal, reward and termination."""
     yield section(
         'Footstep controller',
-        f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
+        f'{task.controller.name}; plans are relative to position and heading of the root at the beginning of '
+        'a footstep',
     )
     yield spatial_description.start(spec)
     if task.ball:
@@ -79,7 +86,7 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
             'centre of mass towards the goal, m/s',
             '1',
         ]
-        full = f'speed is full where a step begins within {task.goal_reached:g} m of the goal'
+        full = f'speed is full if the step begins within {task.goal_reached:g} m of the goal'
     yield section(
         'Reward of a step: sum of weight * term, at most 1; 0 after a fall',
         Table(
@@ -100,25 +107,25 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
     yield section(
         f'Termination (discount 0), sampled every {every:g} s',
         f'one of {", ".join(task.character.spec.fall_links)} touches the ground in '
-        f'{description.samples_until_fall(*share)} samples in a row, or so often that {description.contact_share(*share)}; '
+        f'{description.samples_until_fall(*share)} consecutive samples, or so often that {description.contact_share(*share)}; '
         'or the physics diverges',
     )
 
 
 def time(spec: EnvSpec, task: Any) -> Section:
-    """Returns rates, and how long a step and an episode are."""
+    """Returns rates, and the duration of a step and an episode."""
     duration, physics = task.control_timestep, 1 / task.physics_timestep
     return section(
         'Time',
         f'a step is {duration:.3g} s, the first of an episode may be shorter; footstep controller 30 Hz, '
-        f'physics\n{physics:.4g} Hz; an episode is cut (discount 1) after {spec.step_limit} steps, '
+        f'physics\n{physics:.4g} Hz; an episode is truncated (discount 1) after {spec.step_limit} steps, '
         f'{spec.step_limit * duration:.3g} s',
     )
 
 
 def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
-    """Yields clip, start, goal, reward and termination."""
-    if not isinstance(task, direct.DirectNavigation):  # the original's reward, of a hidden plan
+    """Yields the sections on clip, start, goal, reward and termination."""
+    if not isinstance(task, direct.DirectNavigation):  # reward 'original', for a hidden plan
         yield from spatial_rules(spec, task)
         return
     of_ball = 'ball' in task.blocks
@@ -140,14 +147,14 @@ def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
         f'the {where}'
     )
     yield (
-        f"com: the clip's velocity is turned towards the {where}; nearer than {near} com and heading are "
-        'worth their whole weight'
+        f"com: the clip's velocity is rotated towards the {where}; within {near} of it, com and heading are "
+        'equal to their weights'
     )
     if where == 'ball':
         formulas, full = spatial_description.ball_terms(ball.SPEED, task.goal_reached)
         weights = [task.TERMS[name][0] for name in task.TERMS if name in ball.SOCCER_TERMS]
         yield Table(
-            ('term', 'weight', 'times'),
+            ('term', 'weight', 'factor'),
             list(zip(ball.SOCCER_TERMS, weights, formulas, strict=True)),
         )
         yield full

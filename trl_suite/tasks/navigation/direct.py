@@ -1,7 +1,7 @@
-"""Going from goal to goal without hierarchy: joints are driven 30 times a second, by one policy.
+"""Navigation from goal to goal without hierarchy: one policy controls the joints at 30 Hz.
 
-Source: the 'Hard' environments of the original, and its imitation scenario with a goal, which they
-were meant to have.
+Source: the 'Hard' environments of the original, and its imitation scenario with a goal, for which
+they were intended.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class DirectConfig(SpatialConfig):
     terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=('height',))
     goal_reached: float | None = option(
         None,
-        f'distance at which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',
+        f'distance within which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',
         unit='m', above=0,
     )  # fmt: skip
 
@@ -64,8 +64,8 @@ class DirectNavigationConfig(DirectConfig):
 
     reward: str = option(
         'goal',
-        f"'goal', or 'original': that of following a hidden plan of footsteps {HIDDEN_LENGTH:g} m long "
-        'towards a goal that stays where it is',
+        f"'goal', or 'original': the reward for tracking footsteps of {HIDDEN_LENGTH:g} m that are not "
+        'observed; the goal is then fixed',
         choices=REWARDS,
     )
 
@@ -76,15 +76,16 @@ class DirectNavigationConfig(DirectConfig):
 
 
 class DirectNavigation(SpatialTask):
-    """A spatial character imitates a clip on its way from goal to goal, or dribbles a ball to them.
+    """A spatial character imitates a clip while it walks, or dribbles a ball, from goal to goal.
 
-    The reward is that of imitation, but that the clip's velocity is turned towards the goal, and
-    heading for the goal and nearness are rewarded too (`rewards.DIRECT_TERMS`). With a ball, half of
-    it is that of a journey to the ball, half that of dribbling (`ball.SOCCER_TERMS`).
+    The reward is that of imitation, with the clip's velocity rotated towards the goal, and
+    additional terms for heading towards the goal and for proximity (`rewards.DIRECT_TERMS`). With a
+    ball, half of the reward has these terms, with the ball as the goal, and half is for dribbling
+    (`ball.SOCCER_TERMS`).
 
     Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
-      goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball, as
-        seen from the ball.
+      goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball,
+        measured from the ball.
       ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
     """
 
@@ -104,14 +105,14 @@ class DirectNavigation(SpatialTask):
 
         Args:
           character: a spatial character without actuators; it is attached to the arena.
-          arena: where it moves.
+          arena: the arena with its terrain.
           clip: a looping clip for this character, with a free root.
           config: the options.
-          ball: a ball of the arena that is to be dribbled.
+          ball: a ball of the arena, for dribbling.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other, or a clip that does not fit the character.
+          ValueError: incompatible options, or a clip that does not fit the character.
         """
         check_cycle(clip)
         self.clip, self.period, self.ball = clip, clip.duration, ball
@@ -152,7 +153,7 @@ class DirectNavigation(SpatialTask):
 
     @property
     def goal(self) -> np.ndarray:
-        """Where to go, or where the ball is to go, (n, 3) m."""
+        """Goal of the walker, or of the ball, (n, 3) m."""
         return self.goals.place
 
     # Episodes.
@@ -196,7 +197,7 @@ class DirectNavigation(SpatialTask):
         finish_all(env_ids, self._pack)
 
     def _draw(self, env_ids: np.ndarray) -> None:
-        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        """Places balls and draws goals again, where they have expired or were reached."""
         root, count = self.figure.found.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]
@@ -210,11 +211,11 @@ class DirectNavigation(SpatialTask):
         observe_all(self.world.all_ids if env_ids is None else env_ids, False, self._pack)
 
     def clip_action(self, env_id: int) -> np.ndarray:
-        """Action that drives joints along the clip; see `imitation3d.clip_action`."""
+        """Returns the action that moves the joints along the clip, in open loop."""
         return clip_action(self, self.clip, env_id)
 
     def markers(self, env_id: int) -> list[Marker]:
-        """Where the centre of mass has been, and the goal: of a ball as a disc on the ground."""
+        """Returns markers of past positions of the centre of mass, and of the goal."""
         goal = self.goal[env_id]
         there = ball.goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [*trace_markers(env_id, self.trace), there]
@@ -227,9 +228,10 @@ def hidden_plan(
     config: DirectConfig,
     actuation_model: str,
 ) -> SpatialFootsteps:
-    """Composes what the reward 'original' is for.
+    """Makes the task for the reward 'original': footsteps with a hidden plan.
 
-    In the original the hidden plan begins at the world's origin, mostly far away; here at the start.
+    In the original the plan begins at the world's origin, which is mostly far away; here it begins
+    at the start position.
     """
     common = {
         field.name: getattr(config, field.name) for field in dataclasses.fields(SpatialConfig)

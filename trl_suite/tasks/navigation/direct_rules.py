@@ -1,4 +1,4 @@
-"""The rules of direct navigation, as compiled functions of one simulation."""
+"""Direct navigation: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from trl_suite.tasks.task import conclude
 from trl_suite.util.compiled import compiled, compiled_loop
 
 REWARDS = ('goal', 'original')
-GOAL_REACHED = 0.5  # m; of the root, on the ground
-NEAR = 3.0  # m from the goal, where neither speed nor heading counts any longer
-HIDDEN_LENGTH = 0.4  # m; of the steps of the plan that the original's reward is about
-BALL_SHARE = 0.5  # of the reward, where there is a ball
+GOAL_REACHED = 0.5  # m; horizontal distance of the root within which a goal is reached
+NEAR = 3.0  # m; distance from the goal within which com and heading have no error
+HIDDEN_LENGTH = 0.4  # m; step length of the plan of the reward 'original'
+BALL_SHARE = 0.5  # share of the reward for dribbling, with a ball
 BALL_TERMS = {
     name: (BALL_SHARE * weight, scale)
     for name, (weight, scale) in {**rewards.DIRECT_TERMS, **ball.SOCCER_TERMS}.items()
@@ -49,17 +49,17 @@ POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING, PROXIMITY = range(TERMS)
 
 
 class Progress(NamedTuple):
-    """How fast each walker goes where it is to go, (n,) m/s."""
+    """Speed of each walker's centre of mass towards its goal, (n,) m/s."""
 
     speed: np.ndarray
 
 
 class DirectRules(NamedTuple):
-    """All that the rules of a journey work on.
+    """Data for the compiled functions of direct navigation.
 
     Attributes:
-      goal: where the goal block begins in the full observation.
-      goal_reached: m; nearer, the root has reached the goal.
+      goal: first column of the block goal in the full observation.
+      goal_reached: distance of the root within which the goal is reached, m.
       with_ball: whether the goal is that of a ball.
     """
 
@@ -74,12 +74,12 @@ class DirectRules(NamedTuple):
     ball: BallRules
 
 
-# A step of simulation i: `travel`, the next goal where one is wanted, `finish`.
+# A step of simulation i: `travel`, the next goal if one is needed, `finish`.
 
 
 @compiled
 def travel(i: int, rules: DirectRules) -> bool:
-    """Measures the body and looks at what was reached; returns whether anything is to be drawn."""
+    """Measures the body and tests goal and ball; returns whether one of them must be redrawn."""
     common, goals, state = rules.common, rules.goals, rules.ball.state
     tick(i, common)
     goals.wanted[i] = state.wanted[i] = False
@@ -95,7 +95,7 @@ def travel(i: int, rules: DirectRules) -> bool:
         )  # fmt: skip
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
-        goals.wanted[i] = count >= goals.due[i]  # reaching it does not end it
+        goals.wanted[i] = count >= goals.due[i]  # a ball's goal is not redrawn when it is reached
     else:
         x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
         reached = x * x + y * y < rules.goal_reached * rules.goal_reached
@@ -106,9 +106,9 @@ def travel(i: int, rules: DirectRules) -> bool:
 
 @compiled
 def finish(i: int, rules: DirectRules) -> None:
-    """Reward, failure and observation."""
+    """Computes reward, failure and observation."""
     common = rules.common
-    if common.outcome.diverged[i]:  # the last finite observation stands
+    if common.outcome.diverged[i]:  # keeps the last finite observation
         conclude(i, True, common.outcome)
         return
     if rules.with_ball:
@@ -120,7 +120,7 @@ def finish(i: int, rules: DirectRules) -> None:
 
 @compiled
 def compare(i: int, rules: DirectRules) -> None:
-    """Writes the reward terms: imitation on the way to the goal, or to the ball."""
+    """Writes the reward terms: imitation while walking to the goal, or to the ball."""
     common, by, found = rules.common, rules.comparison, rules.common.found
     row, rest = moment(common.clock.phase[i], 0, by.tracks)
     if rules.with_ball:
@@ -172,7 +172,7 @@ def observe(i: int, rules: DirectRules) -> None:
 
 @compiled_loop
 def travel_all(env_ids: np.ndarray, rules: DirectRules) -> int:
-    """Looks at what was reached; returns for how many anything is to be drawn."""
+    """Tests goals and balls; returns in how many simulations one must be redrawn."""
     wanted = 0
     for i in env_ids:
         wanted += travel(i, rules)
@@ -188,7 +188,10 @@ def finish_all(env_ids: np.ndarray, rules: DirectRules) -> None:
 
 @compiled_loop
 def observe_all(env_ids: np.ndarray, fresh: bool, rules: DirectRules) -> None:
-    """Observes, and compares as if a step had been taken; at their starts if they are fresh."""
+    """Measures, writes reward terms for the current state, and observes.
+
+    If `fresh`, episodes have just begun, and positions of ball and walker are stored.
+    """
     for i in env_ids:
         measure(i, rules.common)
         if fresh and rules.with_ball:

@@ -1,4 +1,4 @@
-"""Walking somewhere by planning footsteps: the high-level tasks above a footstep controller.
+"""Navigation by footstep plans: the high-level tasks, with a low-level footstep controller.
 
 Source: the hike scenarios of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
 deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
@@ -93,39 +93,42 @@ class HierarchicalConfig(Config):
 
     controller: Any = option(
         CONTROLLER,
-        'footstep controller: an id whose policy is shipped, a policy, its file, or a function',
+        'footstep controller: an id with a shipped policy, a policy, its file, or a function',
         policy=True,
     )
     interface: str = option(
         'plan',
-        "'plan': a step is a footstep; 'frame': 1/30 s, and an action has the plan, then the joints' "
-        'targets; a plan takes effect only in a step that begins a footstep',
+        "'plan': a step is a footstep; 'frame': a step is 1/30 s, and an action has the plan, then the "
+        'joint targets; a plan takes effect only in a step that begins a footstep',
         choices=INTERFACES,
     )
     terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
     step_length: float = option(
-        STEP_LENGTH, 'length of the steps that action 0 means', unit='m', above=0
+        STEP_LENGTH, 'step length of the plan at action 0', unit='m', above=0
     )
     target_speed: float = option(
         1.0,
-        'speed of walker and ball towards the goal from which on the reward is full',
+        'speed of walker and ball towards the goal for full reward',
         unit='m/s',
         above=0,
     )
     goal_reached: float | None = option(
         None,
-        f'distance at which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
-        f'{AT_GOAL:g}',
+        f'distance within which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
+        f'by default {AT_GOAL:g}',
         unit='m', above=0,
     )  # fmt: skip
     goal_distance: tuple[float, float] | None = option(
         None,
-        'least and most distance from the walker, or the ball, at which goals are drawn, in any direction; '
-        'by default goals are where the terrain has them',
+        'minimum and maximum distance of goals from the walker, or the ball, in any direction; by default '
+        'the terrain determines where goals are drawn',
         unit='m',
     )
     start_phases: Sequence[float] = option(
-        (0.1, 0.6), 'phases of the clock, one of which an episode starts with', at_least=0, below=1
+        (0.1, 0.6),
+        'phases of the clock from which that of the start is chosen',
+        at_least=0,
+        below=1,
     )
     substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6, at_most=MOST_SUBSTEPS)
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
@@ -143,25 +146,26 @@ class HierarchicalConfig(Config):
 
 
 class HierarchicalNavigation(SpatialTask):
-    """A spatial biped goes from goal to goal, or dribbles a ball to them, by planning footsteps.
+    """A spatial biped walks from goal to goal, or dribbles a ball to them, by planning footsteps.
 
     An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
-    next, half a cycle of the footstep controller that drives the joints inside; the first of an
-    episode may be shorter. The plan is laid out from the root's place on the ground and its heading
-    at the beginning of the step: where the foot that swings lands, where the other one lands after
-    it, and the heading to have.
+    next, half a cycle of the footstep controller that controls the joints; the first step of an
+    episode may be shorter. A plan has the landing place of the swing foot, the next landing place
+    of the stance foot, and a heading, relative to position and heading of the root at the beginning
+    of the step.
 
     Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
-      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if it sees heights.
-      surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if it sees velocities.
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if heights are observed.
+      surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if velocities are observed.
       pose, velocity: as in `SpatialImitation`.
-      goal: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
+      goal: bearing of the goal, rad to the left, and its distance, m; with a ball, measured from
         the ball.
       ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
-      low_level: what the footstep controller observes, with interface 'frame' only; see `SpatialFootsteps`.
+      low_level: observation of the footstep controller, with interface 'frame' only; see
+        `SpatialFootsteps`.
 
     Attributes:
-      watch: called at every 1/30 s of the first simulation, within steps too; for pictures.
+      watch: callback at every 1/30 s of the first simulation, also within steps; for rendering.
     """
 
     ABOUT = 'root'
@@ -181,13 +185,13 @@ class HierarchicalNavigation(SpatialTask):
 
         Args:
           character: a spatial biped without actuators; it is attached to the arena.
-          arena: where it walks.
-          steps: library of single steps of this character, for the first pose and the clock.
+          arena: the arena with its terrain.
+          steps: library of single steps of this character, for the initial pose and the clock.
           config: the options.
-          ball: a ball of the arena that is to be dribbled; its ground must be level.
+          ball: a ball of the arena, for dribbling; the terrain must be level.
 
         Raises:
-          ValueError: parts that do not fit each other.
+          ValueError: parts that are incompatible.
         """
         check_two_feet(character.spec)
         interface, step_length = config.interface, config.step_length
@@ -201,7 +205,7 @@ class HierarchicalNavigation(SpatialTask):
         )  # fmt: skip
         self.controller = footstep_controller.load(config.controller)
         self.controller.check(self)
-        # A function of the user's is called by one thread, for all simulations that go on.
+        # A custom function is called on one thread, for all simulations together.
         self.in_parts = self.controller.policy is not None
         self.config, self.interface, self.step_length = config, interface, step_length
         reached = config.goal_reached
@@ -239,7 +243,7 @@ class HierarchicalNavigation(SpatialTask):
         return plan_mirror(name)
 
     def _plan_mirror(self) -> Mirror:
-        """How observations and plans are reflected."""
+        """Returns the reflection of observations and plans."""
         parts = reflection3d.body(self.character)
         lines, _ = parts['terrain']
         ahead = np.ones(len(lines))
@@ -292,16 +296,16 @@ class HierarchicalNavigation(SpatialTask):
         self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
         self._low_action = np.zeros((n, len(self.joint_map)))
 
-    # What is often asked for, by short names.
+    # Short names for state.
 
     @property
     def stance(self) -> np.ndarray:
-        """Foot that stands, 0 the right one, (n,)."""
+        """Stance foot, 0 right, 1 left, (n,)."""
         return self.plan.stance
 
     @property
     def landing(self) -> np.ndarray:
-        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        """Landing places of the swing foot, then of the stance foot, (n, 2, 3) m."""
         return self.plan.landing
 
     @property
@@ -311,7 +315,7 @@ class HierarchicalNavigation(SpatialTask):
 
     @property
     def goal(self) -> np.ndarray:
-        """Where to go, or where the ball is to go, (n, 3) m."""
+        """Goal of the walker, or of the ball, (n, 3) m."""
         return self.goals.place
 
     # Episodes.
@@ -347,14 +351,14 @@ class HierarchicalNavigation(SpatialTask):
         if self.ball:
             self.ball.state.at_goal[env_ids] = False
             self.world.forward(env_ids)
-        # Until the first action there is no plan; the places under the feet stand for it.
+        # Before the first action, the plan is the current positions of the feet.
         plan.heading[env_ids] = found.heading[env_ids]
         stance = plan.stance[env_ids]
         plan.landing[env_ids, 0] = found.feet[env_ids, 1 - stance]
         plan.landing[env_ids, 1] = found.feet[env_ids, stance]
 
     def begin_goal(self, i: int) -> None:
-        """Draws what is to be reached in an episode by a walker where it was last measured."""
+        """Draws the first goal of an episode, and places the ball, from the last measurement."""
         place = self.figure.found.root[i, :2]
         if self.ball:
             self.ball.put(i, place, self.clock.steps[i], self._random[i])
@@ -378,7 +382,7 @@ class HierarchicalNavigation(SpatialTask):
         take_all(env_ids, action, self._pack)
 
     def simulate(self, env_ids: np.ndarray) -> None:
-        """Runs each simulation to the next switch of stance, or for a control step."""
+        """Runs each simulation to the next switch of stance, or for one control step."""
         if not len(env_ids):
             return
         by_plan = self.interface == 'plan'
@@ -401,18 +405,18 @@ class HierarchicalNavigation(SpatialTask):
                 going = going[~self.state.over[going]]
 
     def lay(self, action: np.ndarray) -> np.ndarray:
-        """Lays out plans where a footstep begins, as the step to come would with the same actions.
+        """Sets plans where a footstep begins, as the next step with the same actions would.
 
-        With the interface 'frame' a footstep controller can so see a plan before it acts by it.
+        With the interface 'frame', a footstep controller can thus observe a plan before it acts.
 
         Args:
-          action: (n, k), in [-1, 1]; what lies behind the plan does not count.
+          action: (n, k), in [-1, 1]; numbers after the plan are ignored.
 
         Returns:
-          What the footstep controller observes now, (n, size); the observation has it as well.
+          Observation of the footstep controller, (n, size); the observation is updated as well.
 
         Raises:
-          ValueError: actions of another shape, or with NaN or infinity.
+          ValueError: actions of the wrong shape, or with NaN or infinity.
         """
         everyone = self.world.all_ids
         self.apply_action(self.action_map.checked(action, self.world.n), everyone)
@@ -426,7 +430,7 @@ class HierarchicalNavigation(SpatialTask):
         finish_all(env_ids, self._pack)
 
     def _draw(self, env_ids: np.ndarray) -> None:
-        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        """Places balls and draws goals again, where they have expired or were reached."""
         root, count = self.figure.found.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]
@@ -440,7 +444,7 @@ class HierarchicalNavigation(SpatialTask):
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
     def markers(self, env_id: int) -> list[Marker]:
-        """The plan, where the centre of mass has been, and the goal: of a ball as a disc."""
+        """Returns markers of the plan, past positions of the centre of mass, and the goal."""
         root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
         there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
         return [

@@ -1,4 +1,4 @@
-"""The rules of navigation by planned footsteps, as compiled functions of one simulation."""
+"""Navigation by planned footsteps: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -36,43 +36,43 @@ from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_loop
 
-CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # whose shipped policy places the feet by default
+CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
 INTERFACES = ('plan', 'frame')
 MAPS = ('height', 'velocity')
-# The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
-# m, and turn of the heading, rad.
+# A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
+# at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
 PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
-PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
+PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
 PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
 STEP_LENGTH = 0.5  # m
 PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
-GOAL_REACHED = 1.0  # m; by default
-GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
+GOAL_REACHED = 1.0  # m; default
+GOAL_SIGNS = (-1.0, 1.0)  # of mirrored bearing and distance
 SPEED_SHARPNESS = 1.5
-UPRIGHT = 0.2  # reward for being on one's feet
+UPRIGHT = 0.2  # constant reward of a step without a fall
 NAVIGATION_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
 CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
     0.9,
     1 / 11,
     0.25,
-)  # of the running share of samples that touch the ground
-SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
-FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
-LONGEST = 60  # control steps of a step; the clock switches stance long before
+)  # of the decaying average of samples with a fall link on the ground
+SAMPLE_FRAMES = 3  # control steps between two samples: 0.1 s
+FARTHEST_GOAL = 100.0  # m; upper bound of the option goal_distance
+LONGEST = 60  # limit of control steps per step; the clock switches stance long before
 
 SPEED, ON_FEET = range(len(NAVIGATION_TERMS))
 
 
 class PlanningState(NamedTuple):
-    """What the task knows beside plan and goal, (n, ...).
+    """State of the task in addition to plan and goal, (n, ...).
 
     Attributes:
-      lasted: control steps of the last step.
-      duration: of the last step, s.
-      begin: centre of mass at its beginning, (n, 3) m.
-      down: running share of samples with a fall link on the ground.
-      speed: towards the goal in the last step, of walker or ball, m/s.
-      action: of the agent, clipped, (n, k).
+      lasted: number of control steps in the last step.
+      duration: duration of the last step, s.
+      begin: position of the centre of mass at its beginning, (n, 3) m.
+      down: decaying average of samples with a fall link on the ground.
+      speed: mean speed of walker or ball towards the goal in the last step, m/s.
+      action: clipped action, (n, k).
       over: whether the step is over.
     """
 
@@ -86,17 +86,17 @@ class PlanningState(NamedTuple):
 
 
 class PlanningRules(NamedTuple):
-    """All that the rules of planned footsteps work on.
+    """Data for the compiled functions of navigation by planned footsteps.
 
-    The full observation of `common` is what the footstep controller observes.
+    The full observation of `common` is the observation of the footstep controller.
 
     Attributes:
-      contact, plan_block: where these blocks begin in the full observation.
+      contact, plan_block: first columns of these blocks in the full observation.
       by_plan: whether a step is a footstep, not a control step.
-      terrain, surface, pose, velocity, goal, low_level: where these blocks begin in the
+      terrain, surface, pose, velocity, goal, low_level: first columns of these blocks in the
         observation; -1: not observed.
-      plan_offset, plan_scale: what an action means.
-      target_speed, goal_reached: of the reward, m/s and m.
+      plan_offset, plan_scale: offset and scale of actions.
+      target_speed, goal_reached: see `HierarchicalConfig`, m/s and m.
       with_ball: whether the goal is that of a ball.
     """
 
@@ -122,13 +122,14 @@ class PlanningRules(NamedTuple):
     ball: BallRules
 
 
-# A step of simulation i: `begin_step`, then for every control step inside of it actions of the
-# footstep controller, physics and `finish_control_step`; then `score`, the next goal if one is wanted, `finish`.
+# A step of simulation i: `begin_step`; then for every control step the action of the footstep
+# controller, physics and `finish_control_step`; then `score`, the next goal if one is needed,
+# `finish`.
 
 
 @compiled
 def begin_step(i: int, rules: PlanningRules) -> None:
-    """Lays out the plan where a footstep begins, and shows it to the footstep controller."""
+    """Sets the plan if a footstep begins, and writes the footstep controller's observation."""
     common, state = rules.common, rules.state
     measure(i, common)
     lay_plan(i, rules)
@@ -143,7 +144,7 @@ def begin_step(i: int, rules: PlanningRules) -> None:
 
 @compiled
 def lay_plan(i: int, rules: PlanningRules) -> None:
-    """Lays out the plan that the action means, from the root and its heading, if a footstep begins."""
+    """Sets the plan from the action, relative to the root and its heading, if a footstep begins."""
     plan, found, ground = rules.plan, rules.common.found, rules.common.ground
     if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
         return
@@ -160,13 +161,13 @@ def lay_plan(i: int, rules: PlanningRules) -> None:
 
 @compiled
 def meant(i: int, k: int, rules: PlanningRules) -> float:
-    """What number k of an action means, m or rad."""
+    """Returns number k of the action in physical units, m or rad."""
     return rules.state.action[i, k] * rules.plan_scale[k] + rules.plan_offset[k]
 
 
 @compiled
 def observe_low(i: int, rules: PlanningRules) -> None:
-    """Writes what the footstep controller observes."""
+    """Writes the observation of the footstep controller."""
     common = rules.common
     observe_body(i, common)
     observe_plan(i, rules.contact, rules.plan_block, common.found, rules.plan, common.full)
@@ -174,9 +175,10 @@ def observe_low(i: int, rules: PlanningRules) -> None:
 
 @compiled
 def finish_control_step(i: int, rules: PlanningRules) -> bool:
-    """Finishes a control step inside of a step: clock, divergence, measurement, falls, landings.
+    """Finishes a control step within a step: clock, divergence, measurement, falls, landings.
 
-    What the footstep controller is to see next is written if the step goes on, which is returned.
+    Returns:
+      Whether the step continues; the observation of the footstep controller is then written.
     """
     common, state, outcome = rules.common, rules.state, rules.common.outcome
     tick(i, common)
@@ -204,7 +206,7 @@ def finish_control_step(i: int, rules: PlanningRules) -> bool:
 
 @compiled
 def score(i: int, rules: PlanningRules) -> bool:
-    """Writes the reward terms; returns whether a goal or a place of the ball is to be drawn."""
+    """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
     common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
     found, terms = common.found, common.outcome.reward_terms
     seconds = CONTROL_TIMESTEP * state.lasted[i]
@@ -230,7 +232,7 @@ def score(i: int, rules: PlanningRules) -> bool:
         return False
     count = common.clock.steps[i]
     late = count >= goals.due[i]
-    if rules.with_ball:  # reaching it does not end it
+    if rules.with_ball:  # a ball's goal is not redrawn when it is reached
         goals.reached[i] += ball.at_goal[i]
         ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
     else:
@@ -243,10 +245,10 @@ def score(i: int, rules: PlanningRules) -> bool:
 
 @compiled
 def finish(i: int, rules: PlanningRules) -> None:
-    """Reward and observation."""
+    """Computes reward and observation."""
     outcome = rules.common.outcome
     conclude(i, outcome.failed[i], outcome)
-    if not outcome.diverged[i]:  # else the last finite observation stands
+    if not outcome.diverged[i]:  # otherwise keeps the last finite observation
         observe(i, rules)
 
 
@@ -279,7 +281,7 @@ def observe(i: int, rules: PlanningRules) -> None:
 
 @compiled_loop
 def take_all(env_ids: np.ndarray, action: np.ndarray, rules: PlanningRules) -> None:
-    """Takes in the actions of the agent, clipped."""
+    """Stores clipped actions."""
     for i in env_ids:
         for k in range(action.shape[1]):
             rules.state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
@@ -294,7 +296,7 @@ def begin_steps(env_ids: np.ndarray, rules: PlanningRules) -> None:
 
 @compiled_loop
 def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
-    """Lays out plans as `begin_steps` would, and writes what the footstep controller observes."""
+    """Sets plans as `begin_steps` would, and writes observations."""
     for i in env_ids:
         measure(i, rules.common)
         lay_plan(i, rules)
@@ -303,7 +305,7 @@ def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
 
 @compiled_loop
 def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
-    """Accounts for a control step; returns how many steps go on."""
+    """Finishes a control step; returns how many steps continue."""
     going = 0
     for i in env_ids:
         going += finish_control_step(i, rules)
@@ -312,7 +314,7 @@ def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
 
 @compiled_loop
 def score_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
-    """Writes reward terms; returns for how many anything is to be drawn."""
+    """Writes reward terms; returns in how many simulations goal or ball must be redrawn."""
     wanted = 0
     for i in env_ids:
         wanted += score(i, rules)

@@ -1,7 +1,7 @@
-"""Hand-written policies for the high-level tasks: a baseline, and an example of what a plan is.
+"""Hand-written policies for the high-level tasks: a baseline, and an example of footstep plans.
 
-They step towards the goal, turn by little at a time, and go around what the map shows; towards a
-ball they go in such a way that it is between them and the goal.
+They walk towards the goal with limited turns, and around obstacles in the observed maps. With a
+ball, they approach it from the side opposite to its goal.
 """
 
 from __future__ import annotations
@@ -17,21 +17,24 @@ from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import PLAN_NAMES
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
-LENGTH, SHORT = 1.3, 1.0  # of a step, and of one in a turn or near the goal; in step lengths
-CAUTIOUS = 0.5  # the same of one with something close ahead
-ROOM = 2.0  # m; what is close
-WIDTH = 0.15  # m; between the feet
-# The longer the steps the smaller these are: times the step length,
-ANKLE = 0.1  # m m; how far ahead of the root's middle the foot stands that has just landed
-TURN = 0.6  # rad m; the most that a plan turns
-SHARP = 0.8  # rad; turns from here on are made with short steps
-NEAR = 1.0  # m; where steps become short
-CANDIDATES = np.linspace(-1.4, 1.4, 29)  # rad; ways that are looked along
-LOOK = np.arange(0.4, 3.0, 0.3)  # m; how far
-CLEARANCE = 0.45  # m; to both sides of a way
-STEP_HEIGHT = 0.15  # m; what is taken for level
-MOVING = 0.1  # m/s; what is taken for standing
-BEHIND_BALL, ALIGNED = 0.7, 0.5  # m, rad
+LENGTH, SHORT = (
+    1.3,
+    1.0,
+)  # step length, and that in turns or near the goal; in units of task.step_length
+CAUTIOUS = 0.5  # step length if an obstacle is close, in the same units
+ROOM = 2.0  # m; distance at which an obstacle is close
+WIDTH = 0.15  # m; distance between the feet to the side
+# The next two are divided by the step length:
+ANKLE = 0.1  # m^2; distance of the foot that has just landed ahead of the root, times step length
+TURN = 0.6  # rad m; largest turn of a plan, times step length
+SHARP = 0.8  # rad; larger turns are made with short steps
+NEAR = 1.0  # m; steps are short within this distance of the goal
+CANDIDATES = np.linspace(-1.4, 1.4, 29)  # rad; candidate bearings, relative to that of the goal
+LOOK = np.arange(0.4, 3.0, 0.3)  # m; distances at which the maps are sampled along a bearing
+CLEARANCE = 0.45  # m; required free width to both sides
+STEP_HEIGHT = 0.15  # m; larger height differences are obstacles
+MOVING = 0.1  # m/s; faster ground is an obstacle
+BEHIND_BALL, ALIGNED = 0.7, 0.5  # m; rad
 
 
 def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
@@ -44,14 +47,14 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
       A function from observations, (n, k) with all blocks side by side, to actions (n, 5).
 
     Raises:
-      ValueError: another task.
+      ValueError: the task is not a high-level one, or has the interface 'frame'.
     """
     task = environments.task
     if isinstance(task, Composed):
         task = task.task
     if not isinstance(task, HierarchicalNavigation):
         raise ValueError(
-            f'the task {type(task).__name__} has no scripted policy; goal navigation and soccer have'
+            f'the task {type(task).__name__} has no scripted policy; goal_navigation and soccer have one'
         )
     if task.interface != 'plan':
         raise ValueError(
@@ -71,7 +74,10 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def towards_ball(parts: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Bearing and distance of the place from which a ball is best walked into."""
+    """Returns bearing and distance of the target position for dribbling.
+
+    It is behind the ball as seen from the goal, or just beyond the ball once both are aligned.
+    """
     ball = parts['ball'][:, 1, None] * direction(parts['ball'][:, 0])
     shot = direction(parts['goal'][:, 0])
     off = np.abs(np.arctan2(*_cross_dot(ball, shot)))
@@ -91,8 +97,13 @@ def direction(angle: np.ndarray) -> np.ndarray:
 def free_way(
     parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The bearing nearest to that of the goal on which the maps show nothing, (n,) rad; or next to
-    nothing: then also how far away that is, (n,) m.
+    """Returns the best bearing around obstacles in the observed maps.
+
+    The cost of a bearing grows with its difference from that of the goal and with the proximity of
+    obstacles along it.
+
+    Returns:
+      Bearings, (n,) rad, and distances of the first obstacle along them, (n,) m; inf if none.
     """
     n = len(bearing)
     blocked = np.zeros((n, SAMPLES, SAMPLES), bool)  # lines from the left, along them ahead
@@ -122,7 +133,13 @@ def free_way(
 
 
 def lengths(way: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Lengths (n,) of steps along a bearing (n,), so far and with so much room; in step lengths."""
+    """Returns step lengths (n,) in units of task.step_length.
+
+    Args:
+      way: bearings, (n,) rad.
+      distance: distances of the goal, (n,) m.
+      room: distances of the first obstacle, (n,) m.
+    """
     short = (distance < NEAR) | (np.abs(way) > SHARP)
     return np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH))
 
@@ -130,7 +147,7 @@ def lengths(way: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarr
 def steps(
     way: np.ndarray, length: np.ndarray, stance: np.ndarray, step_length: float
 ) -> np.ndarray:
-    """Plans (n, 5) in physical units: steps along bearings (n,) rad, so long (n,) m."""
+    """Returns plans (n, 5) in physical units: steps of a length (n,) m along bearings (n,) rad."""
     turn = np.clip(way, -TURN / step_length, TURN / step_length)
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)

@@ -1,11 +1,11 @@
-"""Walking forward, with nothing to track: for characters without a clip, and to compose tasks of."""
+"""Walking without a reference motion: for characters without a clip, and for custom tasks."""
 
 from trl_suite.tasks.components import spatial_description
 from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
 from trl_suite.tasks.task_type import Description, Parts, TaskType
 from trl_suite.tasks.walk.task import WALK, PlanarWalkConfig, SpatialWalkConfig, Walk
 
-_HEADING = ('1', 'cosine and sine of the bearing of the heading to keep, that of the start')
+_HEADING = ('1', 'cosine and sine of the bearing of the target heading, the heading at the start')
 
 
 def _make(parts: Parts, config: PlanarWalkConfig | SpatialWalkConfig) -> Walk:

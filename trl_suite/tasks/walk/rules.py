@@ -1,4 +1,4 @@
-"""The rules of walking forward, as compiled functions of one simulation."""
+"""Walking forward: compiled functions."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
-SAMPLES = 50  # heights on the line that a planar character sees
-FROUDE = 0.25  # speed^2 / (gravity * height of the root) of a full reward
+SAMPLES = 50  # terrain heights that a planar character observes
+FROUDE = 0.25  # speed^2 / (gravity * height of the root) at which the reward of speed is full
 GRAVITY = 9.8  # m/s^2
 
 
 class WalkState(NamedTuple):
-    """What the task knows of each walker.
+    """State of each walker.
 
     Attributes:
       origin: x, y of the start, (n, 2) m.
-      target_heading: direction in which it is to go, rad to the left of +x, (n,).
-      distance: travelled along the target_heading, (n,) m.
+      target_heading: direction to walk in, rad to the left of +x, (n,).
+      distance: distance travelled along the target heading, (n,) m.
     """
 
     origin: np.ndarray
@@ -56,7 +56,7 @@ class WalkState(NamedTuple):
 
 
 class PlanarRules(NamedTuple):
-    """What the rules of a planar walk work on; `ctrl` are the controls of the physics."""
+    """Data for the compiled functions of a planar walk; `ctrl`: controls of the physics."""
 
     engine: native.Engine
     body: PlanarBody
@@ -70,12 +70,12 @@ class PlanarRules(NamedTuple):
 
 
 class SpatialRules(NamedTuple):
-    """What the rules of a walk in space work on.
+    """Data for the compiled functions of a spatial walk.
 
     Attributes:
       ctrl: controls of the physics, (n, ...).
-      terrain, pose, velocity, target_heading: where these blocks begin; -1: not observed.
-      leaving: whether the window of ground has to be laid anew, (n,).
+      terrain, pose, velocity, target_heading: first columns of these blocks; -1: not observed.
+      leaving: whether the walker has left its ground window, which must then be moved, (n,).
     """
 
     engine: native.Engine
@@ -94,7 +94,7 @@ class SpatialRules(NamedTuple):
     outcome: Outcome
 
 
-# In the plane, of simulation i and of all.
+# In the plane.
 
 
 @compiled
@@ -108,7 +108,7 @@ def look_planar(i: int, rules: PlanarRules) -> None:
 
 @compiled_loop
 def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> int:
-    """Takes actions; returns how many windows of ground must be laid anew."""
+    """Applies actions; returns how many ground windows must be moved."""
     leaving = 0
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
@@ -118,7 +118,7 @@ def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> i
 
 @compiled_loop
 def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int:
-    """Finishes steps, or only observes; returns how many have to wait for ground to be drawn."""
+    """Finishes steps, or only observes; returns how many are waiting, see `must_wait`."""
     waiting = 0
     for i in env_ids:
         outcome = rules.outcome
@@ -126,7 +126,7 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
             outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
                 i, rules.body.dof[3:], MAX_JOINT_SPEED, rules.physics.qvel
             )
-            if outcome.diverged[i]:  # the last finite observation stands
+            if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)
                 continue
         rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
@@ -139,7 +139,7 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
     return waiting
 
 
-# In space.
+# In three dimensions.
 
 
 @compiled
@@ -161,7 +161,7 @@ def look_spatial(i: int, rules: SpatialRules) -> None:
 
 @compiled_loop
 def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
-    """Takes actions and keeps boxes moving; returns how many windows of ground must be laid."""
+    """Applies actions and drives moving boxes; returns how many ground windows must be moved."""
     leaving, root = 0, rules.body.links[0]
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
@@ -178,14 +178,14 @@ def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) ->
 
 @compiled_loop
 def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> int:
-    """Finishes steps, or only observes; none has to wait."""
+    """Finishes steps, or only observes; returns 0, since none has to wait for ground."""
     for i in env_ids:
         outcome = rules.outcome
         if stepped:
             outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
                 i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
             )
-            if outcome.diverged[i]:  # the last finite observation stands
+            if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)
                 continue
         look_spatial(i, rules)

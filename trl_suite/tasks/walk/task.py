@@ -1,4 +1,4 @@
-"""Walking forward, with nothing to track: for characters without a clip, and to compose tasks of."""
+"""Walking without a reference motion: for characters without a clip, and for custom tasks."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class WalkConfig(Config):
         SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4, at_most=MOST_SUBSTEPS
     )
     action_scale: float | None = option(
-        None, 'joint angle per unit action about the working posture; by default 1.5',
+        None, 'joint angle per unit action, from the working posture; by default 1.5',
         unit='rad', above=0, actuation='position',
     )  # fmt: skip
     terrain_level: float = option(0.0, TERRAIN_LEVEL)
@@ -76,7 +76,7 @@ class PlanarWalkConfig(WalkConfig):
 
     terrain_observation: int = option(
         0,
-        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        'number of observed ground heights, from 0.5 m behind to 3 m ahead of the root; 0: none',
         at_least=0,
         at_most=MOST_SAMPLES,
     )
@@ -94,17 +94,20 @@ class SpatialWalkConfig(WalkConfig):
 
 
 class Walk(Task):
-    """A character, planar or spatial, stands in its working posture on random terrain.
+    """A planar or spatial character walks on random terrain, from its working posture.
 
-    It fails when a fall link touches the ground. It has no reward of its own: `suite.build` adds
-    `WALK`, or the user's `rewards`. So may a subclass, after `super().finish_step`.
+    An episode fails when a fall link touches the ground. The task has no reward: `suite.build` adds
+    `WALK`, unless the option `rewards` is given; a subclass may compute one after
+    `super().finish_step`.
 
-    Observation blocks, in this order: terrain (if seen), pose and velocity as in `PlanarImitation` and
-    `SpatialImitation`; of a spatial character
-      target_heading: cosine and sine of the bearing of the way it is to go, that of its start; 2.
+    Observation blocks, in this order: terrain (optional), pose and velocity as in `PlanarImitation`
+      and
+    `SpatialImitation`; for a spatial character also
+      target_heading: cosine and sine of the bearing of the target heading, the heading at the
+        start; 2.
 
     Attributes:
-      speed_ratio: speed of a full reward, m/s.
+      full_speed: speed at which the reward term `speed_ratio` is full, m/s.
     """
 
     CONFIG: Any = MappingProxyType({False: PlanarWalkConfig, True: SpatialWalkConfig})
@@ -121,12 +124,12 @@ class Walk(Task):
 
         Args:
           character: without actuators; it is attached to the arena.
-          arena: where it moves, of as many dimensions.
-          config: the options, planar or spatial as the character is; by default the defaults.
+          arena: the arena with its terrain, planar or spatial as the character.
+          config: the options, planar or spatial as the character; by default the defaults.
           actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
 
         Raises:
-          ValueError: options that do not fit each other.
+          ValueError: incompatible options.
         """
         self._spatial = character.spec.spatial
         if config is None:
@@ -169,7 +172,7 @@ class Walk(Task):
         else:
             figure.bind(world, self.blocks)
         self._pose, self._extents = self._posture(world)
-        # In m; of the root over the ground, in the working posture.
+        # Height of the root above the ground in the working posture, m.
         standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
         self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
         self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
@@ -182,7 +185,7 @@ class Walk(Task):
             'distance': self.state.distance,
         }
         scope = f'{self.character.mjcf_model.model}/'
-        # Actuators were added one after the other.
+        # The controls are consecutive.
         first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
         common: Any = (
             world.engine,
@@ -212,11 +215,11 @@ class Walk(Task):
 
     @property
     def target_heading(self) -> np.ndarray:
-        """Direction in which each walker is to go, rad to the left of +x, (n,)."""
+        """Target heading of each walker, rad to the left of +x, (n,)."""
         return self.state.target_heading
 
     def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pose of the start about the origin, and the extents of its geoms."""
+        """Returns the initial pose, with the root at the origin, and the extents of its geoms."""
         figure, spec = self.figure, self.character.spec
         values: list[float] = [0, 0, 0, 1, 0, 0, 0] if self._spatial else [0, 0, 0]
         for joint, ball in zip(spec.joints.values(), self.character.spherical, strict=True):
@@ -257,7 +260,7 @@ class Walk(Task):
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if self._act(env_ids, action, self._pack):
-            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
+            # Before the physics steps, so that images rendered afterwards are up to date.
             leaving = env_ids[self._leaving[env_ids]]
             if isinstance(self.arena, SpatialArena):
                 self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
@@ -274,7 +277,7 @@ class Walk(Task):
             self._finish(self._widened(env_ids), False, self._pack)
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
-        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        """Draws ground beyond the windows of waiting simulations; returns their numbers."""
         waiting = env_ids[self._waiting[env_ids]]
         assert isinstance(self.arena, PlanarArena)
         for i in waiting.tolist():
@@ -282,7 +285,7 @@ class Walk(Task):
         return waiting
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
-        """Returns the parts of horizontal vectors (n, 2) that go along the target_heading, (n,)."""
+        """Returns the components of horizontal vectors (n, 2) along the target heading, (n,)."""
         return (
             np.cos(self.target_heading) * vectors[:, 0]
             + np.sin(self.target_heading) * vectors[:, 1]
@@ -290,20 +293,20 @@ class Walk(Task):
 
 
 def speed_ratio(task: Any) -> np.ndarray:
-    """Speed along the target_heading in shares of that of a full reward, in [0, 1], (n,)."""
+    """Speed along the target heading over `task.full_speed`, clipped to [0, 1], (n,)."""
     velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
     if not task.character.spec.spatial:
-        velocity = velocity * [1.0, 0.0]  # the other one is upward
+        velocity = velocity * [1.0, 0.0]  # the second component is vertical
     return np.clip(task.along(velocity) / task.full_speed, 0, 1)
 
 
 def upright(task: Any) -> np.ndarray:
-    """How upright the root is, in [0, 1], (n,)."""
+    """Cosine of the angle between the root's z axis and the vertical, at least 0, (n,)."""
     return np.maximum(parts.upright(task), 0)
 
 
 def low_effort(task: Any) -> np.ndarray:
-    """1 less the mean square of the action, (n,)."""
+    """1 minus the mean square of the action, (n,)."""
     return 1 - parts.effort(task)
 
 
