@@ -441,9 +441,9 @@ class TerrainTest(Folder):
             np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
 
     @parameterized.named_parameters(
-        ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name of its own'),
+        ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name; pass name='),
         ('taken', lambda _: terrain.from_function(np.abs, 'var2d_gaps'), 'exists; pass replace'),
-        ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'of shape .3,. with float64 of shape ..;'),
+        ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),
         ('arguments', lambda _: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
         ('shape', lambda _: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
         ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; those at \[1\]'),
@@ -453,7 +453,7 @@ class TerrainTest(Folder):
         ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
         ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
-        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture'),
+        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'cannot be read as an image'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
@@ -487,10 +487,10 @@ class TerrainTest(Folder):
                 terrain.from_function(lambda x, factor=factor: factor * x, 'wedge')
 
     def test_heights_that_are_not_finite(self):
-        with self.assertRaisesRegex(TypeError, "function 'f' failed where .* np.sin"):
+        with self.assertRaisesRegex(TypeError, "function 'f' failed with .* np.sin"):
             terrain.from_function(lambda x: math.sin(x), 'f')
         with self.assertRaisesRegex(
-            TypeError, "function 'f' failed where .* np.where instead of if"
+            TypeError, "function 'f' failed with .* np.where instead of if"
         ):
             terrain.from_function(lambda x: x if x > 0 else 0.0, 'f')
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
