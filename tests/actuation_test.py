@@ -215,7 +215,7 @@ class ActionMapTest(parameterized.TestCase):
 
     @parameterized.parameters(*WITHOUT_MUSCLES)
     def test_characters_without_muscles(self, name):
-        with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; those who have: .*dog"):
+        with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; these have: .*dog"):
             Mounted(name, 'muscle')
 
     def test_a_slide_without_limits_needs_a_range(self):

@@ -221,13 +221,13 @@ class CharacterTest(Folder):
 
     @parameterized.named_parameters(
         ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
-        ('inner_root', {'root': 'left_shin'}, "hangs on another body; did you mean 'trunk'"),
+        ('inner_root', {'root': 'left_shin'}, "is a child of another body; did you mean 'trunk'"),
         ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
         ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
         ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
-        ('name', {'name': 'dog'}, "may not be named 'dog'"),
+        ('name', {'name': 'dog'}, "has a character named 'dog'"),
     )  # fmt: skip
     def test_bad_names(self, options, message):
         with self.assertRaisesRegex(ValueError, message):

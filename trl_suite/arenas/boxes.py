@@ -107,7 +107,7 @@ def _is_level(cell: int, heights: np.ndarray, vertical: np.ndarray) -> bool:
 def _mark(
     start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float, marks: np.ndarray
 ) -> None:
-    """Marks the vertices where a piece ends and the next begins, in the first row of marks (3, m)."""
+    """Marks the vertices between pieces in marks[0]; other rows of marks, (3, m), are scratch."""
     cuts, mandatory, whole = marks[0], marks[1], marks[2]
     count, any_sloped = len(heights), False
     for i in range(count):
@@ -220,7 +220,7 @@ def pose(
     if not level:
         _run_on(count, vertical, ends, edges)
     right_face = math.inf
-    for k in range(count - 1, -1, -1):  # distance to the next face on the right, temporarily in half_size
+    for k in range(count - 1, -1, -1):  # distance to the face on the right, in half_size
         if _is_face(ends[1, k] + 1, vertical):
             right_face = min(right_face, edges[2, k])
         boxes.half_size[k, 2] = right_face - edges[2, k]

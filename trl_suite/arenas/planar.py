@@ -68,9 +68,9 @@ class PlanarArena(composer.Arena):
         return 'world'
 
     def bind(self, world: World) -> None:
-        """Resolves the arena's geoms in a world and makes room for its n strips."""
+        """Resolves the arena's geoms in a world and allocates the windows of its n grounds."""
         self._world = world
-        # Geoms of one body are neighbours in the model.
+        # Geoms of one body are adjacent in the model.
         first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         pool = slice(first, first + len(self.boxes))
         self._pools = [
@@ -268,7 +268,7 @@ def _pool_size(terrain: Terrain) -> int:
     """Estimates the number of boxes that a window of a terrain needs, from a few fixed seeds."""
     generator, windows = GENERATORS.get(terrain.type), range(PROBES)
     if generator is not None and generator.line is not None:
-        windows = range(-LINE_PROBES, LINE_PROBES)  # the same in every episode, so only places differ
+        windows = range(-LINE_PROBES, LINE_PROBES)  # every episode is the same; places differ
     most = 0
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for k in windows:

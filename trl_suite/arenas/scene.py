@@ -1,4 +1,4 @@
-"""Common settings of all arenas: solver options, contact parameters of the ground, sky and light."""
+"""Common settings of all arenas: solver options, contacts of the ground, sky and light."""
 
 from __future__ import annotations
 

@@ -29,10 +29,10 @@ def make(character: str | CharacterSpec) -> Character:
     """Builds a character entity.
 
     Args:
-      character: a name in `CHARACTERS`, or a user's own row.
+      character: a name in `CHARACTERS`, or a user's own `CharacterSpec`.
 
     Raises:
-      ValueError: an unknown name, or an MJCF file that lacks a link or joint of the row.
+      ValueError: an unknown name, or an MJCF file that lacks a link or joint of the spec.
     """
     if isinstance(character, str):
         if character not in CHARACTERS:

@@ -1,6 +1,6 @@
-"""What an MJCF or URDF file holds of a character: names, links, joints and their figures.
+"""Extracts a character from an MJCF or URDF file: names, links, joints and their parameters.
 
-`own.py` says what is assumed where a file is silent, and makes a character of what is found here.
+`from_file.py` lists the assumptions about missing values, and makes a CharacterSpec of the results.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ GRAVITY = 9.8  # m/s^2, of the arenas
 SLIDE_WEIGHTS = 2.0  # force limit of a slide, in weights of the character
 KD_SHARE = 0.1  # s; kd per kp
 ARMATURE_SHARE = 0.01 / 300  # s^2; armature per kp
-# What a figure in the wrong unit goes beyond.
+# Values outside these bounds are probably in another unit.
 LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
 MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
 SIZES = (0.05, 10.0)  # m, from the root to the farthest end
 MASSES = (0.1, 2000.0)  # kg
-LATERAL = 1e-3  # how far an axis of a planar character may be from its plane or normal, rad
+LATERAL = 1e-3  # rad; largest deviation of a planar character's joint axis from plane or normal
 
 _FREE, _BALL, _SLIDE, _HINGE = (
     int(kind)
@@ -36,17 +36,17 @@ _FREE, _BALL, _SLIDE, _HINGE = (
     )
 )  # fmt: skip
 KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
-# Of a file, besides bodies: what must have a name to be found again.
+# Elements of a file, besides bodies, that need a name so that they can be found again.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
 
 def problem(file: pathlib.Path, what: str) -> ValueError:
-    """Returns what to raise about a file."""
+    """Returns an error about a file."""
     return ValueError(f'{file}: {what}')
 
 
 def named(file: pathlib.Path) -> mujoco.MjSpec:
-    """Reads a file; what has no name in it gets one."""
+    """Reads a file, and names elements without a name."""
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
@@ -72,7 +72,7 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
 
 
 def check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset()) -> None:
-    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity."""
+    """Raises an error for NaN, which MuJoCo treats as a missing value, and for infinity."""
     try:
         elements = [*etree.parse(file).getroot().iter(etree.Element)]
     except etree.XMLSyntaxError as error:
@@ -90,12 +90,12 @@ def check_numbers(file: pathlib.Path, seen: frozenset[pathlib.Path] = frozenset(
     for element in elements:
         if element.tag == 'include':
             included = file.parent / element.get('file', '')
-            if included.is_file() and included.resolve() not in seen:  # else MuJoCo complains
+            if included.is_file() and included.resolve() not in seen:  # else MuJoCo fails
                 check_numbers(included, seen)
 
 
 def _finite(text: str) -> bool:
-    """Whether a text is no list of numbers, or one of finite ones."""
+    """False for a text with numbers that are not all finite."""
     try:
         return bool(np.isfinite([float(number) for number in text.split()]).all())
     except ValueError:
@@ -103,7 +103,7 @@ def _finite(text: str) -> bool:
 
 
 def _in_package(file: pathlib.Path, name: str) -> str:
-    """Returns where a mesh of a ROS package lies, given a file somewhere in that package."""
+    """Returns the path of a mesh of a ROS package, given a file somewhere in that package."""
     address = re.fullmatch(r'package:/+([^/]+)/(.+)', name)
     if address is None:
         return name
@@ -117,7 +117,7 @@ def _in_package(file: pathlib.Path, name: str) -> str:
 
 
 class ModelInspector:
-    """What a compiled file holds of a character."""
+    """The properties of a character in a compiled file."""
 
     def __init__(
         self, file: pathlib.Path, model: mujoco.MjModel, root: str | None, spatial: bool | None
@@ -157,8 +157,8 @@ class ModelInspector:
             number = top[root]
             if abs(model.body_quat[number, 0]) < 1 - 1e-6:
                 raise problem(
-                    self.file, f'the root {root!r} is turned against the world; expected none, x '
-                    'ahead and z up: turn what it holds instead',
+                    self.file, f'the root {root!r} is turned against the world; expected x ahead '
+                    'and z up: rotate its geoms and children instead',
                 )  # fmt: skip
             return number
         if not top:
@@ -169,7 +169,7 @@ class ModelInspector:
         if root in names:
             above = model.body(model.body_rootid[model.body(root).id]).name
             raise problem(
-                self.file, f'root {root!r} hangs on another body; did you mean {above!r}?'
+                self.file, f'root {root!r} is a child of another body; did you mean {above!r}?'
             )
         raise problem(self.file, errors.unknown('root', root, names))
 
@@ -179,7 +179,7 @@ class ModelInspector:
         if spatial is not None:
             if says is not None and says is not spatial:
                 self.notes.append(
-                    f'spatial={spatial} was given, and counts: the root of the file '
+                    f'spatial={spatial} was given and is used, although the root of the file '
                     f'{"has a free joint" if says else "moves in a plane, by two slides and a hinge"}'
                 )
             return spatial
@@ -187,13 +187,13 @@ class ModelInspector:
             return says
         raise problem(
             self.file, f'the root {self.bodies[0]!r} has {", ".join(kinds) or "no joints"}; expected '
-            'a free joint, or two slides and a hinge, or that you say spatial=True or spatial=False',
+            'a free joint, or two slides and a hinge; or pass spatial=True or spatial=False',
         )  # fmt: skip
 
     def _check_joints(self) -> None:
         model = self.model
         if not len(self.joints):
-            raise problem(self.file, f'nothing hangs on the root {self.bodies[0]!r} by a joint')
+            raise problem(self.file, f'no joint attaches a body to the root {self.bodies[0]!r}')
         for i in self.joints:
             name, kind, axis = model.joint(i).name, int(model.jnt_type[i]), self.data.xaxis[i]
             aside = abs(axis[1])
@@ -210,7 +210,7 @@ class ModelInspector:
                 )  # fmt: skip
 
     def _doubt(self) -> None:
-        """Notes what looks as if it were in another unit."""
+        """Adds notes on values that are probably in another unit."""
         model = self.model
         hinges = [i for i in self.joints if model.jnt_type[i] == _HINGE and model.jnt_limited[i]]
         found = {model.joint(i).name: model.jnt_range[i] for i in hinges}
@@ -248,7 +248,7 @@ class ModelInspector:
                 )  # fmt: skip
 
     def figures(self) -> dict[str, Joint]:
-        """The figures of all joints; sets `limits`, their largest torques or forces."""
+        """The parameters of all joints; sets `limits`, their largest torques or forces."""
         model, figures = self.model, {}
         self.limits: dict[str, float] = {}
         assumed: dict[str, list[str]] = {
@@ -284,7 +284,7 @@ class ModelInspector:
                 ('limit', 'no torque limits in the file; N m (slides: N)'),
                 ('gains', 'no servos in the file; kp, N m/rad (slides: N/m)'),
                 ('damping', 'servos without damping; kd, N m s/rad (slides: N s/m)'),
-                ('posture', 'zero is beyond the limits; working about'),
+                ('posture', 'zero is beyond the limits; working posture'),
                 ('free', 'no limits of the angle'),
             )
             if assumed[key]
@@ -292,7 +292,7 @@ class ModelInspector:
         return figures
 
     def _actuators(self, joint: int) -> tuple[float | None, float, float | None]:
-        """Returns kp, kv and torque limit of a joint as the file's actuators have them."""
+        """Returns kp, kv and torque limit of a joint from the file's actuators."""
         model = self.model
         kp, kv, limits = 0.0, 0.0, []
         at = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
@@ -319,9 +319,9 @@ class ModelInspector:
         return self.weight * self.reach(self.data.xanchor[joint], body)
 
     def reach(self, point: np.ndarray, body: int) -> float:
-        """Distance from a point to the farthest end of what a body and all on it can touch, m."""
+        """Distance from a point to the farthest end of a body and its descendants, m."""
         below = {body}
-        for i in range(body + 1, self.model.nbody):  # parents come before their children
+        for i in range(body + 1, self.model.nbody):  # parents precede their children
             if self.model.body_parentid[i] in below:
                 below.add(i)
         geoms = [g for g in self.geoms if self.model.geom_bodyid[g] in below]

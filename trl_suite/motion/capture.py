@@ -212,7 +212,7 @@ def _capture(
 
 
 def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, bool]:
-    """Reads a .asf file: bones (parents first), the unit of length, whether angles are in degrees."""
+    """Reads a .asf file: bones (parents first), factor of lengths, whether angles are degrees."""
     bones: dict[str, dict[str, Any]] = {
         'root': {'parent': '', 'dof': [], 'axis': np.zeros(3), 'order': 'xyz', 'tip': np.zeros(3)}
     }

@@ -174,10 +174,10 @@ class Clip:
         return poses + cycle[..., None] * self._cycle
 
     def _turned(self, poses: np.ndarray, cycle: np.ndarray) -> np.ndarray:
-        """Returns poses of the first cycle where later cycles (...) have them."""
+        """Moves poses of the first cycle to later cycles (...)."""
         turn = self.heading_change
         angle = cycle * turn
-        # The displacements of k cycles are the sides of a polygon: its chord.
+        # The displacements of cycles are the sides of a polygon; that of k cycles is its chord.
         small = abs(turn) < _STRAIGHT
         chord = cycle if small else np.sin(angle / 2) / np.sin(turn / 2)
         start, way = self.poses[0, :3], self.displacement
@@ -241,7 +241,7 @@ class Clip:
         return dataclasses.replace(self, poses=mirror.pose(self.poses))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the clip as .npz without pickled objects; replaces an old file only when complete."""
+        """Writes the clip as .npz without pickled objects; an old file is replaced at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 

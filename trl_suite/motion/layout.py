@@ -71,7 +71,7 @@ class Layout:
         self._straight_rates = np.setdiff1d(np.arange(self.rates), self._turns)
 
     def blend(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Interpolates poses (..., columns): `before` where `u` (...) is 0, `after` where it is 1."""
+        """Interpolates poses (..., columns) from `before`, u = 0, to `after`, u = 1; u is (...)."""
         poses = before + u[..., None] * (after - before)
         if self.rotations:
             here = self._quaternions

@@ -148,7 +148,7 @@ class Steps:
         return _mirrored(mirrored, poses, self.layout.mirror.pose)
 
     def velocity(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns velocities of steps as `Clip.velocity` does; one-sided differences at the ends."""
+        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends."""
         which, time = np.broadcast_arrays(np.asarray(index), np.asarray(t, dtype=float))
         time = np.clip(time, 0, self.duration)
         start = np.maximum(time - VELOCITY_STEP / 2, 0)
@@ -176,7 +176,7 @@ class Steps:
         return np.argmin((gap * gap).sum(axis=2), axis=1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the library as .npz without pickled objects; replaces a file only when complete."""
+        """Writes the library as .npz without pickled objects; replaces an old file at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
