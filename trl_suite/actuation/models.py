@@ -305,7 +305,8 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       model: one of `ACTUATIONS`.
       timestep: physics time step, s; joint limits are as stiff as it allows.
       **options: for 'position', `action_offset` and `action_scale` of every degree of freedom,
-        (D,), rad (m where prismatic); by default the working posture, and 1.5 rad, half the range of a prismatic joint, or twice the range of joints with a small range.
+        (D,), rad (m where prismatic); by default the working posture, and 1.5 rad, half the
+        range of a prismatic joint, or twice the range of joints with a small range.
         `rotations`: description of a ball joint's rotation in actions: 'vector', a rotation vector,
         or 'angle_axis', an angle and an axis, scaled as in the original. For 'muscle',
         `muscle_set`: 'plain', or the name of a motion for which the muscles were optimised.

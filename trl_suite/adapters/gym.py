@@ -192,7 +192,10 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
     ) -> tuple[Any, Info]:
-        """Starts episodes, seeded if `seed` is given, in all simulations or those of `options['reset_mask']`."""
+        """Starts episodes in all simulations, or in those of `options['reset_mask']`.
+
+        They are seeded if `seed` is given.
+        """
         env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
         if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
             raise ValueError(

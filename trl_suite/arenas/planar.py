@@ -89,7 +89,7 @@ class PlanarArena(composer.Arena):
 
     def begin_episode(self, env_id: int, strip: PlanarGround) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
-self.grounds[env_id] = strip
+        self.grounds[env_id] = strip
         self._lay(env_id, 0)
 
     def follow(self, x: np.ndarray, env_ids: np.ndarray | None = None) -> None:

@@ -30,7 +30,7 @@ class Joint:
       kp: position gain, N m/rad.
       kd: damping gain, N m s/rad.
       weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
-      target: working posture of position control, rad; of a spherical joint a rotation vector, or 0.
+      target: working posture of position control, rad; of a ball joint a rotation vector, or 0.
       original_range: limits in rad by which the original scales position actions, where they differ
         from the joint's limits; of a spherical joint the extremes over its three axes.
       armature: inertia in kg m^2 that is added so that stiff servos of light links are stable.

@@ -10,8 +10,8 @@ from trl_suite.characters.character import CharacterSpec, Joint
 # are effectively 0.61 rad higher), but scales actions by the numbers in the file.
 _FILE_RANGE = (-1.57, 1.57)
 
-# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; for a prismatic
-# joint read m for rad and N for N m. The MJCF files define which joints are spherical.
+# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; for a
+# prismatic joint read m for rad and N for N m. The MJCF files define which joints are spherical.
 _DOG_JOINTS = {
     'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
     'spine1': Joint(200, 20, 0.5),

@@ -159,9 +159,7 @@ def frame(forward: str, up: str) -> np.ndarray:
     for name, axis in (('forward', forward), ('up', up)):
         letter = axis.lstrip('+-')
         if letter not in _AXES or len(axis) > 2:
-            raise ValueError(
-                f"{name} is {axis!r}; expected 'x', 'y', 'z', '-x', '-y' or '-z'"
-            )
+            raise ValueError(f"{name} is {axis!r}; expected 'x', 'y', 'z', '-x', '-y' or '-z'")
         rows.append(np.array(_AXES[letter]) * (-1 if axis[0] == '-' else 1))
     if abs(rows[0] @ rows[1]) > 0:
         raise ValueError(f'forward is {forward!r} and up {up!r}; expected two axes')

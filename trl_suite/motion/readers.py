@@ -188,7 +188,9 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
         for j, value in enumerate(frame):
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             if not (number and abs(value) < _LARGEST):  # false for NaN, too
-                raise ValueError(f'{path}: frame {i}, {_field(j)}: {value!r} is not a finite number')
+                raise ValueError(
+                    f'{path}: frame {i}, {_field(j)}: {value!r} is not a finite number'
+                )
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
     array = np.array(frames, dtype=float)
