@@ -56,7 +56,7 @@ class DoctorTest(CommandTest):
             (),
             'MUJOCO_GL=disable if you need no',
         ),
-        ((1, '', 'ImportError: mujoco'), (), 'see what failed above'),
+        ((1, '', 'ImportError: mujoco'), (), 'see failures above'),
     )
     def test_remedies(self, end, works, remedy):
         with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):
@@ -98,8 +98,8 @@ class DoctorTest(CommandTest):
     def test_exit_status(self):
         good, bad = doctor.Finding('ok', 'fine'), doctor.Finding('FAILED', 'no engine', 'mend it')
         for found, status, last in (
-            ([good], 0, 'all is well'),
-            ([good, bad], 1, '1 thing to mend'),
+            ([good], 0, 'all checks passed'),
+            ([good, bad], 1, '1 check failed'),
         ):
             with mock.patch.object(doctor, 'findings', lambda found=found: iter(found)):
                 code, out, _ = run('doctor')

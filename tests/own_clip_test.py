@@ -310,7 +310,7 @@ class RetargetTest(FolderTest):
             retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_nee': 'left_knee'})
         with self.assertRaisesRegex(ValueError, "joint of the motion 'knee'; did you mean"):
             retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_knee': 'knee'})
-        with self.assertRaisesRegex(ValueError, 'no root, or nothing else'):
+        with self.assertRaisesRegex(ValueError, 'the root, or all other joints'):
             retargeting.retarget(clip, 'dog')
         with self.assertRaisesRegex(ValueError, 'scale is 0'):
             retargeting.retarget(clip, 'raptor', scale=0)
