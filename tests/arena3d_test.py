@@ -107,7 +107,7 @@ class GeometryTest(parameterized.TestCase):
     """Ray casts against queries."""
 
     @parameterized.parameters(*BOXED, *GRIDS)
-    def test_geometry_is_the_ground(self, source):
+    def test_geometry_equals_the_ground(self, source):
         stage = Stage(source)
         tolerance = SINGLE if source in GRIDS else EXACT
         for seed, xy in ((0, (0, 0)), (1, (17.3, -9.1)), (2, (-40.2, 12.0)), (3, (200.0, 31.0))):
@@ -201,7 +201,7 @@ class GeometryTest(parameterized.TestCase):
             self.assertLess((error[lean] > EXACT).mean(), 0.01)
             self.assertGreater((~lean).sum(), 30)
 
-    def test_refuses(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'gaps'):
             SpatialArena(terrain.load('gaps'))
         with self.assertRaisesRegex(ValueError, 'hills3d'):
@@ -350,7 +350,7 @@ class DynamicsTest(parameterized.TestCase):
         self.assertLess(fastest, 2.2 * speed + 0.05)  # pushed, not shot off
         self.assertGreater(fastest, 0.5 * speed)
 
-    def test_boxes_keep_their_speed_and_way(self):
+    def test_boxes_keep_their_speed_and_path(self):
         stage = Stage('dynamic_obstacles3d', (7,))
         movers = stage.arena.grounds[0].layout.movers
         kinematic = terrain.Surroundings(1, stage.arena.capacity)
@@ -386,7 +386,7 @@ class DynamicsTest(parameterized.TestCase):
         np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
         self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
 
-    def test_drives_do_not_loosen_the_solver(self):
+    def test_inertia_of_movers_does_not_loosen_the_solver(self):
         # The solver stops by a tolerance relative to the mean inertia.
         with_drives, without = Stage('dynamic_obstacles3d', load=CUBE), Stage('plane', load=CUBE)
         expected = without.model.stat.meaninertia
@@ -496,7 +496,7 @@ class WorldTest(parameterized.TestCase):
         return np.stack(seen, 1)
 
     @parameterized.parameters(*SOURCES)
-    def test_every_row_of_a_batch_has_its_own_ground_and_equals_a_physics(self, source):
+    def test_every_simulation_has_its_own_ground_and_equals_a_physics(self, source):
         seeds = (11, 4, 8)
         stage, heading = self.begin(source, seeds, batch=True)
         seen = self.advance(stage, heading, 60)  # far enough to lay windows anew
@@ -507,7 +507,7 @@ class WorldTest(parameterized.TestCase):
             self.assertFalse(np.array_equal(seen[0][:, 6:], seen[1][:, 6:]))
 
     @parameterized.parameters(*SOURCES)
-    def test_saved_and_restored(self, source):
+    def test_a_restored_state_continues_exactly(self, source):
         stage, heading = self.begin(source, (5,), batch=False)
         self.advance(stage, heading, 40)
         state = pickle.loads(pickle.dumps((stage.arena.state(0), stage.world.get_state(0))))
@@ -520,7 +520,7 @@ class WorldTest(parameterized.TestCase):
             np.testing.assert_array_equal(self.advance(other, heading, 30), seen)
 
     @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d')
-    def test_restored_into_a_row_of_a_batch(self, source):
+    def test_restored_into_one_of_many_simulations(self, source):
         stage, heading = self.begin(source, (5,), batch=False)
         self.advance(stage, heading, 40)
         state = stage.arena.state(0), stage.world.get_state(0)
@@ -532,7 +532,7 @@ class WorldTest(parameterized.TestCase):
         found = self.advance(batch, heading.repeat(3), 20)
         np.testing.assert_array_equal(found[1], seen[0])
 
-    def test_rows_by_themselves(self):
+    def test_simulations_are_independent(self):
         """A simulation that is begun or followed leaves the others alone."""
         stage, heading = self.begin('pillars3d', (1, 2, 3), batch=True)
         self.advance(stage, heading, 10)
@@ -553,7 +553,7 @@ class WorldTest(parameterized.TestCase):
             np.testing.assert_array_equal(rays[0], rays[1])
             self.assertFalse(np.array_equal(rays[0], rays[2]))
 
-    def test_nothing_is_compiled_anew(self):
+    def test_nothing_is_recompiled(self):
         stage = Stage('pillars3d')
         model = stage.model
         stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, 5))

@@ -169,7 +169,7 @@ class GeometryTest(parameterized.TestCase):
             ground.follow(6.5)
             np.testing.assert_allclose(ground.heights(xs), first, atol=1e-9)
 
-    def test_a_strip_two_metres_wide(self):
+    def test_ground_is_two_metres_wide(self):
         ground = SpatialGround('steps_humanoid')
         for lateral, hit in ((0.99, True), (-0.99, True), (1.01, False)):
             self.assertEqual(ground.ray((3, lateral, 5), (0, 0, -1))[2], hit)
@@ -236,7 +236,7 @@ class QueryTest(parameterized.TestCase):
         self.assertTrue(np.isnan(planar_ground.height(0, np.nan, arrays)))
         self.assertFalse(planar_ground.has_left(0, np.nan, arrays))
 
-    def test_wrong_shapes_are_refused(self):
+    def test_wrong_shapes_are_rejected(self):
         ground = SpatialGround('flat')
         with self.assertRaisesRegex(ValueError, r'shape \(2, 1\); expected \(1, k\)'):
             ground.arena.height(np.zeros((2, 1)))
@@ -257,7 +257,7 @@ class PoolTest(parameterized.TestCase):
                 most = max(most, len(boxes.from_profile(first, *window).position))
         self.assertLessEqual(most, pool)
 
-    def test_rows_use_these_terrains(self):
+    def test_environments_use_these_terrains(self):
         planar = [spec for spec in catalogue.SPECS if 'planar' in spec.tags]
         self.assertEqual({spec.terrain for spec in planar}, {*OF_ROWS, *OF_GAITS})
 
@@ -372,7 +372,7 @@ class LongWalkTest(parameterized.TestCase):
             ground.follow(x)
         np.testing.assert_array_equal(ground.heights(xs), before)
 
-    def test_environment_lays_ground_under_a_walker(self):
+    def test_environment_moves_the_window_with_a_walker(self):
         environment = suite.make('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'random': 3})
         environment.reset()
         physics, arena = environment.physics, environment.task.arena
@@ -416,7 +416,7 @@ class LongWalkTest(parameterized.TestCase):
             states.append(np.array(trajectory))
         np.testing.assert_array_equal(*states)
 
-    def test_laying_the_same_window_again_does_not_change_a_trajectory(self):
+    def test_refilling_the_same_window_does_not_change_a_trajectory(self):
         states = []
         for disturb in (False, True):
             environment = suite.make('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'random': 11})

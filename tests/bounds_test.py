@@ -39,7 +39,7 @@ class ArenaTest(parameterized.TestCase):
     """After the ground was laid, and laid anew, a model is as `mj_setConst` leaves it."""
 
     @parameterized.parameters(*PLANAR, *SPATIAL)
-    def test_bounds(self, name):
+    def test_bounds_equal_those_of_mj_set_const(self, name):
         ground = terrain.load(name)
         arena = (SpatialArena if ground.spatial else PlanarArena)(ground)
         arena.mjcf_model.worldbody.add('body', name='ball').add('geom', size=(0.1,))
@@ -61,7 +61,7 @@ class RefreshTest(parameterized.TestCase):
     """Any box, any body."""
 
     @parameterized.parameters(range(5))
-    def test_random_boxes(self, seed):
+    def test_bounds_of_random_boxes_equal_those_of_mj_set_const(self, seed):
         rng = np.random.default_rng(seed)
         root = mjcf.RootElement()
         bodies = [root.worldbody]

@@ -496,7 +496,7 @@ class MirrorTest(parameterized.TestCase):
             np.testing.assert_allclose(position, other, atol=atol, err_msg=link)
 
     @parameterized.parameters(*NAMES)
-    def test_poses(self, name):
+    def test_mirrored_poses_give_mirrored_positions(self, name):
         first, second = (Floating(name, 'position', root=False) for _ in range(2))
         pose = random_targets(name, np.random.default_rng(3))
         first.pose(pose)
@@ -506,7 +506,7 @@ class MirrorTest(parameterized.TestCase):
         self.assertGreater(abs(here['right_ankle'][1] + here['left_ankle'][1]), 0.01)  # not alike
 
     @parameterized.product(name=NAMES, model=('position', 'torque', 'velocity'))
-    def test_motion(self, name, model):
+    def test_mirrored_controls_give_mirrored_motion(self, name, model):
         first, second = (Floating(name, model) for _ in range(2))
         self.assertFalse(first.map.action_offset.any())
         # Below the clamps: at them, which steps MuJoCo damps implicitly depends on the last bit.
@@ -549,7 +549,7 @@ class CollisionTest(parameterized.TestCase):
         self.assertLen(pairs, FIGURES[name].pairs)
 
     @parameterized.parameters(*NAMES)
-    def test_ground_touches_every_link(self, name):
+    def test_every_link_collides_with_the_ground(self, name):
         links = characters.CHARACTERS[name].links
         floor = {next(iter(p - {'floor'})) for p in self.touching(name) if 'floor' in p}
         self.assertEqual(floor, set(links))
@@ -622,7 +622,7 @@ class OwnArenaTest(parameterized.TestCase):
         self.assertAlmostEqual(height, FIGURES[name].height, delta=0.01)
 
     @parameterized.parameters(*NAMES)
-    def test_falls_and_rests_on_the_floor_with_its_weight(self, name):
+    def test_falls_and_its_contact_forces_equal_its_weight(self, name):
         _, physics = self.place(name, 'torque')
         model, data = physics.model.ptr, physics.data.ptr
         data.qvel[:2] = 0.3, 0.2
@@ -698,7 +698,7 @@ class PlanarTaskTest(parameterized.TestCase):
         ({'terrain': 'gaps'}, "'biped3d_mocap'.*'gaps'|'gaps'.*'biped3d_mocap'"),
         ({'actuation': 'muscle'}, "'biped3d_mocap' has no muscles"),
     )
-    def test_refusal(self, options, message):
+    def test_planar_tasks_reject_spatial_characters(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.build('biped3d_mocap', **options)
 
@@ -734,12 +734,12 @@ class ActionMapTest(parameterized.TestCase):
         ('torque', 'torque', 'N m'), ('velocity', 'target velocity', 'rad/s'),
         ('position', 'target rotation vector', 'rad'),
     )  # fmt: skip
-    def test_what_a_control_is(self, model, quantity, unit):
+    def test_controls_are_an_affine_map_of_actions(self, model, quantity, unit):
         mapping = Floating('biped3d', model).map
         self.assertEqual((mapping.quantity, mapping.unit), (quantity, unit))
 
     @parameterized.parameters(*NAMES)
-    def test_reach(self, name):
+    def test_largest_actions_reach_their_limits(self, name):
         reach = {
             model: dict(zip(mapping.names, mapping.action_scale, strict=True))
             for model in ('torque', 'velocity', 'position')
@@ -752,7 +752,7 @@ class ActionMapTest(parameterized.TestCase):
                 rigid = max(np.abs(np.ravel([axis for axis in limits if axis is not None]))) < 0.1
                 self.assertAlmostEqual(reach['position'][part], 0.04 if rigid else 1.5)
 
-    def test_centre_and_half_range(self):
+    def test_action_offset_and_action_scale(self):
         rng = np.random.default_rng(0)
         action_offset, reach = rng.uniform(-0.2, 0.2, 17), rng.uniform(0.5, 1, 17)
         mapping = Floating(
@@ -862,7 +862,7 @@ class AngleAxisTest(parameterized.TestCase):
             )
             np.testing.assert_allclose(got, expected)
 
-    def test_forward_swing(self):
+    def test_positive_angle_swings_forward(self):
         """A positive angle about the axis to the right lifts the front, as in the plane."""
         body = self.make('biped3d')
         action = np.zeros(22)
@@ -882,7 +882,7 @@ class AngleAxisTest(parameterized.TestCase):
         np.testing.assert_array_equal(mapping.control(action[0])[:3], control[0, :3])
 
     @parameterized.parameters(*NAMES)
-    def test_action_that_causes_a_control(self, name):
+    def test_action_inverts_control(self, name):
         mapping = self.make(name).map
         rng = np.random.default_rng(6)
         target = np.array([random_targets(name, rng) for _ in range(20)])
@@ -909,7 +909,7 @@ class AngleAxisTest(parameterized.TestCase):
         torques = (body.data.qfrc_actuator[body.dofs][3:6] for body in (by_axis, by_vector))
         np.testing.assert_allclose(*torques, atol=1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for options in ({'action_offset': np.zeros(22)}, {'action_scale': 1.0}):
             with self.assertRaisesRegex(ValueError, 'those of the original: no action_offset'):
                 Floating('biped3d', 'position', rotations='angle_axis', **options)
@@ -1071,7 +1071,7 @@ class ServoTest(parameterized.TestCase):
         self.assertLess(body.speed, 1)
 
     @parameterized.product(name=NAMES, model=('torque', 'velocity', 'position'))
-    def test_torque_limits_in_a_violent_rollout(self, name, model):
+    def test_torque_limits_hold_under_extreme_actions(self, name, model):
         arena = users_arena()
         character = characters.make(name)
         character.create_root_joints(arena.attach(character))
@@ -1096,7 +1096,7 @@ class ServoTest(parameterized.TestCase):
         self.assertFalse(data.warning.number.any())
 
     @parameterized.parameters(*NAMES)
-    def test_limits_of_joints_hold(self, name):
+    def test_joint_limits_hold(self, name):
         body = Floating(name, 'position', root=False)
         limits = body.character.joint_ranges
         rng = np.random.default_rng(12)

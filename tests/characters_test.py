@@ -245,7 +245,7 @@ class FiguresTest(parameterized.TestCase):
         self.assertAlmostEqual(-min(lowest(model, data)), figures.height, delta=5e-5)
 
     @parameterized.parameters(*NAMES)
-    def test_body_figures_reports_the_same(self, name):
+    def test_body_figures_agree(self, name):
         figures, reported = FIGURES[name], characters.body_figures(characters.make(name))
         self.assertAlmostEqual(reported['mass'], figures.mass, delta=1e-9)
         self.assertAlmostEqual(reported['standing_height'], figures.height, delta=5e-5)
@@ -280,7 +280,7 @@ class FiguresTest(parameterized.TestCase):
             self.assertEqual(model.body(model.body(link).parentid[0]).name, parent)
 
     @parameterized.parameters('dog', 'goat')
-    def test_only_the_pelvis_box_is_turned(self, name):
+    def test_only_the_pelvis_box_is_rotated(self, name):
         model, data = alone(name)
         mujoco.mj_forward(model, data)
         for link in characters.CHARACTERS[name].links:
@@ -435,7 +435,7 @@ class CollisionTest(parameterized.TestCase):
         ('biped2d_full', 'right_forearm', 'right_hip', False),
         ('biped2d_full', 'right_shoulder', 'right_forearm', False),
     )  # fmt: skip
-    def test_pair(self, name, a, b, touch):
+    def test_links_that_collide_with_each_other(self, name, a, b, touch):
         self.assertEqual(frozenset((a, b)) in self.touching(name), touch)
 
     @parameterized.parameters(*NAMES)
@@ -447,7 +447,7 @@ class CollisionTest(parameterized.TestCase):
         np.testing.assert_array_equal(model.geom_condim[boxes], 3)
 
     @parameterized.parameters(*NAMES)
-    def test_what_is_drawn_weighs_and_touches_nothing(self, name):
+    def test_visual_geoms_have_no_mass_and_no_contacts(self, name):
         model, _ = alone(name)
         looks = model.geom_group == 0
         self.assertGreaterEqual(looks.sum(), len(JOINTS[name]))
@@ -486,7 +486,7 @@ class OwnArenaTest(parameterized.TestCase):
         return character, physics
 
     @parameterized.parameters(*NAMES)
-    def test_falls_and_rests_on_the_floor_with_its_weight(self, name):
+    def test_falls_and_its_contact_forces_equal_its_weight(self, name):
         _, physics = self.place(name, 'torque')
         if name == 'hopper':
             physics.named.data.qvel[f'{name}/root_pitch/'] = 0.5  # it would balance on its point
@@ -562,7 +562,7 @@ class OwnArenaTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, "unknown character 'rapter'.*'raptor'"):
             characters.make('rapter')
 
-    def test_row_of_an_incomplete_file(self):
+    def test_spec_of_an_incomplete_file(self):
         spec = characters.CHARACTERS['biped2d']
         joints = {**spec.joints, 'third_leg': next(iter(spec.joints.values()))}
         with self.assertRaisesRegex(ValueError, "biped2d.xml has no joint named 'third_leg'"):

@@ -99,12 +99,12 @@ class ListTest(CommandTest):
         self.assertEqual(lines[-1], f'{count} environments')
         self.assertLen(lines, count + 2 if count else 1)
 
-    def test_those_with_a_policy(self):
+    def test_trained_lists_environments_with_a_policy(self):
         lines = self.output('list', '--trained', '--domain', 'plaid').splitlines()
         shipped = {id_ for id_ in policies.available() if suite.find(id_).domain == 'plaid'}
         self.assertEqual({line.split()[0] for line in lines[1:-1]}, shipped)
 
-    def test_one_is_singular(self):
+    def test_a_single_match_is_counted_in_the_singular(self):
         out = self.output('list', '--domain', 'plaid', '--terrain', 'flat', '--character', 'dog',
                           '--tag', 'blind')  # fmt: skip
         self.assertEndsWith(out, '\n1 environment\n')
@@ -122,7 +122,7 @@ class ListTest(CommandTest):
 
 class InfoTest(CommandTest):
     @parameterized.parameters(*catalogue.BY_ID)
-    def test_speaks_about_every_environment(self, id_):
+    def test_describes_every_environment(self, id_):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
@@ -296,7 +296,7 @@ class InfoTest(CommandTest):
         self.assertIn('within 0.5 m of the goal and within 2 m of the walker', out)
         self.assertNotRegex(out, r'\n  (speed|upright) ')
 
-    def test_an_alias_is_as_good(self):
+    def test_an_alias_gives_the_same_text(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
 
     def test_only_the_differences_that_apply(self):
@@ -392,14 +392,14 @@ class InfoTest(CommandTest):
                 out = self.output('info', id_).split('\nDiffers')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
-    def test_unknown(self):
+    def test_unknown_ids_suggest_the_closest(self):
         self.assert_refused("did you mean 'PD_Biped2D_Gaps_Terrain-v0'", 'info', GAPS[:-1])
         self.assert_refused("did you mean 'plaid/dog_gaps'", 'info', 'plaid/dog_gap')
 
 
 class RolloutTest(CommandTest):
     @parameterized.parameters('random', 'zero', 'clip')
-    def test_trajectory_is_what_the_environment_does(self, policy):
+    def test_trajectory_equals_that_of_the_environment(self, policy):
         steps = 100
         out = self.output(
             'rollout', GAPS, '--seed', '3', '--steps', str(steps), '--policy', policy,
@@ -447,7 +447,7 @@ class RolloutTest(CommandTest):
             end = 'goes on' if i == episodes and t['step_types'][-1] != 2 else 'fell'
             self.assertRegex(out, rf'\n +{i} +{length} +[\d.]+ +-?[\d.]+ +{end}\n')
 
-    def test_an_episode_that_is_cut(self):
+    def test_a_truncated_episode(self):
         def short(id_, task_kwargs):
             return suite.build('raptor', task_kwargs={**task_kwargs, 'step_limit': 3})
 
@@ -458,7 +458,7 @@ class RolloutTest(CommandTest):
         for i, line in enumerate(episodes, 1):
             self.assertRegex(line, rf'^ +{i} +3 +[\d.]+ +[\d.]+  was cut$')
 
-    def test_many_episodes_are_summed_up(self):
+    def test_many_episodes_are_summarised(self):
         out = self.output('rollout', GAPS, '--steps', '600', '--seed', '1')
         lines = out.splitlines()
         self.assertLen(lines, rollout.SHOWN_EPISODES + 3)
@@ -520,7 +520,7 @@ class RolloutTest(CommandTest):
         )  # fmt: skip
         self.assert_only()
 
-    def test_how_an_episode_of_a_gait_ends(self):
+    def test_ends_of_episodes_of_gaits_are_named(self):
         for end in ('fell', 'stuck'):
 
             def fail(task, env_ids, finish=GaitTask.finish_step, end=end):
@@ -559,11 +559,11 @@ class RolloutTest(CommandTest):
         ('required: ID', '--seed', '1'),
         ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
     )  # fmt: skip
-    def test_refusals_leave_nothing_behind(self, message, *arguments):
+    def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'rollout', *arguments)
         self.assert_only()
 
-    def test_an_interrupt_leaves_nothing_behind(self):
+    def test_an_interrupt_leaves_no_files(self):
         frame, calls = rendering.frame, []
 
         def interrupted(*arguments):
@@ -595,7 +595,7 @@ def save_policy(path, id_, seed=0):
 class TrainedTest(CommandTest):
     """Policies from a file or shipped, in rollout."""
 
-    def test_a_file(self):
+    def test_a_policy_file(self):
         policy = save_policy('mine.npz', GAPS)
         self.output(
             'rollout', GAPS, '--steps', '40', '--policy', 'mine.npz', '--trajectory', 'a.npz'
@@ -607,7 +607,7 @@ class TrainedTest(CommandTest):
             expected = policy(t['observations'][acted])
             np.testing.assert_array_equal(t['actions'][acted], expected)
 
-    def test_the_reference(self):
+    def test_the_shipped_policy(self):
         save_policy(f'{GAPS}.npz', GAPS)
         with mock.patch.object(resources, 'directory', lambda kind: self.folder):
             self.assertEqual(policies.available(), (GAPS,))
@@ -626,7 +626,7 @@ class TrainedTest(CommandTest):
                     command, 'PD_Dog2D_Gaps_Terrain-v0', '--policy', 'reference',
                 )  # fmt: skip
 
-    def test_one_that_does_not_fit(self):
+    def test_a_policy_of_another_environment_is_rejected(self):
         save_policy('mine.npz', GAPS)
         pathlib.Path('broken.npz').write_bytes(b'no')
         for command in ('rollout', 'evaluate'):
@@ -708,7 +708,7 @@ class EvaluateTest(CommandTest):
         ("suffix '.txt'; expected .json", GAPS, '--json', 'a.txt'),
         ("the folder 'no' does not exist", GAPS, '--json', 'no/a.json'),
     )
-    def test_refusals_leave_nothing_behind(self, message, *arguments):
+    def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'evaluate', *arguments)
         self.assert_only()
 
@@ -730,13 +730,13 @@ class TerrainTest(CommandTest):
         self.assert_refused('length is 400.0', 'terrain', 'plane', '--length', '400')
         self.assert_only('terrain_stairs3d.png', 'b.png')
 
-    def test_a_file(self):
+    def test_a_policy_file(self):
         (self.folder / 'own').mkdir()
         (self.folder / 'own' / 'mine.json').write_text('{"Type": "var2d_gaps"}')
         self.assertEqual(self.output('terrain', 'own/mine.json'), 'terrain_mine.png\n')
         self.assert_only('own', 'terrain_mine.png')
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         pathlib.Path('bad.json').write_text('{"Type": "var2d_gap"}')
         for message, *arguments in (
             ("unknown terrain 'gasp'; did you mean 'gaps'", 'gasp'),
@@ -757,7 +757,7 @@ class ProgramTest(CommandTest):
     def test_version(self):
         self.assertRegex(self.output('--version'), r'^trl-suite \d+\.\d+\.\d+\n$')
 
-    def test_no_or_another_command(self):
+    def test_a_missing_or_unknown_command_is_an_error(self):
         self.assert_refused('required: command', *())
         self.assert_refused("invalid choice: 'lst'", 'lst')
 
@@ -792,7 +792,7 @@ class ProgramTest(CommandTest):
         self.assertEqual((done.returncode, done.stdout), (2, ''))
         self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
 
-    def test_a_reader_that_stops_reading(self):
+    def test_a_closed_pipe_is_not_an_error(self):
         with subprocess.Popen(
             [sys.executable, '-m', 'trl_suite', 'list'], stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -38,7 +38,7 @@ class DoctorTest(CommandTest):
         # What the suite itself asks for is here.
         self.assertEqual({finding.state for finding in doctor.versions()}, {doctor.OK})
 
-    def test_a_process_says_why_it_failed(self):
+    def test_a_failed_process_reports_its_error(self):
         # At exit, a half-loaded library may complain at length.
         code = 'import atexit; atexit.register(lambda: print(1 / 0)); import no_such_module'
         status, _, error = doctor._end(doctor._start(code))
@@ -76,7 +76,7 @@ class DoctorTest(CommandTest):
         self.assertEqual((found['osmesa'].state, found['glfw'].state), (doctor.NOTE, doctor.OK))
         self.assertIn('libosmesa6', found['osmesa'].remedy)
 
-    def test_fewer_cores_than_there_are(self):
+    def test_fewer_usable_cores_are_noted(self):
         with (
             mock.patch.object(machine, 'cores', return_value=2),
             mock.patch.object(doctor.os, 'cpu_count', return_value=8),
@@ -85,7 +85,7 @@ class DoctorTest(CommandTest):
         self.assertStartsWith(found.text, '2 of 8 cores usable')
         self.assertIn('num_threads=2', found.remedy)
 
-    def test_where_compiled_code_is_kept(self):
+    def test_cache_of_compiled_code_is_reported(self):
         found = doctor.compiled_code()
         self.assertEqual(found.state, doctor.OK)
         self.assertIn(str(doctor.compiled.cache_folder()), found.text)
@@ -108,7 +108,7 @@ class DoctorTest(CommandTest):
 
 
 class BenchTest(CommandTest):
-    def test_measures(self):
+    def test_results_are_printed_and_written(self):
         out = self.output(
             'bench', 'plaid/dog_gaps', '--num-envs', '3', '--threads', '1', '--seconds', '0.05',
             '--json', 'bench.json',
@@ -132,7 +132,7 @@ class BenchTest(CommandTest):
         found = bench.vector('PD_Dog2D_Flat-v0', 2, 1, 0.05)
         self.assertAlmostEqual(found['physics'] / found['control'], 10, delta=2)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         self.assert_refused("did you mean 'PD_Dog2D_Gaps", 'bench', 'PD_Dog_Gaps_Terrain-v0')
         self.assert_refused('seconds is 0', 'bench', '--seconds', '0')
         self.assert_refused('folder', 'bench', '--json', 'no/bench.json')
@@ -172,7 +172,7 @@ class GalleryTest(CommandTest):
             height, width = gallery.STRIP_SIZE
             self.assertEqual(image.size, (6 * width + 5 * 4, height))
 
-    def test_what_is_there_stays(self):
+    def test_existing_pictures_are_kept(self):
         old = pathlib.Path('characters')
         old.mkdir()
         (old / 'dog.jpg').write_text('mine')
@@ -182,7 +182,7 @@ class GalleryTest(CommandTest):
         self.output('gallery', '--filter', 'characters/dog', '--output', '.', '--overwrite')
         self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
 
-    def test_a_policy_that_was_replaced_is_drawn_again(self):
+    def test_pictures_of_a_replaced_policy_are_redrawn(self):
         only = ('gallery', '--filter', f'curves/{GAPS}', '--output', 'g')
         for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
             with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
@@ -192,7 +192,7 @@ class GalleryTest(CommandTest):
             gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
             self.assertEqual(gallery._source(path), 'digest')
 
-    def test_one_that_fails_stops_no_other(self):
+    def test_an_error_does_not_stop_other_pictures(self):
         def draw():
             raise ValueError('no such\nthing')
 
@@ -220,14 +220,14 @@ class ActingTest(parameterized.TestCase):
         ('PD_Dog2D_Flat-v0', 'clip'), ('Torque_Dog2D_LLC_Imitate_Flat-v0', 'zero'),
         ('FSM_Hopper2D_Terrain_Gaps-v0', 'zero'), ('PD_Biped3D_HLC_Soccer-v0', 'scripted'),
     )  # fmt: skip
-    def test_the_best_there_is(self, id_, name):
+    def test_best_policy_that_exists_is_chosen(self, id_, name):
         environment = suite.make(id_, {'random': 0})
         with mock.patch.object(policies, 'reference', side_effect=FileNotFoundError):
             found, policy = acting.best(environment, id_)
         self.assertEqual(found, name)
         self.assertEqual(policy(environment.reset()).shape, environment.action_spec().shape)
 
-    def test_a_shipped_one_is_best(self):
+    def test_a_shipped_policy_is_best(self):
         environment = suite.make(GAPS, {'random': 0})
         self.assertEqual(acting.best(environment, GAPS)[0], 'reference')
 
@@ -263,7 +263,7 @@ class ClipTest(CommandTest):
         self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
         self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
 
-    def test_bad_maps(self):
+    def test_invalid_maps_are_rejected(self):
         for text, message in (
             ('[1, 2]', 'map.json: expected an object of names'),
             ('[1, 2', 'map.json: not JSON'),
@@ -274,7 +274,7 @@ class ClipTest(CommandTest):
                 message, 'clip', 'run.json', '--character', 'raptor', '--map', 'map.json'
             )
 
-    def test_refusals_leave_nothing_behind(self):
+    def test_errors_leave_no_files(self):
         here = [path.name for path in self.folder.iterdir()]
         for message, *arguments in (
             ("unknown character 'cat'", 'run.json', '--character', 'cat'),

@@ -94,7 +94,7 @@ def allocates(n):
 class FunctionTest(parameterized.TestCase):
     """What compiled functions can do."""
 
-    def test_loops_take_packs(self):
+    def test_compiled_loops_accept_packs(self):
         pair = Pair(np.array([1.0, 2.0, 3.0]), np.zeros(3))
         scale_all(np.array([0, 2]), packed(pair))
         np.testing.assert_array_equal(pair.second, [-2, 0, 6])
@@ -108,7 +108,7 @@ class FunctionTest(parameterized.TestCase):
         other = packed(whole._replace(pair=Pair(frozen[::2], np.zeros((1, 1)))))
         self.assertEqual(mixed(other), (2.0, 1, 3.5, 1))
 
-    def test_what_cannot_be_packed(self):
+    def test_unsupported_values_cannot_be_packed(self):
         with self.assertRaisesRegex(TypeError, 'Whole.pair.second is list; expected an array, a'):
             packed(Whole(Pair(np.zeros(2), [1.0]), 7, 0.5, True))
 
@@ -125,13 +125,13 @@ class FunctionTest(parameterized.TestCase):
         scale_all(np.array([5]), pack)
         self.assertEqual(second[5], 1.5)
 
-    def test_who_allocates_is_refused(self):
+    def test_allocation_is_rejected(self):
         import numba
 
         with self.assertRaises(numba.core.errors.NumbaError):
             allocates(3)
 
-    def test_the_python_function_remains(self):
+    def test_the_python_function_is_accessible(self):
         self.assertEqual(twice.function(4), 8)
         self.assertEqual(twice.__name__, 'twice')
 
@@ -184,7 +184,7 @@ class CacheTest(FolderTest):
     def folders(self, base=None):
         return sorted((base or self.cache).glob('trl_suite-*'))
 
-    def test_code_is_kept_for_each_state_of_the_sources(self):
+    def test_code_is_cached_per_state_of_the_sources(self):
         self.assertEqual(self.ask(), (['11.0'], ''))
         (first,) = self.folders()
         files = {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')}
@@ -216,7 +216,7 @@ class CacheTest(FolderTest):
             self.assertEqual(found, [str(path) for path in self.folders(base)])
         self.assertFalse(self.cache.exists())
 
-    def test_without_a_folder_that_can_be_written(self):
+    def test_without_a_writable_folder(self):
         file = self.folder / 'file'
         file.touch()
         nowhere = str(file / 'cache')
@@ -228,7 +228,7 @@ class CacheTest(FolderTest):
         self.assertEqual(found, ['11.0', '20.0'])
         self.assertEqual(warned.count('no folder for compiled code can be written'), 1)
 
-    def test_numbas_setting_is_left_alone(self):
+    def test_numbas_setting_is_not_changed(self):
         found, _ = self.ask("""
             import numba
             from trl_suite.outer import outer
@@ -249,7 +249,7 @@ class CacheTest(FolderTest):
         self.ask(FOLDER)
         self.assertEqual([p.exists() for p in (old, new, other)], [False, True, True])
 
-    def test_types_of_others_are_not_kept(self):
+    def test_foreign_types_are_not_cached(self):
         """Who has not the module of a type could not read the list in which it is."""
         (self.folder / 'foreign.py').write_text(TUPLE.format('Foreign'))
         (self.package / 'own.py').write_text(TUPLE.format('Own') + FIRST)
@@ -337,7 +337,7 @@ class DisabledTest(parameterized.TestCase):
         'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_LLC_Symetric_Step-v0',
         'PD_Biped3D_HLC_DynamicsObstacles-v0', 'PD_Biped3D_Terrain_Soccer_Hard-v0',
     )  # fmt: skip
-    def test_the_same_numbers(self, id_):
+    def test_results_are_equal_without_compilation(self, id_):
         found = [
             subprocess.run(
                 [sys.executable, '-c', textwrap.dedent(self.SCRIPT), id_], capture_output=True,

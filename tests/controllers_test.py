@@ -84,7 +84,7 @@ SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
 class ParametersTest(parameterized.TestCase):
     """Vectors, base actions, and what an action means."""
 
-    def test_who_has_a_gait(self):
+    def test_characters_with_a_gait(self):
         self.assertCountEqual(controllers.available(), NAMES)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
             controllers.load('dgo')
@@ -131,7 +131,7 @@ class ParametersTest(parameterized.TestCase):
         found = gait.vector(np.clip(actions, -1, 1))
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
-    def test_what_action_0_means(self):
+    def test_action_0_is_a_base_action(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
         np.testing.assert_array_equal(dog.action_offset, dog.base_actions[0])
         np.testing.assert_array_equal(hopper.action_offset, hopper.base_actions[0])
@@ -169,7 +169,7 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_allclose(gait.action(vectors), actions, atol=1e-9)
         np.testing.assert_allclose(gait.action(vectors[2]), actions[2], atol=1e-9)
 
-    def test_files_that_are_wrong(self):
+    def test_invalid_files_are_rejected(self):
         good = {
             'character': 'hopper', 'kind': 'hop', 'legs': [['hip', 'leg']], 'feet': ['leg'],
             'targets': {'Hip': ['hip']}, 'misc': ['Gain'], 'states': ['Up', 'Down'],
@@ -426,7 +426,7 @@ class DynamicsTest(parameterized.TestCase):
             np.testing.assert_array_equal(matrix[[0, 2]], others)
 
     @parameterized.parameters(*NAMES)
-    def test_rows_do_not_depend_on_each_other(self, name):
+    def test_simulations_are_independent(self, name):
         rig = Rig(name, 5, batch=True)
         rig.scatter(4)
         gait, feet = rig.gait, rig.gait.parameters.feet
@@ -474,7 +474,7 @@ class LawTest(parameterized.TestCase):
         np.testing.assert_array_equal(np.delete(found[0], [hip, rig.joints.index('left_hip')]), 0)
 
     @parameterized.parameters(*NAMES)
-    def test_what_state_entry_sets(self, name):
+    def test_state_entry_sets_targets(self, name):
         rig = Rig(name)
         gait, figures = rig.gait, controllers.load(name)
         vector = np.random.default_rng(0).uniform(-2, 2, len(figures.names))
@@ -501,7 +501,7 @@ class LawTest(parameterized.TestCase):
             found = dict(zip(rig.joints, gait.state.target[0], strict=True))
             self.assertEqual(found, expected)
 
-    def test_targets_of_joints_that_no_state_moves(self):
+    def test_targets_of_joints_without_a_state_target(self):
         dog, raptor = Rig('dog'), Rig('raptor')
         found = dict(zip(dog.joints, dog.gait.state.target[0], strict=True))
         for joint, angle in (
@@ -713,7 +713,7 @@ class MachineTest(parameterized.TestCase):
         vector[...] = 0  # the caller's own
         np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[2:3])
 
-    def test_rows_move_on_by_themselves(self):
+    def test_simulations_change_states_independently(self):
         rig = Rig('dog', 4, batch=True)
         gait = rig.gait
         gait.state.number[:], gait.state.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
@@ -752,7 +752,7 @@ class MachineTest(parameterized.TestCase):
                     )
                     self.assertEqual(bool(gait.state.rising[0]), now)
 
-    def test_hop_begins_in_the_air_and_goes_on_at_touch_down(self):
+    def test_hop_begins_in_the_air_and_continues_at_touch_down(self):
         rig = Rig('hopper')
         gait = rig.gait
         gait.apply(rig.env_ids, gait.parameters.base_actions[3:4])
@@ -848,7 +848,7 @@ class AloneTest(parameterized.TestCase):
         self.assertGreater(world.qpos[0, places[0]], 6.0)
         self.assertLess(abs(world.qpos[0, places[2]]), 1.2)
 
-    def test_who_has_none_is_refused(self):
+    def test_characters_without_a_gait_are_rejected(self):
         arena, biped = floors.Floor(), characters.make('biped2d')
         arena.attach(biped)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'biped2d'"):

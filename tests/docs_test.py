@@ -27,7 +27,7 @@ generate = load('generate')
 
 
 class PagesTest(absltest.TestCase):
-    def test_fresh(self):
+    def test_pages_are_up_to_date(self):
         """Made anew, all pages are what is there: run `python docs/generate.py` if this fails."""
         pages = generate.pages()
         self.assertEqual(list(generate.stale(pages)), [])
@@ -38,7 +38,7 @@ class PagesTest(absltest.TestCase):
             for name in names:
                 self.assertIn(f'{folder}/{name}.md', pages)
 
-    def test_links(self):
+    def test_links_have_targets(self):
         """Whatever a page links to is there, and is not empty."""
         files = [ROOT / 'README.md', *DOCS.rglob('*.md')]
         for file in files:
@@ -70,7 +70,7 @@ class WordsTest(parameterized.TestCase):
     @parameterized.parameters(
         'PD_Dog2D_Gaps_Terrain-v0', 'FSM_Raptor2D_Terrain_Walls-v0', 'PD_Biped3D_HLC_LargeBlocks-v0'
     )
-    def test_what_is_built_on_other_ground_is_told_the_same(self, id_):
+    def test_descriptions_do_not_depend_on_the_ground(self, id_):
         """Pages of environments that differ by their ground share what was built."""
         spec = suite.find(id_)
         other = next(

@@ -213,7 +213,7 @@ class SingleTest(Same, parameterized.TestCase):
             self.assertTrue((double[0].astype(np.float32) == single[0]).all())
         self.assertEqual(SuiteEnv(GAPS, dtype=np.float64).action_space.dtype, np.float64)
 
-    def test_ends(self):
+    def test_falls_terminate_and_limits_truncate(self):
         """A fall terminates; the own limit truncates, once."""
         env = gymnasium.make(f'trl_suite/{FLAT}', task_kwargs={'step_limit': 3})
         env.reset(seed=0)
@@ -276,13 +276,13 @@ class SingleTest(Same, parameterized.TestCase):
         ({'dtype': np.int32}, 'int32'),
         ({'task_kwargs': {'step_limt': 3}}, 'step_limt'),
     )
-    def test_refused_options(self, options, message):
+    def test_invalid_options_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             SuiteEnv(GAPS, **options)
         with self.assertRaisesRegex(ValueError, message):
             SuiteVectorEnv(GAPS, 2, **options)
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         env = SuiteEnv(FLAT)
         idle = np.zeros(6)
         with self.assertRaises(gymnasium.error.ResetNeeded):
@@ -370,7 +370,7 @@ class VectorTest(Same, parameterized.TestCase):
             for _ in range(21):
                 ours.step(idle)
 
-    def test_seed_of_the_whole(self):
+    def test_one_seed_gives_every_simulation_its_own(self):
         ours = SuiteVectorEnv(GAPS, 3)
         first, _ = ours.reset(seed=5)
         children = np.random.SeedSequence(5).generate_state(3)
@@ -414,7 +414,7 @@ class VectorTest(Same, parameterized.TestCase):
         self.assertEqual(count, expected)
 
     @parameterized.parameters(0, 2.5, -3)
-    def test_refused_max_episode_steps(self, steps):
+    def test_invalid_max_episode_steps_are_rejected(self, steps):
         with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
             SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
         with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
@@ -448,7 +448,7 @@ class VectorTest(Same, parameterized.TestCase):
         self.assertTrue((frames[0] != frames[1]).any())
         self.assertIsNone(SuiteVectorEnv(GAPS, 1).render())
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         with self.assertRaisesRegex(ValueError, 'NextStep'):
             SuiteVectorEnv(FLAT, 2, autoreset_mode='NexStep')
         with self.assertRaisesRegex(ValueError, 'step_limit'):

@@ -156,7 +156,7 @@ class TableTest(parameterized.TestCase):
         self.assertLessEqual(spanned, set(characters.CHARACTERS[name].joints))
 
     @parameterized.parameters(*CASES)
-    def test_row(self, name, muscle):
+    def test_parameters_of_a_muscle(self, name, muscle):
         l_opt, l_slack, f_max, pennation, arms = SAMPLES[name][muscle]
         unit = next(unit for unit in muscles.MUSCLES[name]['plain'] if unit.name == muscle)
         self.assertEqual(unit[1:5], (l_opt, l_slack, f_max, pennation))
@@ -328,7 +328,7 @@ class MujocoTest(parameterized.TestCase):
         self.assertTrue((np.diff(found) > -1e-9).all())
         np.testing.assert_allclose(found[[0, 20, 40]], (0, 1, 1.5), atol=1e-9)
 
-    def test_more_exact_where_muscles_work(self):
+    def test_fit_is_better_in_the_working_range(self):
         """Root mean square error over the fitted range, isometric and by velocity."""
         rig = Rig('biped2d', 'right_GLU')
         lengths, velocities = np.linspace(0.5, 1.5, 41), np.linspace(-10, 10, 41)
@@ -369,7 +369,7 @@ class StrainTest(parameterized.TestCase):
                 )
                 self.assertAlmostEqual(strain[i], -pennation * change / l_opt, delta=1e-9)
 
-    def test_muscles_drive_in_the_order_of_the_action(self):
+    def test_muscles_are_in_the_order_of_the_action(self):
         environment = suite.make('MTU_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
         names = environment.action_map.names
         self.assertEqual(names, tuple(BIPED))

@@ -164,7 +164,7 @@ class FolderTest(parameterized.TestCase):
 
 class ReadingTest(FolderTest):
     @parameterized.parameters('ZXY', 'XYZ', 'ZYX')
-    def test_bvh_comes_back(self, order):
+    def test_bvh_round_trip(self, order):
         """A walk of ours, arms at rest sideways, in centimetres, y up."""
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
         write_bvh(figure, self.folder / 'walk.bvh', order)
@@ -179,7 +179,7 @@ class ReadingTest(FolderTest):
         angles = [column for column in range(clip.poses.shape[1]) if column > 2]
         self.assertLess(np.abs(np.abs(clip.poses) - np.abs(figure.poses))[:, angles].max(), 1e-5)
 
-    def test_acclaim_comes_back(self):
+    def test_acclaim_round_trip(self):
         figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 25)
         write_acclaim(figure, self.folder / 'a.asf', self.folder / 'walk.amc')
         capture = retargeting.read(
@@ -235,7 +235,7 @@ class ReadingTest(FolderTest):
         size = KinematicViewer(PLAIN).standing()[2] / 0.9
         np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for name, text in (
             ('a.bvh', 'HIERARCHY\n'), ('a.json', '{'), ('a.asf', ':root\norder TX\n'),
             ('b.asf', ':bonedata\nbegin\nname x\nlength far\nend\n'), ('a.amc', '1\nroot 1\n'),
@@ -261,7 +261,7 @@ class ReadingTest(FolderTest):
 
 
 class RetargetTest(FolderTest):
-    def test_from_space_to_the_plane(self):
+    def test_a_spatial_motion_on_a_planar_character(self):
         """Hinges take the part of a rotation that is about their axis."""
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
         write_bvh(figure, self.folder / 'walk.bvh')
@@ -304,7 +304,7 @@ class RetargetTest(FolderTest):
         self.assertEqual((found['left_knee'], found['right_elbow']), ('ltibia', 'rradius'))
         self.assertNotIn('right_hip', found)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         clip = motion.load('biped2d_walk')
         with self.assertRaisesRegex(ValueError, "unknown joint of the character 'left_nee'"):
             retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_nee': 'left_knee'})
@@ -347,7 +347,7 @@ class CycleTest(absltest.TestCase):
             moved = clip.layout.change(clip.poses, loose.pose(0.12 + clip.times))[:, flat:]
             self.assertLessEqual(np.abs(moved).max(), gap + 1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         clip = self.unrolled('biped2d_walk')
         with self.assertRaisesRegex(ValueError, 'both or none'):
             retargeting.cycle(clip, start=0.1)
@@ -361,7 +361,7 @@ class CheckTest(parameterized.TestCase):
     @parameterized.parameters(
         ('biped2d_walk', 'biped2d'), ('dog_bound', 'dog'), ('biped3d_run', 'biped3d'),
     )  # fmt: skip
-    def test_our_own_have_no_faults(self, name, character):
+    def test_shipped_clips_have_no_faults(self, name, character):
         report = clip_check.check(motion.load(name), character)
         self.assertEmpty(report.faults)
         self.assertEndsWith(str(report), 'no faults')
@@ -412,7 +412,7 @@ class CheckTest(parameterized.TestCase):
         self.assertAlmostEqual(first.amount, 0.02, delta=0.02)  # not before it has travelled so far
         self.assertIn('foot slide', str(report))
 
-    def test_a_clip_of_another_character(self):
+    def test_a_clip_of_another_character_is_rejected(self):
         with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*is none of 'raptor'"):
             clip_check.check(motion.load('biped2d_walk'), 'raptor')
 
@@ -433,7 +433,7 @@ class ImitationTest(FolderTest):
         time_step = environment.step(environment.task.clip_action(0))
         self.assertGreater(time_step.reward, 0.5)
 
-    def test_the_example(self):
+    def test_example_runs(self):
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 61)
         write_bvh(figure, self.folder / 'walk.bvh')
         spec = importlib.util.spec_from_file_location('own_clip', EXAMPLES / 'own_clip.py')

@@ -126,7 +126,7 @@ class CharacterTest(Folder):
             'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', spec.notes
         )
 
-    def test_what_has_no_name_in_the_file(self):
+    def test_unnamed_elements_get_names(self):
         things = '<site pos="0 0 .4"/><camera pos="0 -2 0"/><light pos="0 0 3"/>'
         rules = (
             '<contact><exclude body1="trunk" body2="left_shin"/></contact>'
@@ -141,11 +141,11 @@ class CharacterTest(Folder):
         model = environment.physics.model
         self.assertEqual((model.neq, model.ntendon, model.nexclude), (1, 1, 1))
 
-    def test_own_figures_replace_those_found(self):
+    def test_given_joint_parameters_replace_those_of_the_file(self):
         mine = characters.Joint(kp=10, kd=1, weight=0.5)
         self.assertIs(self.planar(joints={'left_hip': mine}).joints['left_hip'], mine)
 
-    def test_meshes_travel_with_the_row(self):
+    def test_meshes_are_stored_in_the_spec(self):
         trimesh.creation.icosphere(radius=0.2).export(self.folder / 'ball.obj')
         text = MJCF.replace('<worldbody>', '<asset><mesh file="ball.obj"/></asset><worldbody>', 1)
         text = text.replace('<geom size=".15 .15 .2" type="box"', '<geom type="mesh" mesh="ball"')
@@ -229,7 +229,7 @@ class CharacterTest(Folder):
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
         ('name', {'name': 'dog'}, "has a character named 'dog'"),
     )  # fmt: skip
-    def test_bad_names(self, options, message):
+    def test_invalid_names_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             self.planar(**options)
 
@@ -244,7 +244,7 @@ class CharacterTest(Folder):
         self.assertNotRegex('; '.join(self.planar().notes), message)
         self.assertRegex('; '.join(self.planar(MJCF.replace(before, after)).notes), message)
 
-    def test_a_root_that_says_otherwise_is_noted(self):
+    def test_contradicting_root_joints_are_noted(self):
         spec = self.planar(spatial=True)
         self.assertTrue(spec.spatial)
         self.assertRegex(spec.notes[0], 'spatial=True was given, .* two slides and a hinge')
@@ -265,7 +265,7 @@ class CharacterTest(Folder):
         ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
         ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
     )  # fmt: skip
-    def test_bad_files(self, before, after, message):
+    def test_invalid_files_are_rejected(self, before, after, message):
         self.assertIn(before, MJCF)
         with self.assertRaisesRegex(ValueError, f'figure.xml: .*{message}'):
             self.planar(MJCF.replace(before, after))
@@ -291,11 +291,11 @@ class CharacterTest(Folder):
         ({'kp': -80}, 'kp of a joint is -80'), ({'kd': math.nan}, 'kd of a joint is nan'),
         ({'armature': math.inf}, 'armature'), ({'target': (0, math.nan, 0)}, 'target .* finite numbers'),
     )  # fmt: skip
-    def test_bad_figures(self, values, message):
+    def test_invalid_joint_parameters_are_rejected(self, values, message):
         with self.assertRaisesRegex(ValueError, message):
             characters.Joint(**{'kp': 10, 'kd': 1, 'weight': 1, **values})
 
-    def test_missing_file_and_what_a_urdf_does_not_tell(self):
+    def test_missing_files_and_incomplete_urdf_files(self):
         path = self.write(URDF, 'two.urdf')
         with self.assertRaisesRegex(FileNotFoundError, "did you mean 'two.urdf'"):
             characters.from_file(self.folder / 'tow.urdf', **TWO)
@@ -367,7 +367,7 @@ class TerrainTest(Folder):
         self.assertTrue((found >= np.min(near, 0) - 1e-3).all())
         self.assertTrue((found <= np.max(near, 0) + 1e-3).all())
 
-    def test_a_strip_written_and_read_as_a_line(self):
+    def test_planar_ground_written_and_read_as_a_line(self):
         strip = terrain.PlanarGround(terrain.load('slopes_mixed'), 4)
         terrain.save_mesh(strip, self.folder / 'strip.obj', -2, 12)
         mine = terrain.from_mesh(self.folder / 'strip.obj', terrain.SPACING, line=0.0)
@@ -412,7 +412,7 @@ class TerrainTest(Folder):
             self.assertEqual(heights[7], at(ground))
             self.assertEqual(heights[7], at(draw.from_state(ground.state())))
 
-    def test_a_line_does_not_depend_on_when_it_is_asked(self):
+    def test_a_line_does_not_depend_on_the_order_of_queries(self):
         mine = terrain.from_function(vee)
         whole, piecewise = terrain.PlanarGround(mine, 0), terrain.PlanarGround(mine, 0)
         for x in (0, 30, -30, 90, -55):
@@ -421,7 +421,7 @@ class TerrainTest(Folder):
         np.testing.assert_array_equal(whole.height(x), piecewise.height(x))
         np.testing.assert_allclose(whole.height(x), vee(x), atol=0.2 * terrain.SPACING)
 
-    def test_terrain_crosses_processes(self):
+    def test_terrain_can_be_pickled(self):
         mine = terrain.from_heights(np.random.default_rng(0).random((9, 9)), 0.3, start_span=1)
         again = pickle.loads(pickle.dumps(mine))
         self.assertEqual(again, mine)
@@ -458,7 +458,7 @@ class TerrainTest(Folder):
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
     )  # fmt: skip
-    def test_bad_input(self, make, message):
+    def test_invalid_arguments_are_rejected(self, make, message):
         box = trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix((9, 0, 0)))
         box.export(self.folder / 'away.stl')
         self.write('nothing', 'broken.obj')
@@ -466,7 +466,7 @@ class TerrainTest(Folder):
         with self.assertRaisesRegex(ValueError, message):
             make(self.folder)
 
-    def test_a_cell_that_is_run_again(self):
+    def test_a_rerun_cell_replaces_its_terrain(self):
         def heights(factor):
             def wavelets(x):
                 return factor * np.sin(x)
@@ -477,7 +477,7 @@ class TerrainTest(Folder):
         again = terrain.PlanarGround(heights(0.5), 0)
         self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
 
-    def test_another_lambda_of_the_same_name(self):
+    def test_another_lambda_of_the_same_name_is_rejected(self):
         for factor in (1.0, 2.0):
             with (
                 self.assertRaisesRegex(ValueError, 'exists; pass')
@@ -529,7 +529,7 @@ class TaskTest(parameterized.TestCase):
     """Tasks from parts."""
 
     @parameterized.parameters('PD_Biped2D_Flat-v0', 'PD_Biped3D_Imitate-v0')
-    def test_parts_are_as_they_were_when_asked(self, id):
+    def test_parts_return_current_values(self, id):
         environment = suite.make(id, {'random': 1})
         environment.reset()
         names = ('height', 'root', 'speed', 'heading', 'upright', 'joint_angles', 'joint_rates')
@@ -542,7 +542,7 @@ class TaskTest(parameterized.TestCase):
     @parameterized.parameters(
         'PD_Biped2D_Gaps_Terrain-v0', 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
     )
-    def test_parts_beside_a_task_of_the_suite(self, id):
+    def test_parts_added_to_a_task_of_the_suite(self, id):
         many = VectorEnvironment(id, 3, seed=2, task_kwargs=PARTS)
         plain = VectorEnvironment(id, 3, seed=2)
         count = 2 if id.startswith('FSM') else 20  # whole cycles
@@ -566,7 +566,7 @@ class TaskTest(parameterized.TestCase):
         np.testing.assert_array_equal(found, np.array(seen)[:, 1])
         np.testing.assert_array_equal([r or 0.0 for r in gained], np.array(rewards)[:, 1])
 
-    def test_values_are_what_they_say(self):
+    def test_values_of_parts_equal_their_definitions(self):
         environment = suite.make('PD_Biped2D_Flat-v0', {'random': 1, **PARTS})
         environment.reset()
         data = environment.physics.named.data
@@ -607,7 +607,7 @@ class TaskTest(parameterized.TestCase):
         self.assertEqual(reward.shape, (2,))
 
     @parameterized.parameters('biped2d', 'biped3d')
-    def test_a_task_of_the_users(self, character):
+    def test_a_users_own_task(self, character):
         spec = suite.combine(character, task=Rise)
         environment = suite.build(
             character, task=Rise, task_kwargs={'random': 1, 'action_scale': 1.0}
@@ -642,7 +642,7 @@ class TaskTest(parameterized.TestCase):
         ('dict', {'rewards': [1]}, 'expected a dict'),
         ('option', {'reward': {}}, "did you mean 'rewards'"),
     )
-    def test_bad_parts(self, options, message):
+    def test_invalid_parts_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             environment = suite.make('PD_Biped2D_Flat-v0', options)
             environment.reset()
@@ -656,14 +656,14 @@ class ExampleTest(Folder):
         super().setUp()
         self.enterContext(mock.patch.dict(generators._generators))  # they register types
 
-    def test_page(self):
+    def test_code_of_the_page_runs(self):
         page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')
         code = '\n'.join(re.findall('```python\n(.*?)```', page, re.DOTALL))
         with contextlib.chdir(self.folder):
             exec(compile(code, 'make_your_own.md', 'exec'), {'__name__': 'page'})
 
     @parameterized.parameters('own_character', 'own_terrain', 'own_task')
-    def test_example(self, name):
+    def test_example_runs(self, name):
         path, output = EXAMPLES / f'{name}.py', self.folder / 'picture.png'
         self.assertLess(len(path.read_text().splitlines()), 40)
         with mock.patch.object(sys, 'argv', [name, '--output', str(output)]):

@@ -37,7 +37,7 @@ class StableBaselinesTest(parameterized.TestCase):
             check_env(gymnasium.make(f'trl_suite/{id_}').unwrapped, skip_render_check=True)
 
     @parameterized.parameters(True, False)
-    def test_rows_are_those_of_dummy_vec_env(self, flat):
+    def test_simulations_equal_those_of_dummy_vec_env(self, flat):
         theirs = DummyVecEnv([
             lambda: SuiteEnv(GAPS, flat_observation=flat, task_kwargs={'step_limit': LIMIT})
         ] * 3)  # fmt: skip
@@ -119,7 +119,7 @@ class StableBaselinesTest(parameterized.TestCase):
         with self.assertRaisesRegex(NotImplementedError, 'environment'):
             envs.env_method('reset')
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         envs = SuiteVecEnv(FLAT, 2, 1)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
             envs.step(np.zeros((2, 6)))
@@ -133,7 +133,7 @@ class StableBaselinesTest(parameterized.TestCase):
             envs.step(np.zeros((2, 6)))
 
     @parameterized.parameters((True, 'MlpPolicy'), (False, 'MultiInputPolicy'))
-    def test_ppo(self, flat, policy):
+    def test_ppo_runs(self, flat, policy):
         envs = VecNormalize(VecMonitor(SuiteVecEnv(GAPS, 4, 1, flat_observation=flat)))
         model = PPO(policy, envs, n_steps=32, batch_size=64, n_epochs=1, seed=3, device='cpu')
         model.learn(512)
