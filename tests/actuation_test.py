@@ -1,4 +1,4 @@
-"""Tests of the actuation of planar characters: what an action means, what a joint can get."""
+"""Tests of the actuation of planar characters: action maps, servos and torque limits."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ PAIRS = tuple(
 
 
 def full(name, model):
-    """What full action adds to the control of each joint; torques as shares of the limit."""
+    """Expected action_scale of each joint; torques as fractions of the limit."""
     revolute, leg = {
         'torque': (0.75, 1),
         'velocity': (10 * np.pi, 10),  # rad/s, m/s
@@ -71,7 +71,7 @@ class Mounted:
 
 
 class ActionMapTest(parameterized.TestCase):
-    """An affine map that can be read."""
+    """The affine map from actions to controls."""
 
     @parameterized.parameters(*PAIRS)
     def test_affine_clipped_and_invertible(self, name, model):
@@ -188,9 +188,9 @@ class ActionMapTest(parameterized.TestCase):
                 mapping.names, mapping.action_offset, mapping.action_scale, strict=True
             )
         }
-        np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # turns freely
+        np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # without limits
         np.testing.assert_allclose(figures['elbow'], (1.57, 6.28))
-        # Limits of the file, [-1.57, 1.57], not those that act, [-0.96, 2.18].
+        # Limits of the file, [-1.57, 1.57], not the effective ones, [-0.96, 2.18].
         np.testing.assert_allclose(figures['hip'], (0, 6.28), atol=1e-9)
         np.testing.assert_allclose(figures['spine0'], (0, 6.28), atol=1e-9)
 
@@ -230,7 +230,7 @@ class ActionMapTest(parameterized.TestCase):
 
 
 class ServoTest(parameterized.TestCase):
-    """What the compiled actuators do, by their formulas."""
+    """Forces of the compiled actuators against their formulas."""
 
     @parameterized.parameters(*JOINTS)
     def test_position_law(self, name):
@@ -263,7 +263,7 @@ class ServoTest(parameterized.TestCase):
         mounted.forward()
         force = np.clip(kd * (full(name, 'velocity') * action - rate), -limits, limits)
         np.testing.assert_allclose(mounted.torque, force, atol=1e-9)
-        np.testing.assert_array_equal(mounted.data.qfrc_damper, 0)  # all of kd is the servo's
+        np.testing.assert_array_equal(mounted.data.qfrc_damper, 0)  # the whole kd is in the servo
 
     @parameterized.parameters(*JOINTS)
     def test_torque_law(self, name):
@@ -342,7 +342,7 @@ def on_the_ground(name, model):
 
 
 class TorqueLimitTest(parameterized.TestCase):
-    """No model lets a joint exceed its limit, whatever happens."""
+    """No actuation model exceeds the torque limit of a joint."""
 
     @parameterized.parameters(*PAIRS)
     def test_limits_hold_under_extreme_actions(self, name, model):
@@ -362,7 +362,7 @@ class TorqueLimitTest(parameterized.TestCase):
                     np.maximum(highest, np.abs(data.qfrc_actuator[dof]), out=highest)
         np.testing.assert_array_less(highest, limits * (1 + 1e-9))
         np.testing.assert_array_equal(data.warning.number[:7], 0)
-        # The test means something: the limits are met.
+        # The limits are reached, so the test is effective.
         share = highest / limits
         if model == 'torque':
             np.testing.assert_allclose(share.max(), full(name, model).max())

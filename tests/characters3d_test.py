@@ -1,4 +1,4 @@
-"""Tests of characters in three dimensions, bodies and actuation, against the original's figures."""
+"""Tests of characters in three dimensions, bodies and actuation, against the original's values."""
 
 import dataclasses
 import functools
@@ -226,7 +226,7 @@ def random_targets(name, rng, share=1.0):
 
 
 def alone(name):
-    """The character compiled by itself, its root at the origin."""
+    """The character compiled alone, its root at the origin."""
     physics = mjcf.Physics.from_mjcf_model(characters.make(name).mjcf_model)
     return physics.model.ptr, physics.data.ptr
 
@@ -503,7 +503,7 @@ class MirrorTest(parameterized.TestCase):
         second.pose(self.mirrored(second.character, pose))
         here, there = self.positions(first), self.positions(second)
         self.assert_mirrored(here, there, first.character, 1e-12)
-        self.assertGreater(abs(here['right_ankle'][1] + here['left_ankle'][1]), 0.01)  # not alike
+        self.assertGreater(abs(here['right_ankle'][1] + here['left_ankle'][1]), 0.01)  # not equal
 
     @parameterized.product(name=NAMES, model=('position', 'torque', 'velocity'))
     def test_mirrored_controls_give_mirrored_motion(self, name, model):
@@ -524,7 +524,7 @@ class MirrorTest(parameterized.TestCase):
 
 
 class CollisionTest(parameterized.TestCase):
-    """Who can touch whom, as the engine answers."""
+    """Pairs of links that can collide, according to the engine."""
 
     def touching(self, name):
         """Pairs of links (and the floor) that touch when every box is 20 m large."""
@@ -582,7 +582,7 @@ class CollisionTest(parameterized.TestCase):
 
 
 class OwnArenaTest(parameterized.TestCase):
-    """A character lives in any composer arena."""
+    """A character works in any composer arena."""
 
     def place(self, name, model, **options):
         arena = users_arena()
@@ -690,7 +690,7 @@ class OwnArenaTest(parameterized.TestCase):
 
 
 class PlanarTaskTest(parameterized.TestCase):
-    """What is of the plane refuses a character that is not."""
+    """Planar tasks reject spatial characters."""
 
     @parameterized.parameters(
         ({'task': 'gait'}, "'biped3d_mocap'"),
@@ -704,7 +704,7 @@ class PlanarTaskTest(parameterized.TestCase):
 
 
 class ActionMapTest(parameterized.TestCase):
-    """What an action means."""
+    """The map from actions to controls."""
 
     @parameterized.product(name=NAMES, model=('torque', 'velocity', 'position'))
     def test_three_actions_for_every_ball_joint(self, name, model):
@@ -726,7 +726,9 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(control, mapping.action_scale * small)
         np.testing.assert_allclose(mapping.action(control), small, atol=1e-12)
         for action, row in zip(small, control, strict=True):
-            np.testing.assert_array_equal(mapping.control(action), row)  # alone as in a batch
+            np.testing.assert_array_equal(
+                mapping.control(action), row
+            )  # equal alone and in a batch
         far = mapping.control(np.full(len(mapping), 9.0))
         np.testing.assert_array_equal(far, mapping.control(np.ones(len(mapping))))
 
@@ -822,7 +824,7 @@ class AngleAxisTest(parameterized.TestCase):
         self.assertEqual(body.model.nu, FIGURES[name].sizes[0])
 
     @parameterized.parameters(
-        # Where a part begins, what it is, its value at 0 and its change per unit.
+        # First index, kind, value at action 0 and change per unit of each part.
         ('biped3d', 0, 'torso_angle', 0, 4), ('biped3d', 4, 'right_hip_angle', 0, 10.28),
         ('biped3d', 8, 'right_knee', -1.57, 6.28), ('biped3d', 9, 'right_ankle_angle', 0, 6.28),
         ('biped3d_mocap', 12, 'right_ankle_right', 0.2, 1),
@@ -925,7 +927,7 @@ class AngleAxisTest(parameterized.TestCase):
 
 
 class ServoTest(parameterized.TestCase):
-    """What the compiled actuators do."""
+    """Forces of the compiled actuators."""
 
     @parameterized.parameters(*NAMES)
     def test_position_law(self, name):
@@ -1060,7 +1062,7 @@ class ServoTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_velocity_control_comes_to_rest(self, name):
-        """Clamps of single axes do not make thin limbs shiver."""
+        """Clamps of single axes do not make thin limbs oscillate."""
         body = Floating(name, 'velocity')
         rng = np.random.default_rng(0)
         for _ in range(60):
@@ -1092,7 +1094,7 @@ class ServoTest(parameterized.TestCase):
                         norm = np.linalg.norm(data.qfrc_actuator[dof : dof + size])
                         highest[i] = max(highest[i], norm)
         np.testing.assert_array_less(highest, limits * (1 + 1e-9))
-        self.assertGreater((highest / limits).max(), 0.99)  # the limits are met
+        self.assertGreater((highest / limits).max(), 0.99)  # the limits are reached
         self.assertFalse(data.warning.number.any())
 
     @parameterized.parameters(*NAMES)

@@ -1,4 +1,4 @@
-"""Tests of planar characters: the figures of the original's character files, and physics."""
+"""Tests of planar characters: properties from the original's character files, and physics."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from trl_suite import actuation, characters
 
 GRAVITY = 9.81  # m/s^2; of MuJoCo's default, which a user's own arena has
 
-# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, limits rad as they act;
+# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, effective limits rad;
 # of the hopper's leg, which slides, N and m instead of N m and rad.
 FREE = (-np.inf, np.inf)
 BIPED_LEG = {
@@ -197,7 +197,7 @@ def to_mujoco(vector):
 
 
 def alone(name):
-    """The character compiled by itself, its root at the origin."""
+    """The character compiled alone, its root at the origin."""
     physics = mjcf.Physics.from_mjcf_model(characters.make(name).mjcf_model)
     return physics.model.ptr, physics.data.ptr
 
@@ -390,7 +390,7 @@ class FiguresTest(parameterized.TestCase):
 
 
 class CollisionTest(parameterized.TestCase):
-    """Who can touch whom, as the engine answers."""
+    """Pairs of links that can collide, according to the engine."""
 
     def touching(self, name):
         """Pairs of links (and the floor) that touch when every box is 20 m large."""
@@ -473,7 +473,7 @@ class CollisionTest(parameterized.TestCase):
 
 
 class OwnArenaTest(parameterized.TestCase):
-    """A character lives in any composer arena."""
+    """A character works in any composer arena."""
 
     def place(self, name, model, timestep=1 / 600):
         arena = users_arena(timestep)

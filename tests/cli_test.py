@@ -1,4 +1,4 @@
-"""Every command of the command line, what it prints, what it leaves, and how it fails."""
+"""Every command of the command line: its output, its files, and its errors."""
 
 import contextlib
 import dataclasses
@@ -410,13 +410,13 @@ class RolloutTest(CommandTest):
             t = dict(data)
         self.assertEqual((str(t['id']), int(t['seed'])), (GAPS, 3))
         episodes = int((t['step_types'] == 0).sum())
-        self.assertGreater(episodes, 1)  # it ran over ends of episodes
+        self.assertGreater(episodes, 1)  # it continued after ends of episodes
         self.assertLen(t['rewards'], steps + episodes)
         self.assertEqual(t['observations'].shape, (steps + episodes, 104))
         self.assertEqual(t['qpos'].shape, (steps + episodes, 14))
         self.assertLessEqual(np.abs(t['actions']).max(), 1)
         ends = np.flatnonzero(t['step_types'] == 2)
-        np.testing.assert_array_equal(t['actions'][[*ends, -1]], 0)  # nothing is done there
+        np.testing.assert_array_equal(t['actions'][[*ends, -1]], 0)  # there is no action
 
         # The recorded actions lead a fresh environment through the recorded states, bit for bit.
         environment = suite.make(GAPS, {'random': 3})
@@ -766,7 +766,7 @@ class ProgramTest(CommandTest):
             self.assert_refused("pip install 'trl_suite", 'rollout', GAPS, '--video', 'a.mp4')
 
     def test_other_errors_are_not_hidden(self):
-        # A defect of ours must keep its traceback.
+        # A bug must keep its traceback.
         with (
             mock.patch.object(listing, '_values', lambda *_: 1 / 0),
             self.assertRaises(ArithmeticError),
@@ -785,7 +785,9 @@ class ProgramTest(CommandTest):
         self.assertRegex(done.stderr, "^trl-suite: error: nothing can be drawn.* is 'disable'.*\n$")
         self.assert_only()
         done = self.program('rollout', GAPS, '--steps', '5', MUJOCO_GL='disable')
-        self.assertEqual((done.returncode, done.stderr), (0, ''))  # without pictures all is well
+        self.assertEqual(
+            (done.returncode, done.stderr), (0, '')
+        )  # without rendering there is no error
 
     def test_a_broken_library_or_a_wrong_name(self):
         done = self.program('info', GAPS, MUJOCO_GL='nonsense')
@@ -808,7 +810,7 @@ class ProgramTest(CommandTest):
 
 
 class ReadmeTest(CommandTest):
-    """What the README and the expert show."""
+    """Code and commands of the README and the guide."""
 
     text = ''.join(
         (pathlib.Path(__file__).parents[1] / name).read_text(encoding='utf-8')

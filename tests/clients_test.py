@@ -1,4 +1,4 @@
-"""Programs that use the suite through other libraries: the examples run, and get what they expect."""
+"""Programs that use the suite through other libraries: the examples run with expected results."""
 
 import contextlib
 import importlib
@@ -41,7 +41,7 @@ def output(name, *arguments):
 
 
 def run_page(word):
-    """Runs the code of docs/clients.md that has a word in it; returns its names."""
+    """Runs the code block of docs/clients.md that contains a word; returns its names."""
     page = (ROOT / 'docs' / 'clients.md').read_text(encoding='utf-8')
     (code,) = (
         found for found in re.findall('```python\n(.*?)```', page, re.DOTALL) if word in found
@@ -66,7 +66,7 @@ class GymnasiumTest(absltest.TestCase):
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
 
     def test_metadata_has_the_autoreset_mode(self):
-        """As an attribute too, as Gymnasium's own vector environments: TorchRL asks for it."""
+        """Also as an attribute, as in Gymnasium's vector environments: TorchRL reads it."""
         for mode in gymnasium.vector.AutoresetMode:
             envs = trl_suite.gym.SuiteVectorEnv(GAPS, 2, num_threads=1, autoreset_mode=mode)
             self.assertIs(envs.autoreset_mode, mode)
@@ -129,7 +129,7 @@ class TorchRLTest(parameterized.TestCase):
         self.assertFalse((rollouts[0] == rollouts[2]).all())
 
     def test_simulations_equal_those_of_the_suite(self):
-        """What a rollout over ends of episodes says, in every simulation, a single environment does."""
+        """A rollout through successive episodes equals that of single environments."""
         import torch
 
         environment = self.make(3)

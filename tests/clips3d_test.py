@@ -101,7 +101,7 @@ class ClipsTest(parameterized.TestCase):
     def test_planted_feet_do_not_slide(self, name):
         report = self.reports[name]
         self.assertLess(report.slide, SLIDE)
-        self.assertGreater(report.planted, 0.3)  # else the check above has seen nothing
+        self.assertGreater(report.planted, 0.3)  # otherwise the check above is not effective
 
     @each_clip
     def test_pace(self, name):

@@ -78,7 +78,7 @@ class ClipsTest(parameterized.TestCase):
     def test_planted_feet_do_not_slide(self, name):
         report = self.reports[name]
         self.assertLess(report.slide, SLIDE)
-        self.assertGreater(report.planted, 0.3)  # else the check above has seen nothing
+        self.assertGreater(report.planted, 0.3)  # otherwise the check above is not effective
 
     @each_clip
     def test_speed_and_period_are_those_of_the_original(self, name):
@@ -108,7 +108,7 @@ class ClipsTest(parameterized.TestCase):
 
 
 class ChecksTest(absltest.TestCase):
-    """The measurements find the faults they are for."""
+    """The checks find the corresponding faults."""
 
     def setUp(self):
         super().setUp()

@@ -1,4 +1,4 @@
-"""The commands doctor, bench, gallery and clip, and what is behind them."""
+"""The commands doctor, bench, gallery and clip, and the functions that they use."""
 
 import importlib.metadata
 import json
@@ -22,7 +22,7 @@ CommandTest, run = cli_test.CommandTest, cli_test.run
 
 class DoctorTest(CommandTest):
     def test_this_installation_runs(self):
-        """The part that everything else needs: a process of its own steps and draws."""
+        """The essential check: a separate process steps and renders an environment."""
         (found,) = doctor.self_test(())
         self.assertEqual((found.state, found.remedy), (doctor.OK, ''))
         self.assertRegex(found.text, r'runs: \d+ steps per second, first picture after \d')
@@ -35,11 +35,11 @@ class DoctorTest(CommandTest):
         self.assertEqual([f.state for f in found], [doctor.OK, doctor.FAILED, doctor.FAILED])
         self.assertEqual(found[1].remedy, "pip install 'mujoco>=99'")
         self.assertIn('no-such-thing is missing', found[2].text)
-        # What the suite itself asks for is here.
+        # All required packages are installed.
         self.assertEqual({finding.state for finding in doctor.versions()}, {doctor.OK})
 
     def test_a_failed_process_reports_its_error(self):
-        # At exit, a half-loaded library may complain at length.
+        # At exit, a partly loaded library may print long messages.
         code = 'import atexit; atexit.register(lambda: print(1 / 0)); import no_such_module'
         status, _, error = doctor._end(doctor._start(code))
         self.assertEqual(
@@ -125,7 +125,7 @@ class BenchTest(CommandTest):
             self.assertGreater(found[name], 0, name)
 
     def test_counts_physics_steps(self):
-        """Also of a gait, whose steps last differently."""
+        """Also for a gait, whose steps differ in duration."""
         self.enterContext(mock.patch.object(bench, 'WARM', 0.1))
         found = bench.vector('FSM_Hopper2D_Terrain_Gaps-v0', 2, 1, 0.05)
         self.assertGreater(found['physics'], 50 * found['control'])

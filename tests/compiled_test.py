@@ -1,4 +1,4 @@
-"""Compiled functions: what they may do, and where their machine code is kept."""
+"""Compiled functions: supported features, and the cache of their machine code."""
 
 import contextlib
 import io
@@ -92,7 +92,7 @@ def allocates(n):
 
 
 class FunctionTest(parameterized.TestCase):
-    """What compiled functions can do."""
+    """Features of compiled functions."""
 
     def test_compiled_loops_accept_packs(self):
         pair = Pair(np.array([1.0, 2.0, 3.0]), np.zeros(3))
@@ -121,7 +121,7 @@ class FunctionTest(parameterized.TestCase):
         second = np.zeros(2000)
         pack, others = packed(Pair(np.full(2000, 3.0), second)), []
         for _ in range(20):
-            others.append(np.full(2000, 7.0))  # would take the place of what was freed
+            others.append(np.full(2000, 7.0))  # would reuse freed memory
         scale_all(np.array([5]), pack)
         self.assertEqual(second[5], 1.5)
 
@@ -152,7 +152,7 @@ class FunctionTest(parameterized.TestCase):
 
 
 class CacheTest(FolderTest):
-    """The folder of the machine code, in processes of their own."""
+    """The cache folder of the machine code, in separate processes."""
 
     def setUp(self):
         super().setUp()
@@ -191,7 +191,7 @@ class CacheTest(FolderTest):
         self.assertNotEmpty(files)
         self.assertEqual(self.ask()[0], ['11.0'])
         self.assertEqual(files, {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')})
-        # Numba alone would go on with the code of `outer`, whose file is as it was.
+        # Numba alone would reuse the code of `outer`, whose file has not changed.
         self.write('x * 20.0')
         self.assertEqual(self.ask()[0], ['21.0'])
         self.assertLen(self.folders(), 2)
@@ -250,7 +250,7 @@ class CacheTest(FolderTest):
         self.assertEqual([p.exists() for p in (old, new, other)], [False, True, True])
 
     def test_foreign_types_are_not_cached(self):
-        """Who has not the module of a type could not read the list in which it is."""
+        """A process without the module of a type could not read the index that contains it."""
         (self.folder / 'foreign.py').write_text(TUPLE.format('Foreign'))
         (self.package / 'own.py').write_text(TUPLE.format('Own') + FIRST)
         self.ask(f'{PACKED} from foreign import Foreign; print(first(packed(Foreign(np.ones(2)))))')
@@ -313,7 +313,7 @@ class CacheTest(FolderTest):
 
 
 class DisabledTest(parameterized.TestCase):
-    """Environments return the same numbers where their rules run as Python."""
+    """Environments return the same numbers if their rules run as Python."""
 
     SCRIPT = """
         import hashlib, sys

@@ -1,4 +1,4 @@
-"""Tests of the gait state machines: figures, dynamics, laws and transitions, by other means."""
+"""Tests of the gait state machines: parameters, dynamics, laws and transitions, recomputed."""
 
 import mujoco
 import numpy as np
@@ -82,7 +82,7 @@ SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
 
 
 class ParametersTest(parameterized.TestCase):
-    """Vectors, base actions, and what an action means."""
+    """Parameter vectors, base actions, and the map from actions to parameters."""
 
     def test_characters_with_a_gait(self):
         self.assertCountEqual(controllers.available(), NAMES)
@@ -127,11 +127,11 @@ class ParametersTest(parameterized.TestCase):
         gait = controllers.load(name)
         actions = gait.action(gait.base_actions)
         self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
-        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # none is out of reach
+        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # all are within [-1, 1]
         found = gait.vector(np.clip(actions, -1, 1))
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
-    def test_action_0_is_a_base_action(self):
+    def test_action_0_is_the_default_gait(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
         np.testing.assert_array_equal(dog.action_offset, dog.base_actions[0])
         np.testing.assert_array_equal(hopper.action_offset, hopper.base_actions[0])
@@ -213,7 +213,7 @@ class Rig:
             model = light_model(arena.mjcf_model)
             self.world = BatchWorld(model, n, 1, dynamics.FIELDS)
         else:
-            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # must be kept alive
+            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # keeps it alive
             self.world = PhysicsWorld(self.physics, dynamics.FIELDS)
         arena.bind(self.world)
         self.gait.bind(self.world)
@@ -251,7 +251,7 @@ class Rig:
         self.world.forward(self.env_ids)
 
     def touches(self, links):
-        """Makes the gait believe in contacts until the next step: names of links, or (n, L) bool."""
+        """Overrides contacts until the next step: names of links, or (n, L) bool."""
         on = np.isin(self.character.spec.links, links) if isinstance(links, tuple) else links
         first, sensed = self.rules.machine.contact, self.world.sensordata
         if isinstance(self.world, BatchWorld):
@@ -278,7 +278,7 @@ class Rig:
 
 
 def enter(rig):
-    """Has all machines enter the states that they are in."""
+    """Calls the state entry of the current states of all machines."""
     for env_id in rig.env_ids:
         machine.enter(env_id, rig.rules)
 
@@ -439,7 +439,7 @@ class DynamicsTest(parameterized.TestCase):
 
 
 class LawTest(parameterized.TestCase):
-    """What acts on the joints, against the formulas."""
+    """Joint torques against the formulas."""
 
     @parameterized.product(name=NAMES, batch=(False, True))
     def test_stable_pd(self, name, batch):
@@ -644,7 +644,7 @@ class LawTest(parameterized.TestCase):
 
 
 class MachineTest(parameterized.TestCase):
-    """When states end, and what follows."""
+    """Transitions of states."""
 
     def leave(self, rig, state, links, phase=0.0):
         """Puts the machine into a state, advances it once, and returns (state, cycle's end)."""
@@ -679,7 +679,7 @@ class MachineTest(parameterized.TestCase):
                     ends = late if state < 3 else swing_foot in links
                     expected = (min(state + 1, 3), state == 3) if ends else (state, False)
                     self.assertEqual(self.leave(rig, state, links, phase), expected)
-                    # The legs change places with the cycle, before anybody looks.
+                    # The legs are exchanged with the cycle, before any query.
                     self.assertEqual(
                         rig.gait.state.stance[0], 1 - stance if expected[1] else stance
                     )
@@ -811,7 +811,7 @@ def run(rig, steps):
 
 
 class AloneTest(parameterized.TestCase):
-    """A gait needs no environment of the suite."""
+    """A gait works without an environment of the suite."""
 
     def test_a_dog_on_a_floor_of_dm_control(self):
         arena, dog = floors.Floor(), characters.make('dog')

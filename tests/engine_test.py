@@ -1,4 +1,4 @@
-"""Simulations as arrays: what the engine does is what MuJoCo does."""
+"""Simulations as arrays: results of the engine equal those of MuJoCo."""
 
 import pathlib
 import tempfile
@@ -57,7 +57,7 @@ def state_of(model, data):
 
 
 class StepTest(parameterized.TestCase):
-    """A step is `mj_step` as often as asked."""
+    """A step is `mj_step`, repeated."""
 
     def raw(self, ctrl):
         """States, and what is computed from them, after plain steps of MuJoCo."""
@@ -157,7 +157,7 @@ class StepTest(parameterized.TestCase):
 
 
 class StateTest(parameterized.TestCase):
-    """States that are saved and restored, and simulations that break down."""
+    """States that are saved and restored, and simulations that diverge."""
 
     def worlds(self):
         return PhysicsWorld(mjcf.Physics.from_xml_string(XML)), BatchWorld(model(), 2, 1)
@@ -199,7 +199,7 @@ class StateTest(parameterized.TestCase):
             world.step(SUBSTEPS)
             np.testing.assert_array_equal(world.diverged(), [True, False][: world.n])
             self.assertTrue(world.any_diverged())
-            world.step(SUBSTEPS)  # MuJoCo has put it back; it stays known as diverged
+            world.step(SUBSTEPS)  # MuJoCo has reset it; it remains marked as diverged
             self.assertTrue(world.diverged()[0])
             world.set_state(0, good)
             self.assertFalse(world.any_diverged())
@@ -211,7 +211,7 @@ class StateTest(parameterized.TestCase):
 
 
 class NamesTest(parameterized.TestCase):
-    """Where things are, by name."""
+    """Ids and addresses by name."""
 
     def test_ids_and_addresses(self):
         world = BatchWorld(model(), 1, 1)

@@ -17,7 +17,7 @@ from trl_suite.tasks.imitation.planar import PlanarImitation
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
 SMALL_BIPED = (7, 6, 16)  # of the Imitation family
 GAIT_LINKS = {'Dog2D': 21, 'Goat2D': 21, 'Raptor2D': 19, 'Biped2D': 7, 'Hopper2D': 3}
-# Sizes as the original's papers and programs have them.
+# Sizes in the original's papers and programs.
 SIZES = {
     'PD_Biped2D_Gaps_Terrain-v0': (104, 11), 'PD_Dog2D_Steps_Terrain-v0': (140, 20),
     'PD_Raptor2D_Walls_Terrain-v0': (132, 18), 'PD_Biped2D_Flat-v0': (54, 11),
@@ -112,7 +112,7 @@ def expected_blocks(id_):
 
 def random_actions(environment, steps, seed=0):
     spec = environment.action_spec()
-    # Of wilder gaits many a cycle lasts until it is cut, which takes long.
+    # Many cycles of random gaits last until truncation, which takes long.
     scale = 0.3 if hasattr(environment.task, 'gait') else 1.0
     return scale * np.random.default_rng(seed).uniform(
         spec.minimum, spec.maximum, (steps, *spec.shape)
@@ -132,10 +132,10 @@ def rollout(environment, actions):
 
 
 def every_environment(id_):
-    """What holds for all environments, dm_env's own tests among it, for one of them.
+    """Tests of one environment that apply to all, including those of dm_env.
 
-    It is built once for all tests, as building takes most of the time; a seed brings it back to
-    where a new one begins.
+    It is built once for all tests, as building takes most of the time; seeding restores the state
+    of a new one.
     """
     gait, high = is_gait(id_), is_high(id_)
 
@@ -156,7 +156,7 @@ def every_environment(id_):
                 cls.kept.popitem()[1].close()
 
         def made(self, seed, flat=False, step_limit=256):
-            """The environment, seeded anew, before the first reset of that seed."""
+            """The environment, newly seeded, before its first reset."""
             if flat not in self.kept:
                 self.kept[flat] = suite.make(id_, {'random': seed}, {'flat_observation': flat})
             environment = self.kept[flat]
@@ -164,7 +164,7 @@ def every_environment(id_):
             environment._step_limit = step_limit
             return environment
 
-        # By another name, so that it comes first: then the environment is fresh.
+        # Renamed so that it runs first: then the environment is fresh.
         test_a_step_on_fresh_environment = (
             test_utils.EnvironmentTestMixin.test_step_on_fresh_environment
         )
@@ -179,7 +179,7 @@ def every_environment(id_):
             absltest.TestCase.tearDown(self)  # the mixin's closes the environment
 
         def make_action(self):
-            # dm_env's is the least that is allowed: of such a gait a cycle lasts until it is cut.
+            # dm_env uses the minimum: with such an action, a cycle of a gait lasts until truncation.
             return np.zeros(self.environment.action_spec().shape) if gait else super().make_action()
 
         def make_action_sequence(self):
@@ -211,7 +211,7 @@ def every_environment(id_):
                 self.assertEqual(environment.action_spec().shape, (action,))
 
         def test_random_rollout_is_finite_with_rewards_in_0_to_1(self):
-            # A walker that is told nonsense may well stay up: its episode is cut.
+            # A walker with random plans may not fall: its episode is truncated.
             self.wander(*((6, 4) if gait else (16, 12) if high else (200, 256)))
 
         @pytest.mark.slow
@@ -230,7 +230,9 @@ def every_environment(id_):
             self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
             self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
             last = np.array([each is dm_env.StepType.LAST for each in types])
-            self.assertTrue(last.any())  # random actions fall, or the episode is cut
+            self.assertTrue(
+                last.any()
+            )  # random actions lead to a fall, or the episode is truncated
             np.testing.assert_array_equal(rewards[discounts == 0], 0)
             np.testing.assert_array_equal(last[discounts == 0], True)
 
@@ -240,7 +242,7 @@ def every_environment(id_):
             for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
                 np.testing.assert_array_equal(ours, theirs)
 
-        if not gait and not high:  # these run their physics by themselves: see gait_test, and below
+        if not gait and not high:  # these step their physics in the task: see gait_test, and below
 
             def test_plain_composer_environment_agrees(self):
                 ours = self.made(3)
@@ -516,7 +518,7 @@ class DivergenceTest(parameterized.TestCase):
 
 
 class ObservableTest(parameterized.TestCase):
-    """A user's own observables beside the blocks."""
+    """A user's own observables in addition to the blocks."""
 
     def build(self, **options):
         spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')

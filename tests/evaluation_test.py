@@ -55,7 +55,9 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual(found['lengths'], lengths)
         self.assertEqual(found['distances'], distances)
         self.assertEqual(found['fell'], fell)
-        self.assertGreater(len(set(lengths)), 1)  # some rows went on while others had ended
+        self.assertGreater(
+            len(set(lengths)), 1
+        )  # some simulations continued after others had ended
 
     def test_clip_actions_equal_those_of_single_environments(self):
         id_ = 'PD_Raptor2D_LLC_Imitate_Flat-v0'
@@ -68,7 +70,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
 
     def test_gaits(self):
-        """Rows whose steps last differently."""
+        """Simulations whose steps differ in duration."""
         spec = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
         found = evaluation.evaluate(spec, evaluation.zero, 3, 5, factory=True)
         returns, lengths, distances, fell, _ = alone(

@@ -40,7 +40,7 @@ class JobsTest(parameterized.TestCase):
                 self.assertIn(start, seen, id_)
             seen.add(id_)
 
-    def test_initial_policies_have_the_actions_of_their_successors(self):
+    def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
         for id_ in catalogue.BY_ID:
             start = ppo_settings.settings_for(id_).start
@@ -136,7 +136,7 @@ class PlansTest(absltest.TestCase):
 
 
 class ExpertTest(parameterized.TestCase):
-    """Who shows policies how to plan footsteps."""
+    """The expert for footstep plans."""
 
     def test_a_trail(self):
         trail = SimpleNamespace(
@@ -178,7 +178,7 @@ class ExpertTest(parameterized.TestCase):
 
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
     def test_expert_arrives_on_difficult_ground(self, name):
-        """20 s of 8 episodes, towards goals at the least speed that is asked of who has learnt it."""
+        """20 s of 8 episodes, towards goals at the least speed required of trained policies."""
         environments = VectorEnvironment(
             f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled'
         )

@@ -49,7 +49,7 @@ def walked(n, switches, **options):
 
 
 class ClockTest(parameterized.TestCase):
-    """Clock and clip agree on who stands."""
+    """Clock and clip agree on the stance foot."""
 
     @parameterized.parameters(
         (0.0, [15, 30, 45, 60, 75, 90]), (0.1, [12, 27, 42]), (0.6, [12, 27, 42])
@@ -65,7 +65,7 @@ class ClockTest(parameterized.TestCase):
             self.assertEqual(environment.info['landed'], task.plan.stance[0] != before)
             right = (phase + i / 30 + 1e-9) % 1 < 0.5
             self.assertEqual(task.plan.stance[0], RIGHT if right else LEFT)
-            # What is observed says the same.
+            # The observation agrees.
             self.assertEqual(step.observation['phase'][0] < 0.5, right)
             self.assertEqual(step.observation['phase'][1:3].any(), right)
         self.assertEqual(found, expected)
@@ -95,7 +95,7 @@ class ClockTest(parameterized.TestCase):
 
 
 class PlanTest(parameterized.TestCase):
-    """How plans are drawn and seen."""
+    """How plans are drawn and observed."""
 
     @parameterized.parameters(0.0, 0.2, 0.5, 0.8)
     def test_the_first_plan(self, phase):
@@ -125,7 +125,7 @@ class PlanTest(parameterized.TestCase):
         changed = np.abs(np.diff(lengths, axis=0)) > 1e-9
         deviation = np.sqrt(change * (1 - change) / changed.size)
         self.assertAlmostEqual(changed.mean(), change, delta=4 * deviation)
-        self.assertGreater(np.ptp(lengths[0]), 0.2)  # drawn anew at every start
+        self.assertGreater(np.ptp(lengths[0]), 0.2)  # redrawn at every start
 
     @parameterized.parameters(0.0, 0.3, 0.5, 0.9)
     def test_plan_slots(self, phase):
@@ -279,7 +279,7 @@ class RewardTest(parameterized.TestCase):
 
 
 class LandingTest(parameterized.TestCase):
-    """How well a foot met its place, and what a miss does."""
+    """The landing error, and the end of an episode by a miss."""
 
     @parameterized.parameters(0.3, 0.8)
     def test_landing_error(self, phase):
@@ -333,7 +333,7 @@ class LandingTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """Seeds decide; state and pickles go on bit for bit; many simulations are single ones."""
+    """Seeds, saved states and pickles are exact; simulations equal single environments."""
 
     def advance(self, environment, seed):
         task = environment.task

@@ -48,7 +48,7 @@ def held(environment):
 
 
 def walked(n, switches, id_=GENERAL, **options):
-    """The plans of n walkers who stand still while their clocks run: what plans are made of.
+    """The plans of n walkers that stand still while their clocks run: distributions of plans.
 
     Returns:
       A list over the switches: landing places before and after, headings before and after, stance
@@ -69,7 +69,7 @@ def walked(n, switches, id_=GENERAL, **options):
 
 
 class ClockTest(parameterized.TestCase):
-    """The clock says who stands."""
+    """The clock determines the stance foot."""
 
     @parameterized.parameters(
         (GENERAL, 0.0, [15, 30, 45, 60]), (GENERAL, 0.1, [12, 27, 42, 57]),
@@ -148,7 +148,7 @@ class PlanTest(parameterized.TestCase):
 
     @parameterized.parameters(0.0, 0.2, 0.5, 0.8)
     def test_the_first_plan(self, phase):
-        # Along +x, the feet on lines half a width beside the start.
+        # Along +x, the feet on lines half a width from the line of the start.
         environment, _ = started(start_phase=phase)
         task, feet = environment.task, ankles(environment)
         stance = RIGHT if phase < 0.5 else LEFT
@@ -206,7 +206,7 @@ class PlanTest(parameterized.TestCase):
         self.assertAlmostEqual(turns.mean(), 0.0, delta=0.1 * 4 / np.sqrt(turns.size))
 
     def ways(self, found):
-        """Lengths and widths of the steps that were laid, (switches, n) each."""
+        """Lengths and widths of the planned steps, (switches, n) each."""
         lengths, widths = [], []
         for _, _, after, heading, stance in found:
             x, y = (after[:, 1] - after[:, 0])[:, :2].T
@@ -231,7 +231,7 @@ class PlanTest(parameterized.TestCase):
         changed = np.abs(np.diff(lengths, axis=0)) > 1e-9
         deviation = np.sqrt(change * (1 - change) / changed.size)
         self.assertAlmostEqual(changed.mean(), change, delta=4 * deviation)
-        self.assertGreater(np.ptp(lengths[0]), 0.3)  # drawn anew at every start
+        self.assertGreater(np.ptp(lengths[0]), 0.3)  # redrawn at every start
 
     def test_plans_made_from_the_root(self):
         environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
@@ -250,7 +250,7 @@ class PlanTest(parameterized.TestCase):
         assert_uniform(widths, 0.08 - 1e-9, 0.28 + 1e-9)
         turns = np.ravel(turns)
         self.assertLessEqual(np.abs(turns).max(), 1.2 + 1e-9)
-        # N(0, 0.45) cut at 1.2, which is 2.67 deviations.
+        # N(0, 0.45) truncated at 1.2, which is 2.67 deviations.
         self.assertAlmostEqual(turns.std(), 0.448, delta=0.045)
         self.assertBetween(np.mean(np.abs(turns) > 1.2 - 1e-6), 0.0, 0.025)
 
@@ -272,7 +272,7 @@ class PlanTest(parameterized.TestCase):
             step = environment.reset()
             for _ in range(6):
                 x, y, z = task.landing[0].T
-                # Height grids are kept in single precision.
+                # Height grids are stored in single precision.
                 np.testing.assert_allclose(z, ground(environment, x, y), atol=1e-6)
                 root = body(environment, 'xpos', 'root')
                 slots = step.observation['plan'][:12].reshape(2, 2, 3)
@@ -544,7 +544,7 @@ class RewardTest(parameterized.TestCase):
 
 
 class LandingTest(parameterized.TestCase):
-    """How well a foot met its place, and what a miss does."""
+    """The landing error, and the end of an episode by a miss."""
 
     @parameterized.parameters((GENERAL, 0.3), (GENERAL, 0.8), (MIRRORED, 0.3), (BUMPS, 0.3))
     def test_landing_error(self, id_, phase):
@@ -738,7 +738,7 @@ class PushTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         (GENERAL, {}), (TRAIL, {'terrain_observation': 'height'}), (MIRRORED, {'plans': {'from_root': 0.5}}),

@@ -1,4 +1,4 @@
-"""Tests of the gait task: observation, reward, falls and cycles, recomputed by other means."""
+"""Tests of the gait task: observation, reward, falls and cycles, recomputed independently."""
 
 import ctypes
 import dataclasses
@@ -13,7 +13,7 @@ from trl_suite import controllers, suite, terrain
 from trl_suite.engine import native
 from trl_suite.vector import VectorEnvironment
 
-# One of each character, on ground of which much is seen.
+# One of each character, on ground with many features in view.
 DOG, GOAT = 'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 RAPTOR, BIPED = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0'
 HOPPER = 'FSM_Hopper2D_Terrain_Mixed_Easy-v0'
@@ -72,7 +72,7 @@ def around_physics(environment, before=None, after=None):
     }
     for number, call in calls.items():
         functions[number] = ctypes.cast(call, ctypes.c_void_p).value
-    environment.calls = calls  # must be kept alive
+    environment.calls = calls  # keeps it alive
 
 
 class Probe:
@@ -266,7 +266,7 @@ class RewardTest(parameterized.TestCase):
 
     @parameterized.parameters(*EXAMPLES)
     def test_rollout(self, id_):
-        """Speed and stumbling from what the engine did in between."""
+        """Speed and stumbling, recomputed from the engine's substeps."""
         environment = make(id_, seed=1)
         probe, stumbles = Probe(environment), []
         self.assertEqual(environment.physics.timestep(), 1 / 1200)
@@ -365,13 +365,13 @@ class FallTest(parameterized.TestCase):
         adrift.contacts = lambda time: ('head',) if 0.05 < time < 0.35 else ()
         self.assertIsNone(adrift.lasts(3.0))
         adrift = Adrift(DOG, velocity=(1, 0, 0))
-        # Between two samples nobody looks.
+        # Between two samples, contacts have no effect.
         adrift.contacts = lambda time: ('head',) if 0.02 < time % 0.1 < 0.08 else ()
         self.assertIsNone(adrift.lasts(3.0))
         self.assertGreater(adrift.environment.info['stumbled'], 0.9)
 
     @parameterized.parameters((3, True), (4, True), (5, False))
-    def test_repeated_contacts_are_a_fall(self, every, falls):
+    def test_a_large_share_of_contacts_is_a_fall(self, every, falls):
         adrift = Adrift(DOG, velocity=(1, 0, 0))
         adrift.contacts = lambda time: () if round(time * 10) % every else ('head',)
         share, expected = 0.0, None
@@ -416,7 +416,7 @@ class FallTest(parameterized.TestCase):
             info = adrift.environment.info
             self.assertEqual((info['fell'], info['stuck'], info['diverged']), (False, True, False))
             self.assertEqual(float(adrift.environment.task.reward[0]), 0.0)
-        # Up counts as well, and every 5 s anew.
+        # Vertical motion counts as well; the window restarts every 5 s.
         adrift = Adrift(RAPTOR, velocity=(0, 0.2, 0))
         self.assertIsNone(adrift.lasts(6.0))
         adrift.environment.physics.data.qvel[:] = 0
@@ -580,7 +580,7 @@ class BaseActionTest(parameterized.TestCase):
 
 
 class OptionTest(parameterized.TestCase):
-    """What makes no sense is refused."""
+    """Invalid options are rejected."""
 
     @parameterized.parameters(
         ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
@@ -646,7 +646,7 @@ class GaitTest(parameterized.TestCase):
 
 
 class StateTest(parameterized.TestCase):
-    """Save anywhere, go on bit for bit."""
+    """States saved at any step continue bit for bit."""
 
     @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
     def test_save_restore_and_pickle(self, id_, interface):

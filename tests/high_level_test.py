@@ -1,4 +1,4 @@
-"""Tests of the tasks above a footstep controller: clock, plans, rewards, goals, ball, controllers."""
+"""Tests of hierarchical navigation: clock, plans, rewards, goals, ball, controllers."""
 
 import contextlib
 import dataclasses
@@ -63,7 +63,7 @@ def turned(way, angle):
 
 
 def carry(environment, away=(0, 0, 0), yaw=0.0):
-    """Moves the walker by a way, and turns it about its root."""
+    """Moves the walker by a displacement, and rotates it about its root."""
     task, data = environment.task, environment.physics.data
     pose = data.qpos[task.figure.pose_qpos]
     pose[:3] += away
@@ -153,7 +153,7 @@ class ClockTest(parameterized.TestCase):
 
 
 class PlanTest(parameterized.TestCase):
-    """What an action means."""
+    """The map from actions to plans."""
 
     def test_native_mapping(self):
         action_map = started()[0].action_map
@@ -178,7 +178,7 @@ class PlanTest(parameterized.TestCase):
             for which, way in enumerate((plan[:2], plan[2:4])):
                 place = task.landing[0, which]
                 np.testing.assert_allclose(place[:2], root[:2] + turned(way, heading), atol=1e-9)
-                # Height grids are kept in single precision.
+                # Height grids are stored in single precision.
                 height = float(ground(environment, *place[:2]))
                 self.assertAlmostEqual(place[2], height, delta=1e-5)
             self.assertLess(angle_between(task.heading[0], heading + plan[4]), 1e-9)
@@ -304,7 +304,7 @@ class FallTest(parameterized.TestCase):
         task, share = environment.task, 0.0
         for i, touch in enumerate(samples, 1):
             share = 0.9 * share + int(touch) / 11
-            self.assertEqual(share > 0.25, i == fall)  # the case is what it says
+            self.assertEqual(share > 0.25, i == fall)  # the case is as described
         height = environment.physics.data.qpos[task.figure.pose_qpos[2]]
 
         def place():
@@ -396,7 +396,7 @@ class GoalTest(parameterized.TestCase):
                     begun[env_id] = 0.5 * i
                 before = task.goal.copy()
         self.assertGreaterEqual(len(lasted), 2 * n)
-        # 50 to 100 s, looked at every half second.
+        # 50 to 100 s, checked every half second.
         assert_uniform(lasted, 50.0, 100.5)
         self.assertEqual(task.goals.reached.max(), 0)
 
@@ -412,7 +412,7 @@ class GoalTest(parameterized.TestCase):
 
 
 class MapTest(parameterized.TestCase):
-    """What is seen of the ground: lines from the left to the right, along them ahead."""
+    """Observed ground: lines from left to right, samples of a line from behind to ahead."""
 
     POINTS = (
         np.tile(np.linspace(-1, 10, 32), 32),
@@ -427,7 +427,7 @@ class MapTest(parameterized.TestCase):
         expected = ground(environment, x, y) - ground(environment, *root[:2])
         np.testing.assert_allclose(step.observation['terrain'], expected, atol=1e-5)
         if id_ == FOREST:
-            self.assertBetween(step.observation['terrain'].max(), 2, 8)  # pillars are seen
+            self.assertBetween(step.observation['terrain'].max(), 2, 8)  # pillars are in view
 
     @parameterized.parameters((BELTS, (3, 5), 0.4), (WIDE, (3, 8), 0.6))
     def test_velocities_beside_a_belt(self, id_, belt, speed):
@@ -490,7 +490,7 @@ class BallTest(parameterized.TestCase):
     def test_a_kicked_ball_rolls(self):
         environment, _ = started(SOCCER)
         task = environment.task
-        carry(environment, (0, 20, 0))  # out of the way
+        carry(environment, (0, 20, 0))  # away from the ball
         put_ball(environment, (0, 0, 0.2), (3, 0, 0))
         place = []
         for _ in range(30):
@@ -910,11 +910,11 @@ class ScriptedTest(parameterized.TestCase):
         moving = np.stack([0.4 * wall.ravel(), np.zeros(1024)])[None].reshape(1, 2048)
         found, _ = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
         self.assertLess(found[0], -0.3)
-        # What lies behind the goal is in nobody's way.
+        # Obstacles behind the goal do not block the path.
         near, room = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
         np.testing.assert_allclose(near, 0)
         np.testing.assert_array_equal(room, np.inf)
-        # Where there is no way at all, it is told how far one gets.
+        # If there is no free path, the result is the free distance.
         around = (np.hypot(x, y) > 1.7).reshape(1, 1024)
         everywhere = {'terrain': 2.0 * around}
         _, room = scripted.free_way(everywhere, np.zeros(1), np.full(1, 8.0))
@@ -968,7 +968,7 @@ class ScriptedTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         *((id_, {}) for id_ in IDS), (SOCCER, {'interface': 'frame'}),

@@ -1,4 +1,4 @@
-"""Tests of imitation in three dimensions: observation, reward and start, recomputed by other means."""
+"""Tests of three-dimensional imitation: observation, reward and start, recomputed independently."""
 
 import mujoco
 import numpy as np
@@ -147,7 +147,7 @@ class ObservationTest(parameterized.TestCase):
         environment, step = started(id_, steps, terrain_observation='height')
         self.assertEqual(list(step.observation)[:3], ['terrain', 'pose', 'velocity'])
         for name, value in Probe(environment).blocks().items():
-            # Height grids are kept in single precision.
+            # Height grids are stored in single precision.
             delta = 1e-6 if name == 'terrain' or id_ == HILLS else 1e-9
             np.testing.assert_allclose(
                 step.observation[name], value, rtol=0, atol=delta, err_msg=name
@@ -432,7 +432,7 @@ class StartTest(parameterized.TestCase):
         for _ in range(3):
             self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-9)
             step = environment.reset()
-        # The ground is drawn anew, and is the same whether the phase is drawn or given.
+        # The ground is redrawn, and does not depend on whether the phase is drawn or given.
         grounds = []
         for options in ({}, {'start_phase': 0.6}):
             other = suite.make(HILLS, {'random': 5, **options})
@@ -510,7 +510,7 @@ class EpisodeTest(parameterized.TestCase):
 
 
 class MovingGroundTest(parameterized.TestCase):
-    """Belts carry what stands on them, and velocities are against them."""
+    """Belts carry characters, and observed velocities are relative to them."""
 
     def test_velocity_against_the_belt(self):
         environment = suite.build(
@@ -535,7 +535,7 @@ class MovingGroundTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         (HILLS, {'terrain_observation': 'height'}), (STEPS, {'mirrored': True, 'terrain_observation': 'height'}),

@@ -1,4 +1,4 @@
-"""Tests of the imitation task: observation, reward and reset, recomputed by other means."""
+"""Tests of the imitation task: observation, reward and reset, recomputed independently."""
 
 import mujoco
 import numpy as np
@@ -396,7 +396,7 @@ class ResetTest(parameterized.TestCase):
             with self.assertRaisesRegex(ValueError, 'start_phase is'):
                 suite.make(BIPED, {'start_phase': bad})
 
-    def test_a_range_of_start_phases(self):
+    def test_ranges_of_start_phases(self):
         pairs = ((0.1, 0.2), (0.5, 0.8))
         specs = VectorEnvironment(BIPED, 400, 1, 5, task_kwargs={'start_phase': pairs})
         specs.reset()

@@ -1,4 +1,4 @@
-"""Tests of going from goal to goal without hierarchy: observation, reward, goals, ball, the original."""
+"""Tests of direct navigation: observation, reward, goals, ball, the original."""
 
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -114,7 +114,7 @@ class RewardTest(parameterized.TestCase):
         set_goal(environment, 10.0)
         found = terms(environment)
         for name, (weight, _) in rewards.DIRECT_TERMS.items():
-            # Heading and way differ by what the pelvis turns in a step.
+            # Heading and path differ by the rotation of the pelvis in a step.
             least = 0.0 if name == 'proximity' else 0.95 * weight
             self.assertBetween(found[name], least, weight + 1e-12, name)
         self.assertAlmostEqual(
@@ -141,7 +141,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(found['proximity'], expected, delta=1e-9)
 
     def test_a_ball_that_rolls_to_its_goal(self):
-        """Half of the reward is the ball's: its speed along the way to the goal counts from 0 on."""
+        """Half of the reward is for the ball: its speed towards the goal, from 0."""
         environment, _ = started(SOCCER)
         task = environment.task
         action = task.clip_action(0)

@@ -1,4 +1,4 @@
-"""Q-learning over base actions: transitions, retries, the policy that comes out, going on exactly."""
+"""Q-learning over base actions: transitions, retries, the exported policy, exact resumption."""
 
 import dataclasses
 import pathlib

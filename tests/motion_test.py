@@ -121,7 +121,7 @@ class SamplingTest(parameterized.TestCase):
         heading = quaternion.heading(first[3:7]) + cycles * turn
         gap = quaternion.heading(found[:, 3:7]) - heading
         np.testing.assert_allclose(np.exp(1j * gap), 1, atol=1e-9)
-        # On the circle for ever, but for the sag between frames; the climb goes on.
+        # Stays on the circle, except for linear interpolation between frames; the climb accumulates.
         np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 1]), 2, atol=5e-3)
         np.testing.assert_allclose(found[:, 2], 1.03 + 0.1 * cycles, atol=1e-9)
         np.testing.assert_allclose(found[:, 7:], [first[7:]] * 6, atol=1e-12)
@@ -552,7 +552,7 @@ class ReaderTest(parameterized.TestCase):
 
     def test_a_file_of_the_original_form(self):
         # Tabs and blank lines; pitch +90 deg about z (up turns back), then past 180 with the
-        # quaternion's sign turned; hinge signs are kept.
+        # quaternion's sign inverted; hinge signs are kept.
         half = np.sqrt(0.5)
         self.path.write_text(
             '{\n\t"Loop": true,\n\n"Frames":\t[\n'
@@ -580,7 +580,7 @@ class ReaderTest(parameterized.TestCase):
         np.testing.assert_allclose(clip.poses[:, 2], pitch, atol=1e-9)
 
     def test_rotates_the_frame(self):
-        # Up is y and right is z in the file: yaw about its y is yaw about our z, and so on.
+        # Up is y and right is z in the file: yaw about its y is yaw about z here, and so on.
         turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
         frame = [0.1, 1, 2, 3, *wxyz(turn), *wxyz(turn)]
         self.write([frame, frame])

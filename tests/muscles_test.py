@@ -88,7 +88,7 @@ SETS = (  # a muscle of each set that was optimised for a motion
     ('dog', 'bound', 'back_toe1', 0.05, 0.15, 1000, {'toe': (0.037, 0.0708, -0.4492)}),
 )  # fmt: skip
 COUNTS = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
-# How many muscles span each joint; the last tail units are told apart by the joint they span.
+# How many muscles span each joint; the last tail units have the joint that they span in their names.
 SPANS = {
     'dog': {'shoulder': 4, 'elbow': 4, 'hip': 4, 'knee': 4, 'ankle': 3, 'toe': 2, 'tail3': 2},
     'raptor': {'right_hip': 4, 'left_knee': 4, 'left_ankle': 3, 'spine3': 2, 'tail4': 2},

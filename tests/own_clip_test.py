@@ -1,4 +1,4 @@
-"""Motions of the user's own: files in four formats, carried over, cut to a cycle, checked."""
+"""Users' own motions: files in four formats, retargeted, cut to a cycle, checked."""
 
 import contextlib
 import dataclasses
@@ -17,13 +17,15 @@ from trl_suite.motion import quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.retargeting import clip_check
 
-FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # ours from a file with y up, z forward
+FILE_AXES = np.array(
+    [[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]
+)  # to the suite's frame, from y up, z forward
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
 
 
 def in_file(rotation):
-    """A rotation of ours in a file's frame."""
+    """Converts a rotation to a file's frame."""
     return Rotation.from_matrix(FILE_AXES.T @ rotation.as_matrix() @ FILE_AXES)
 
 
@@ -165,7 +167,7 @@ class FolderTest(parameterized.TestCase):
 class ReadingTest(FolderTest):
     @parameterized.parameters('ZXY', 'XYZ', 'ZYX')
     def test_bvh_round_trip(self, order):
-        """A walk of ours, arms at rest sideways, in centimetres, y up."""
+        """A shipped walk, arms at rest sideways, in centimetres, y up."""
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
         write_bvh(figure, self.folder / 'walk.bvh', order)
         capture = retargeting.read(self.folder / 'walk.bvh', FULL)
@@ -212,7 +214,12 @@ class ReadingTest(FolderTest):
         walk, angle = motion.load('biped3d_mocap_walk'), 0.3
         frame = [0.1, 0, 0.9, 0, 1, 0, 0, 0]
         for name, size in motion.HUMANOID3D.items():
-            bent = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # about their z, our -y
+            bent = [
+                np.cos(angle / 2),
+                0,
+                0,
+                np.sin(angle / 2),
+            ]  # about z of the file, -y of the suite
             value = [angle if name == 'left_knee' else 0] if size == 1 else [1, 0, 0, 0]
             frame += bent if name in ('chest', 'right_hip') else value
         ahead = [*frame[:1], 0.5, *frame[2:]]
@@ -231,7 +238,7 @@ class ReadingTest(FolderTest):
             np.testing.assert_allclose(
                 clip.poses[:, column : column + len(expected)], [expected] * 2, atol=1e-12
             )
-        # The root as high as ours stands, and what it travels in proportion.
+        # The height of the root is that of the character; displacements scale with it.
         size = KinematicViewer(PLAIN).standing()[2] / 0.9
         np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
 
@@ -276,7 +283,7 @@ class RetargetTest(FolderTest):
         own, _ = clip.layout.starts('left_shoulder')  # hangs, though it was sideways at rest
         np.testing.assert_allclose(clip.poses[:, own], 0, atol=0.2)
         self.assertGreater(clip.speed, 0.8 * source.speed)
-        # Who turns around on the way moves its joints all the same.
+        # A rotation of the whole motion does not change joint angles.
         ramp = Rotation.from_euler('z', np.linspace(0, 3, 31)[:, None])
         figure.local[0] = ramp * figure.local[0]
         write_bvh(figure, self.folder / 'turn.bvh')
@@ -418,7 +425,7 @@ class CheckTest(parameterized.TestCase):
 
 
 class ImitationTest(FolderTest):
-    def test_it_can_be_imitated(self):
+    def test_a_cycle_can_be_imitated(self):
         """From a file to an environment."""
         walk = motion.load('biped2d_full_walk')
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 41)

@@ -96,7 +96,7 @@ class CharacterTest(Folder):
         foot = '<link name="foot"/><joint name="f" type="fixed"><parent link="leg"/><child link="foot"/><origin xyz="0 0 -.4"/></joint></robot>'
         path = self.write(URDF.replace('</robot>', foot), 'two.urdf')
         spec = characters.from_file(path, **{**TWO, 'end_effectors': ('foot',)})
-        self.assertEqual(spec.links, ('trunk', 'leg'))  # what has no mass is no link
+        self.assertEqual(spec.links, ('trunk', 'leg'))  # massless bodies are not links
         suite.build(spec, task='walk').reset()
 
     def test_actuators_key_frame_and_defaults(self):
@@ -390,7 +390,7 @@ class TerrainTest(Folder):
         ground = terrain.SpatialGround(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2), 0)
         self.assertAlmostEqual(float(ground.height(0.4, 0.4)), 2)
         self.assertAlmostEqual(float(ground.height(0.2, 0.4)), -1)
-        # Its rim goes on.
+        # The heights of its rim continue.
         self.assertAlmostEqual(float(ground.height(0.4, 9)), 2)
         line = terrain.PlanarGround(
             terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0
@@ -506,7 +506,7 @@ class TerrainTest(Folder):
 
 
 def tall(task):
-    """Rows whose root is high."""
+    """Simulations whose root is high."""
     return parts.height(task) > 0.5
 
 

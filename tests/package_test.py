@@ -134,7 +134,7 @@ class WheelTest(absltest.TestCase):
             folder / name for name in ('source', 'wheels', 'venv', 'work')
         )
         work.mkdir()
-        # Built from a copy: building writes beside setup.py.
+        # Built from a copy: building writes to the folder of setup.py.
         source.mkdir()
         for name in ('trl_suite', 'xml', 'mocap', 'trained'):
             shutil.copytree(
@@ -157,7 +157,7 @@ class WheelTest(absltest.TestCase):
             sys.executable, '-m', 'pip', '--disable-pip-version-check', '-q', 'install',
             '--no-deps', '--no-index', '--target', target, wheel,
         )  # fmt: skip
-        # Third-party packages come from this interpreter; ours must not.
+        # Third-party packages come from this interpreter; the suite must not.
         others = [sysconfig.get_path('purelib'), sysconfig.get_path('platlib'),
                   *site.getsitepackages()]  # fmt: skip
         lines = [f'import sys; sys.path.append({path!r})' for path in dict.fromkeys(others)]

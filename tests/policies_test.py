@@ -45,7 +45,7 @@ def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes
 
 
 def make_convolving(seed=0, **changes):
-    """A policy that sees 9 heights through convolutions, relative to the first of 4 other numbers."""
+    """A policy with convolutions over 9 heights, relative to the first of 4 other inputs."""
     rng = np.random.default_rng(seed)
     shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
     line = policies.Convolution(
@@ -607,7 +607,7 @@ class ShippedTest(parameterized.TestCase):
         )
     )
     def test_walkers_that_do_not_fall_advance(self, id_):
-        """Standing in front of a wall until time is up is no way of crossing terrain."""
+        """A policy that stands still in front of a wall until the time limit is not shipped."""
         entry = json.loads((resources.directory('trained') / f'{id_}.json').read_text())
         found = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
         full = np.equal(found['lengths'], found['step_limit'])

@@ -1,4 +1,4 @@
-"""The trainer of examples/ppo.py: its parts, that it goes on where it was stopped, that it learns."""
+"""The trainer of examples/ppo.py: its parts, exact resumption, and learning."""
 
 import dataclasses
 import pathlib
@@ -49,7 +49,9 @@ class PartsTest(parameterized.TestCase):
             scales.update(part)
         np.testing.assert_allclose(scales.mean[2:5], data[:, 2:5].mean(0))
         np.testing.assert_allclose(scales.std[2:4], data[:, 2:4].std(0))
-        self.assertEqual(scales.std[4], ppo.LEAST_STD)  # what hardly varies is not blown up
+        self.assertEqual(
+            scales.std[4], ppo.LEAST_STD
+        )  # the scale of almost constant inputs is bounded
         # All heights share one scale about the ground under the root, and the phase stays.
         np.testing.assert_allclose(scales.mean[:2], 0)
         np.testing.assert_allclose(scales.std[:2], np.sqrt((data[:, :2] ** 2).mean()))
@@ -160,7 +162,7 @@ class RunTest(parameterized.TestCase):
         policy = trainer.exported()
         # Nothing rises on flat ground: what rises here has no influence yet.
         np.testing.assert_allclose(policy(observation), other(as_flat), atol=1e-4)
-        # At first the value alone is learnt.
+        # At first only the value function is trained.
         before = [weight.copy() for weight in policy.weights]
         trainer.learn(trainer.collect())
         np.testing.assert_array_equal(trainer.exported().weights[0], before[0])
@@ -263,7 +265,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
         self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
 
-    def test_it_is_evaluated_between_rounds(self):
+    def test_policies_are_evaluated_between_rounds(self):
         settings = ppo_settings.Settings(
             **TINY, start='scripted', cloned=160, clonings=2, averaged=100.0
         )
@@ -273,7 +275,7 @@ class RunTest(parameterized.TestCase):
             trainer.imitate('scripted', pathlib.Path(name))
             self.assertEqual([point['samples'] for point in trainer.curve], [80])
             labels = policies.load(pathlib.Path(name) / 'policy.npz')(trainer.observation)
-        self.assertGreater(np.abs(labels - before).mean(), 0.1)  # not the average, not yet begun
+        self.assertGreater(np.abs(labels - before).mean(), 0.1)  # not yet the average
 
     def test_a_run_ends_at_its_target_return(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
@@ -324,7 +326,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(np.concatenate(spacings), [8 / 3, 8 / 3, 8 / 3, 4, 4])
 
     def test_near_parts_of_maps(self):
-        """Both maps of velocities are cut as that of heights."""
+        """Both velocity maps are reduced as the height map."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
         two = {'surface': slice(0, 2048), 'pose': slice(2048, 2054)}
         near, both = (
@@ -406,7 +408,7 @@ class RunTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, f'stages_averaged: {number}; expected 1 to 2'):
             ppo.Trainer(FLAT, 0, settings, 1)
 
-    def test_it_learns(self):
+    def test_a_short_run_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
         settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
         folder = self.folder / 'run'

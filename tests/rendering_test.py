@@ -1,4 +1,4 @@
-"""Pictures show what is there, files are whole or absent, and failures say what to do."""
+"""Frames show the current state, files are complete or absent, errors name remedies."""
 
 import itertools
 import os

@@ -1,4 +1,4 @@
-"""Sequences of environments: what they hold, their seeds, the metrics, and runs that go on."""
+"""Sequences of environments: contents, seeds, metrics, and resumed runs."""
 
 import importlib.util
 import json
@@ -58,7 +58,7 @@ class SeedsTest(absltest.TestCase):
         self.assertEqual(train[:5], sequences.train_seeds(5, (1, 2)))
         self.assertNotEqual(train[:5], sequences.train_seeds(5, (1, 3)))
 
-    def test_environments_take_them(self):
+    def test_environments_accept_the_seeds(self):
         seeds = sequences.test_seeds(3)
         found = evaluation.evaluate('plaid/dog_gaps', evaluation.zero, 3, seeds, factory=True)
         self.assertEqual((found['seeds'], found['seed']), (seeds, None))
@@ -204,7 +204,7 @@ class RunTest(parameterized.TestCase):
 
 class ExampleTest(absltest.TestCase):
     def test_example_runs_with_a_small_learner(self):
-        """Stopped after the first stage, it goes on as if it had not been."""
+        """A run that was stopped after the first stage resumes exactly."""
         self.enterContext(mock.patch.object(sys, 'path', [str(EXAMPLES), *sys.path]))
         spec = importlib.util.spec_from_file_location(
             'continual_learning', EXAMPLES / 'continual_learning.py'

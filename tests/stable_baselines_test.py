@@ -28,7 +28,7 @@ SMALL = {'height': 48, 'width': 64}
 
 
 class StableBaselinesTest(parameterized.TestCase):
-    """Rows against single environments, wrappers, and a learner."""
+    """Simulations against single environments, wrappers, and a learner."""
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_single_environments_pass_the_checker(self, id_):
@@ -91,7 +91,7 @@ class StableBaselinesTest(parameterized.TestCase):
     def test_seeds(self):
         envs = SuiteVecEnv(FLAT, 2, 1, seed=[4, 5])
         first = envs.reset()
-        self.assertTrue((envs.reset() != first).any(1).all())  # the streams go on
+        self.assertTrue((envs.reset() != first).any(1).all())  # the streams continue
         envs.seed(4)
         np.testing.assert_array_equal(envs.reset(), first)
         envs.seed(2**32 - 1)  # as SB3 may draw it

@@ -121,7 +121,7 @@ class DeterminismTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """Save anywhere, go on bit for bit."""
+    """States saved at any step continue bit for bit."""
 
     def check(self, environment, restored_into):
         state = pickle.loads(pickle.dumps(environment.get_state()))

@@ -101,7 +101,7 @@ SPATIAL = {
         )
     },
 }
-# Above a controller: id -> terrain, which maps are seen, phases of the start, original.
+# Hierarchical: id -> terrain, observed maps, start phases, original.
 _EITHER, _ZERO = (0.1, 0.6), (0.0,)
 HARD = {  # id: terrain
     'PD_Biped3D_Terrain_Trail_Hard-v0': 'trail3d1',
@@ -126,17 +126,17 @@ HIGH_LEVEL = {
 
 
 def ids_of(rules):
-    """Rows of one task class."""
+    """Specs of one task class."""
     return [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == rules]
 
 
 def imitation_ids():
-    """Rows of the two planar families of tracking."""
+    """Specs of the two planar tracking families."""
     return ids_of('planar_imitation')
 
 
 class CatalogueTest(parameterized.TestCase):
-    """Every environment is a row."""
+    """Every environment is an `EnvSpec`."""
 
     def test_counts(self):
         specs = [suite.find(id_) for id_ in imitation_ids()]

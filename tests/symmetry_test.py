@@ -1,4 +1,4 @@
-"""Left for right: what is reflected, that physics agrees, and policies that see a mirror."""
+"""Reflection of left and right: observations, physics, and policies with a mirror."""
 
 import dataclasses
 import pathlib
@@ -121,7 +121,7 @@ class TaskTest(parameterized.TestCase):
                 kept[environment.blocks['contact']] = False
             reflected = task.mirror.observation(second[None])[0]
             np.testing.assert_allclose(reflected[kept], first[kept], rtol=0, atol=1e-9)
-            # The reward does not see a difference either, but for the interpolation of its table.
+            # Rewards are equal, too, except for the interpolation of the table.
             np.testing.assert_allclose(
                 other.task.reward_terms, task.reward_terms, rtol=0, atol=1e-6
             )
@@ -217,7 +217,7 @@ class TaskTest(parameterized.TestCase):
 
 
 class PlanTest(parameterized.TestCase):
-    """The mirror of tasks whose actions are plans: no phase is seen, the foot that is ahead stands."""
+    """The mirror of planning tasks: without a phase, the stance foot is the one ahead."""
 
     def soccer(self, phase):
         environment = suite.make(
@@ -228,7 +228,7 @@ class PlanTest(parameterized.TestCase):
         return environment
 
     def reflect(self, environment, other):
-        """Puts the state of an environment, seen in a mirror, into another."""
+        """Copies the reflected state of an environment to another."""
         pose, rate = state(environment)
         mirror = environment.task.motion.layout.mirror
         columns, dof = environment.task.ball.qpos, environment.task.ball.dof
@@ -258,7 +258,7 @@ class PlanTest(parameterized.TestCase):
         mine, theirs = environment.step(plan), other.step(mirror.action(plan[None])[0])
         self.assertAlmostEqual(mine.reward, theirs.reward, delta=0.02)
         again = mirror.observation(theirs.observation['observations'][None])[0]
-        turned = mine.observation['observations'][105] - first[105]  # where the goal is seen
+        turned = mine.observation['observations'][105] - first[105]  # bearing of the goal
         self.assertGreater(abs(turned), 0.2)
         shown = np.r_[environment.blocks['pose'], environment.blocks['goal'], 107:109]
         np.testing.assert_allclose(
@@ -366,7 +366,7 @@ class MirrorTest(parameterized.TestCase):
 
 
 def policy_for(environment, **changes):
-    """A random policy that sees what an environment observes, in the mirror of its task."""
+    """A random policy for an environment, with the mirror of its task."""
     rng = np.random.default_rng(7)
     task, k, a = environment.task, environment.observation_spec(), len(environment.action_map)
     k = k['observations'].shape[0]
@@ -383,7 +383,7 @@ def policy_for(environment, **changes):
 
 
 class PolicyTest(parameterized.TestCase):
-    """Policies that see left stance as right stance in a mirror."""
+    """Policies that reflect left stance to right stance."""
 
     def setUp(self):
         super().setUp()

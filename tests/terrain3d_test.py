@@ -1,4 +1,4 @@
-"""Tests of the three-dimensional part of trl_suite.terrain: figures from the original's description."""
+"""Tests of the three-dimensional part of trl_suite.terrain: values from the original's description."""
 
 import json
 import math
@@ -138,7 +138,7 @@ class ShapeTest(parameterized.TestCase):
         self.assertLess(np.abs(noise_of).max(), 0.2)
         self.assertAlmostEqual(noise_of.std(), 0.2 / math.sqrt(3), delta=0.005)
         self.assertLess(abs(noise_of.mean()), 0.005)
-        # The same in every episode, and however it is asked for.
+        # The same in every episode, and for every order of queries.
         np.testing.assert_array_equal(heights, make('cliff3d', 9).layout.grid(i, j))
         np.testing.assert_array_equal(
             heights[50:70, 80:], make('cliff3d').layout.grid(i[50:70], j[80:])
@@ -189,7 +189,7 @@ class ShapeTest(parameterized.TestCase):
         self.assertAlmostEqual(ground.height(0.05, 0.05), 0.25 * 1 + 0.25 * 4)
         self.assertAlmostEqual(ground.height(0.15, 0.15), 2 + 0.25 * (1 - 2) + 0.25 * (4 - 2))
         self.assertAlmostEqual(ground.height(0.2, 0.2), 2)
-        self.assertAlmostEqual(ground.height(-7.0, 0.1), 0.5)  # the rim goes on
+        self.assertAlmostEqual(ground.height(-7.0, 0.1), 0.5)  # the rim continues
         self.assertEqual(ground.height(5.0, 500.0), 0)
 
 
@@ -856,7 +856,7 @@ class SurroundingsTest(parameterized.TestCase):
         on = (np.linspace(-1, 10, 32) + 2 >= 3) & (np.linspace(-1, 10, 32) + 2 <= 8)
         np.testing.assert_array_equal(velocities[0], 0)
         np.testing.assert_allclose(velocities[1], np.where(on, -speed, 0)[None].repeat(32, 0))
-        # Standing on the belt, the ground beside it runs the other way.
+        # Relative to the belt, the ground next to it moves in the opposite direction.
         found.follow(np.array([(4.0, 0.0)]))
         velocities = found.velocity_map(np.array([(4.0, 0.0)]), np.zeros(1))[0].reshape(2, 32, 32)
         on = (np.linspace(-1, 10, 32) + 4 >= 3) & (np.linspace(-1, 10, 32) + 4 <= 8)

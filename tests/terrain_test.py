@@ -1,4 +1,4 @@
-"""Tests of trl_suite.terrain: figures from the papers and from the original's description."""
+"""Tests of trl_suite.terrain: values from the papers and the original's description."""
 
 import copy
 import json
@@ -109,7 +109,7 @@ class ProcessTest(parameterized.TestCase):
 
     @parameterized.parameters(*sorted(terrain.GENERATORS))
     def test_length(self, kind):
-        # At least the length asked for, longer by less than a feature.
+        # At least the given length, longer by less than a feature.
         longest_feature = {'narrow_gaps': 10.0}
         name = kind.removeprefix('var2d_').removeprefix('slopes_')
         for seed in range(10):
@@ -258,7 +258,7 @@ class ProcessTest(parameterized.TestCase):
         self.assertAlmostEqual(g.reshape(-1, 40).mean(1).std(), deviation_over_1m, delta=0.006)
 
     def test_slopes_under_features(self):
-        # The walk alone: of features that have no height.
+        # Only the random walk: the features have no height.
         ground = json.loads(PAPER)
         for key in ('GapH', 'WallH', 'StepH0', 'StepH1'):
             ground['Params'][0].update({f'{key}Min': 0, f'{key}Max': 0})
@@ -604,7 +604,7 @@ class PlanarGroundTest(parameterized.TestCase):
                 ground(seed)
 
     def test_streams_of_level_ground(self):
-        # They are made when they are asked for; a state has them all the same.
+        # They are created on demand; a state includes them.
         state = terrain.PlanarGround(terrain.load('flat'), 3).state()
         other = terrain.PlanarGround(terrain.load('slopes'), 3).state()
         self.assertEqual(state['right'], other['right'])

@@ -77,7 +77,7 @@ class IdentityTest(parameterized.TestCase):
             np.testing.assert_array_equal(a.reward, b.reward[:2])
 
     def test_long_runs_extend_the_ground(self):
-        # 14 m at 4 m/s: the window of boxes is laid anew, at another time in every simulation.
+        # 14 m at 4 m/s: the window of boxes moves, at another time in every simulation.
         environments = VectorEnvironment(
             'PD_Dog2D_Slopes_Terrain-v0', 3, 2, seed=2, autoreset='disabled'
         )
@@ -151,7 +151,7 @@ class IdentityTest(parameterized.TestCase):
 
 
 class LimitTest(parameterized.TestCase):
-    """Episodes are cut where those of a single environment are."""
+    """Episodes are truncated as those of a single environment."""
 
     @parameterized.parameters(
         ({}, 256), ({'step_limit': None, 'time_limit': 8.99}, 270), ({'time_limit': 0.5}, 15),
@@ -213,7 +213,7 @@ class LimitTest(parameterized.TestCase):
 
 
 class AutoresetTest(parameterized.TestCase):
-    """Gymnasium's three manners of beginning anew."""
+    """Gymnasium's three autoreset modes."""
 
     def run_to_the_end(self, autoreset):
         environments = VectorEnvironment(FLAT, 4, 1, seed=0, autoreset=autoreset, step_limit=3)
@@ -305,7 +305,7 @@ class PartialBatchTest(parameterized.TestCase):
         for _ in range(2):
             step = environments.step(action, [2])
         np.testing.assert_array_equal(step.truncated, [False, False, True])
-        step = environments.step(action)  # the first and the last begin anew, the other ends
+        step = environments.step(action)  # the first and the last are reset, the other ends
         np.testing.assert_array_equal(step.truncated, [False, True, False])
         np.testing.assert_array_equal(step.reward > 0, [False, True, False])
         with self.assertRaisesRegex(
@@ -382,7 +382,7 @@ class PartialBatchTest(parameterized.TestCase):
 
 
 class RobustnessTest(parameterized.TestCase):
-    """What goes wrong says so, and stays in its simulation."""
+    """Errors are reported, and do not affect other simulations."""
 
     def setUp(self):
         super().setUp()

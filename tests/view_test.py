@@ -1,4 +1,4 @@
-"""The command view: what reaches dm_control's viewer, and what that draws, in a window that is none."""
+"""The command view: inputs and frames of dm_control's viewer, with a fake window."""
 
 import importlib
 import types
@@ -25,7 +25,7 @@ with warnings.catch_warnings():  # GLFW's, where there is no screen
 
 class CommandTest(cli_test.CommandTest):
     def view(self, *arguments):
-        """Runs the command; returns the environment, the policy and the title that were shown."""
+        """Runs the command; returns environment, policy and title of the window."""
         with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
             self.assertEqual(self.output('view', *arguments), '')
         return shown.call_args.args
@@ -134,7 +134,7 @@ class FramesTest(parameterized.TestCase):
 
 
 class NoWindow:
-    """What the viewer needs of a window; it is closed after some pictures, which it keeps."""
+    """A fake window for the viewer; it stores its frames, and closes after some of them."""
 
     def __init__(self, width, height, title):
         names = ('on_move', 'on_click', 'on_double_click', 'on_scroll', 'on_key')
@@ -162,10 +162,8 @@ class WindowTest(parameterized.TestCase):
     def window(self, environment):
         shown = window.Window(environment, 'a title')
         clock = types.SimpleNamespace(tick=lambda: FRAME, measured_time=FRAME)
-        shown._frame_timer = clock  # that of the machine may be slow
-        shown._viewer_layout = (
-            window.application.views.ViewportLayout()
-        )  # no figures over the picture
+        shown._frame_timer = clock  # the machine's clock may be slow
+        shown._viewer_layout = window.application.views.ViewportLayout()  # no text over the frame
         return shown, shown._window
 
     @parameterized.parameters(GAPS, DOG, PLANS)
