@@ -913,9 +913,9 @@ class AngleAxisTest(parameterized.TestCase):
 
     def test_invalid_arguments_are_rejected(self):
         for options in ({'action_offset': np.zeros(22)}, {'action_scale': 1.0}):
-            with self.assertRaisesRegex(ValueError, 'those of the original: no action_offset'):
+            with self.assertRaisesRegex(ValueError, 'do not pass action_offset'):
                 Floating('biped3d', 'position', rotations='angle_axis', **options)
-        with self.assertRaisesRegex(ValueError, "unknown way to describe rotations 'axis'"):
+        with self.assertRaisesRegex(ValueError, "unknown description of rotations 'axis'"):
             Floating('biped3d', 'position', rotations='axis')
 
     def test_planar_character(self):

@@ -420,7 +420,7 @@ class CheckTest(parameterized.TestCase):
         self.assertIn('foot slide', str(report))
 
     def test_a_clip_of_another_character_is_rejected(self):
-        with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*is none of 'raptor'"):
+        with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*does not fit 'raptor'"):
             clip_check.check(motion.load('biped2d_walk'), 'raptor')
 
 

@@ -446,7 +446,7 @@ class TerrainTest(Folder):
         ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),
         ('arguments', lambda _: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
         ('shape', lambda _: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
-        ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; those at \[1\]'),
+        ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; the one at \[1\]'),
         ('spacing', lambda _: terrain.from_heights([0, 0], 0), 'spacing is 0'),
         ('suffix', lambda _: terrain.from_mesh('hill.fbx'), "suffix '.fbx'; expected .obj or"),
         ('away', lambda f: terrain.from_mesh(f / 'away.stl'), 'not over the origin'),

@@ -203,7 +203,7 @@ class RunTest(parameterized.TestCase):
             inside = trainer.policy(trainer.scales(observation)).numpy()
         inside = trainer.mirror.unmirror_action(inside, left)
         np.testing.assert_allclose(policy(trainer.observation), np.clip(inside, -1, 1), atol=1e-5)
-        # What has not varied would not be taken over.
+        # Inputs that have not varied would not be copied.
         policy = dataclasses.replace(policy, std=np.ones_like(policy.std))
         for names, same in ((places, True), (places[::-1], True), (places[1:], False)):
             other = ppo.Trainer(id_, 1, dataclasses.replace(settings, places=names), 1)
@@ -228,7 +228,7 @@ class RunTest(parameterized.TestCase):
         cut = observation.copy()
         cut[:, part] = np.clip(cut[:, part], -0.3, 0.3)
         np.testing.assert_allclose(policy(cut), policy(observation), atol=1e-6)
-        # What has not varied would not be taken over.
+        # Inputs that have not varied would not be copied.
         policy = dataclasses.replace(policy, std=np.maximum(policy.std, 0.02))
         for bound, same in ((0.3, True), (0.5, False)):
             other = ppo.Trainer(id_, 1, dataclasses.replace(settings, map_bound=bound), 1)

@@ -160,7 +160,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--scale', type=float, help='of lengths; default: by the length of limbs')
     command.add_argument(
         '--cycle', nargs='*', type=float, metavar='TIME',
-        help='cut one cycle from START to END (s); without times, the best cycle is searched for',
+        help='cut one cycle, from a start to an end time (s); by default the best one is found',
     )  # fmt: skip
     command.add_argument('--frames', action='store_true', help='print every fault in every frame')
     command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
