@@ -170,8 +170,8 @@ GOAT = CharacterSpec(
         'position': _TO_PARENT,
         'muscle': _BORROWED,
         'gait': (
-            "action 0 is a re-tuned gait: with the original's gait the character falls here on "
-            'flat ground; the original has the gait, but no environment for it',
+            "action 0 is a re-tuned gait: with the original's gaits the goat falls here on flat "
+            'ground; the original has the gait, but no environment for it',
         ),
     },
 )
