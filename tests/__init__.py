@@ -18,7 +18,7 @@ sys.path.insert(0, FOLDER)  # for `helpers`
 def load_tests(
     loader: unittest.TestLoader, tests: unittest.TestSuite, pattern: str | None
 ) -> unittest.TestSuite:
-    """Finds what pytest finds: the tests in files *_test.py that are not marked as slow."""
+    """Finds the same tests as pytest: those in files *_test.py that are not marked as slow."""
     found = loader.discover(FOLDER, '*_test.py')
     tests.addTests(test for test in flat(found) if not is_slow(test))
     gc.freeze()  # as in conftest.py

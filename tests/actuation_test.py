@@ -1,4 +1,4 @@
-"""Tests of the actuation of planar characters: what an action means, what a joint can get."""
+"""Tests of the actuation of planar characters: action maps, servos and torque limits."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ PAIRS = tuple(
 
 
 def full(name, model):
-    """What full action adds to the control of each joint; torques as shares of the limit."""
+    """Expected action_scale of each joint; torques as fractions of the limit."""
     revolute, leg = {
         'torque': (0.75, 1),
         'velocity': (10 * np.pi, 10),  # rad/s, m/s
@@ -71,7 +71,7 @@ class Mounted:
 
 
 class ActionMapTest(parameterized.TestCase):
-    """An affine map that can be read."""
+    """The affine map from actions to controls."""
 
     @parameterized.parameters(*PAIRS)
     def test_affine_clipped_and_invertible(self, name, model):
@@ -90,7 +90,7 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_array_equal(mapping.control(far), mapping.control(np.ones(size)))
         np.testing.assert_array_equal(mapping.control(-far), mapping.control(-np.ones(size)))
 
-    def test_the_given_action_is_not_changed(self):
+    def test_the_argument_is_not_changed(self):
         mapping, action = Mounted('biped2d', 'torque').map, np.full(6, 3.0)
         mapping.control(action)
         np.testing.assert_array_equal(action, 3.0)
@@ -99,7 +99,7 @@ class ActionMapTest(parameterized.TestCase):
         ('torque', 'torque', 'N m'), ('velocity', 'target velocity', 'rad/s'),
         ('position', 'target angle', 'rad'), ('muscle', 'excitation', '1'),
     )  # fmt: skip
-    def test_what_a_control_is(self, model, quantity, unit):
+    def test_controls_are_an_affine_map_of_actions(self, model, quantity, unit):
         mapping = Mounted('dog', model).map
         self.assertEqual((mapping.quantity, mapping.unit), (quantity, unit))
 
@@ -132,7 +132,7 @@ class ActionMapTest(parameterized.TestCase):
             self.assertAlmostEqual(full[joint], torque)
         np.testing.assert_array_equal(mapping.action_offset, 0)
 
-    def test_velocity_is_five_turns_a_second(self):
+    def test_velocity_is_five_revolutions_per_second(self):
         mapping = Mounted('raptor', 'velocity').map
         np.testing.assert_allclose(mapping.action_scale, 31.4159265, rtol=1e-8)
         np.testing.assert_array_equal(mapping.action_offset, 0)
@@ -142,7 +142,7 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(mapping.control(-np.ones(44)), 0.01)
         np.testing.assert_allclose(mapping.control(np.ones(44)), 1)
 
-    def test_position_without_options_is_the_posture_and_1_5_rad(self):
+    def test_default_position_control_is_the_working_posture_and_1_5_rad(self):
         mapping = Mounted('raptor', 'position').map
         np.testing.assert_array_equal(mapping.action_scale, 1.5)
         action_offset = dict(zip(mapping.names, mapping.action_offset, strict=True))
@@ -188,20 +188,20 @@ class ActionMapTest(parameterized.TestCase):
                 mapping.names, mapping.action_offset, mapping.action_scale, strict=True
             )
         }
-        np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # turns freely
+        np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # without limits
         np.testing.assert_allclose(figures['elbow'], (1.57, 6.28))
-        # Limits of the file, [-1.57, 1.57], not those that act, [-0.96, 2.18].
+        # Limits of the file, [-1.57, 1.57], not the effective ones, [-0.96, 2.18].
         np.testing.assert_allclose(figures['hip'], (0, 6.28), atol=1e-9)
         np.testing.assert_allclose(figures['spine0'], (0, 6.28), atol=1e-9)
 
-    def test_centres(self):
+    def test_action_offset_and_scale(self):
         self.assertCountEqual(imitation_rules.ACTION_OFFSETS, ('clip', 'posture', 'original'))
         mapping = suite.build('raptor', task_kwargs={'action_offset': 'posture'}).action_map
         self.assertAlmostEqual(mapping.action_offset[mapping.names.index('left_hip')], 0.46487)
         mapping = suite.build('raptor', task_kwargs={'action_scale': 0.7}).action_map
         np.testing.assert_array_equal(mapping.action_scale, 0.7)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "unknown actuation 'postion'.*'position'"):
             actuation.add(characters.make('dog'), 'postion', TIMESTEP)
         spec = dataclasses.replace(
@@ -215,7 +215,7 @@ class ActionMapTest(parameterized.TestCase):
 
     @parameterized.parameters(*WITHOUT_MUSCLES)
     def test_characters_without_muscles(self, name):
-        with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; those who have: .*dog"):
+        with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; these have: .*dog"):
             Mounted(name, 'muscle')
 
     def test_a_slide_without_limits_needs_a_range(self):
@@ -230,7 +230,7 @@ class ActionMapTest(parameterized.TestCase):
 
 
 class ServoTest(parameterized.TestCase):
-    """What the compiled actuators do, by their formulas."""
+    """Forces of the compiled actuators against their formulas."""
 
     @parameterized.parameters(*JOINTS)
     def test_position_law(self, name):
@@ -263,7 +263,7 @@ class ServoTest(parameterized.TestCase):
         mounted.forward()
         force = np.clip(kd * (full(name, 'velocity') * action - rate), -limits, limits)
         np.testing.assert_allclose(mounted.torque, force, atol=1e-9)
-        np.testing.assert_array_equal(mounted.data.qfrc_damper, 0)  # all of kd is the servo's
+        np.testing.assert_array_equal(mounted.data.qfrc_damper, 0)  # the whole kd is in the servo
 
     @parameterized.parameters(*JOINTS)
     def test_torque_law(self, name):
@@ -304,7 +304,7 @@ class ServoTest(parameterized.TestCase):
     @parameterized.parameters(
         *(pair for pair in PAIRS if pair[0] in ('biped2d', 'dog', 'biped2d_simbicon', 'hopper'))
     )
-    def test_limits_of_joints_hold(self, name, model):
+    def test_joint_limits_hold(self, name, model):
         for direction in (-1, 1):
             mounted = Mounted(name, model)
             action = np.full(len(mounted.map), float(direction))
@@ -342,10 +342,10 @@ def on_the_ground(name, model):
 
 
 class TorqueLimitTest(parameterized.TestCase):
-    """No model lets a joint exceed its limit, whatever happens."""
+    """No actuation model exceeds the torque limit of a joint."""
 
     @parameterized.parameters(*PAIRS)
-    def test_in_a_violent_rollout(self, name, model):
+    def test_limits_hold_under_extreme_actions(self, name, model):
         compiled, data, character, mapping = on_the_ground(name, model)
         dof = compiled.jnt_dofadr[
             [compiled.joint(joint.full_identifier).id for joint in character.joints]
@@ -362,7 +362,7 @@ class TorqueLimitTest(parameterized.TestCase):
                     np.maximum(highest, np.abs(data.qfrc_actuator[dof]), out=highest)
         np.testing.assert_array_less(highest, limits * (1 + 1e-9))
         np.testing.assert_array_equal(data.warning.number[:7], 0)
-        # The test means something: the limits are met.
+        # The limits are reached, so the test is effective.
         share = highest / limits
         if model == 'torque':
             np.testing.assert_allclose(share.max(), full(name, model).max())
@@ -371,7 +371,7 @@ class TorqueLimitTest(parameterized.TestCase):
             self.assertGreater(share.max(), 0.99)
 
     @parameterized.parameters(*MUSCLES)
-    def test_all_muscles_at_once(self, name):
+    def test_limits_hold_with_all_muscles_active(self, name):
         mounted = Mounted(name, 'muscle')
         mounted.data.qvel[:] = 20  # lengthening muscles pull with up to 1.5 of their peak force
         mounted.act(np.ones(len(mounted.map)))

@@ -29,7 +29,7 @@ CUBE = {
 
 
 def tree(source, load=None):
-    """An arena, by itself or with one free body."""
+    """An arena, alone or with one free body."""
     arena = SpatialArena(terrain.load(source))
     root = arena.mjcf_model
     root.option.timestep = TIMESTEP
@@ -66,7 +66,7 @@ class Stage:
         self.world.forward(self.env_ids)
 
     def put(self, position, velocity=(0, 0, 0)):
-        """Puts the loads somewhere, moving."""
+        """Sets positions and velocities of the loads."""
         q, v = self.q, self.v
         self.world.qpos[:, q : q + 3] = position
         self.world.qpos[:, q + 3 : q + 7] = (1, 0, 0, 0)
@@ -107,7 +107,7 @@ class GeometryTest(parameterized.TestCase):
     """Ray casts against queries."""
 
     @parameterized.parameters(*BOXED, *GRIDS)
-    def test_geometry_is_the_ground(self, source):
+    def test_geometry_equals_the_ground(self, source):
         stage = Stage(source)
         tolerance = SINGLE if source in GRIDS else EXACT
         for seed, xy in ((0, (0, 0)), (1, (17.3, -9.1)), (2, (-40.2, 12.0)), (3, (200.0, 31.0))):
@@ -145,7 +145,7 @@ class GeometryTest(parameterized.TestCase):
                 start = np.array([*boxes.position[k], 0.5 * boxes.top[k]])
                 start[axis] -= sign * (boxes.half_size[k, axis] + 0.05)
                 if stage.height(*start[:2])[0] > 0:
-                    continue  # another block stands there
+                    continue  # another block is there
                 direction = np.zeros(3)
                 direction[axis] = sign
                 distance = mujoco.mj_ray(
@@ -195,13 +195,13 @@ class GeometryTest(parameterized.TestCase):
             stage = Stage({'Type': 'turned3d'}, (seed,))
             x, y = np.random.default_rng(seed).uniform(-13, 13, (2, 600))
             error = np.abs(stage.rays(x, y) - stage.height(x, y))
-            # The lower ends lean out, by up to 0.2 of the height of the box.
+            # The lower ends overhang, by up to 0.2 of the height of the box.
             lean = stage.height(x, y) == -0.3
             np.testing.assert_allclose(error[~lean], 0, atol=EXACT)
             self.assertLess((error[lean] > EXACT).mean(), 0.01)
             self.assertGreater((~lean).sum(), 30)
 
-    def test_refuses(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'gaps'):
             SpatialArena(terrain.load('gaps'))
         with self.assertRaisesRegex(ValueError, 'hills3d'):
@@ -276,7 +276,7 @@ class DynamicsTest(parameterized.TestCase):
             y = stage.position[0, 1]
             stage.run(2.0)
             np.testing.assert_allclose(stage.position[0], (4, y + 2 * speed, 0.11), atol=5e-3)
-            # Beside the belt it comes to rest.
+            # Off the belt it comes to rest.
             stage.put((2, 0, 0.1), (0, speed, 0))
             stage.run(1.0)
             np.testing.assert_allclose(stage.velocity[0], 0, atol=1e-3)
@@ -298,7 +298,7 @@ class DynamicsTest(parameterized.TestCase):
         return around.centres()[0, k], speed * around.axis[0, k], around.half_size[0, k]
 
     def alone(self, stage):
-        """The fastest moving box with nothing near its way for two seconds."""
+        """The fastest moving box with nothing near its path for two seconds."""
         around = stage.arena.surroundings
         centres = around.centres()[0]
         order = np.argsort(-around.speed[0])
@@ -313,7 +313,7 @@ class DynamicsTest(parameterized.TestCase):
     def test_a_moving_box_carries(self):
         stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
         k = self.alone(stage)
-        near = self.mover(stage, k)[0][None]  # a character nearby, so that it does not turn round
+        near = self.mover(stage, k)[0][None]  # a character nearby, so that it does not reverse
         stage.arena.follow(near)
         centre, velocity, _ = self.mover(stage, k)
         stage.put((*centre, stage.height(*centre)[0] + 0.1), (*velocity, 0))
@@ -350,7 +350,7 @@ class DynamicsTest(parameterized.TestCase):
         self.assertLess(fastest, 2.2 * speed + 0.05)  # pushed, not shot off
         self.assertGreater(fastest, 0.5 * speed)
 
-    def test_boxes_keep_their_speed_and_way(self):
+    def test_boxes_keep_their_speed_and_path(self):
         stage = Stage('dynamic_obstacles3d', (7,))
         movers = stage.arena.grounds[0].layout.movers
         kinematic = terrain.Surroundings(1, stage.arena.capacity)
@@ -363,7 +363,7 @@ class DynamicsTest(parameterized.TestCase):
         stage.arena._look(0)
         np.testing.assert_allclose(stage.arena.surroundings.way, kinematic.way, atol=2e-3)
         np.testing.assert_array_equal(stage.arena.surroundings.direction, kinematic.direction)
-        self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some turned
+        self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some reversed
         # Queries and geometry agree on where they are.
         x, y = np.random.default_rng(0).uniform(-12, 12, (2, 400))
         stage.world.forward(stage.env_ids)
@@ -386,7 +386,7 @@ class DynamicsTest(parameterized.TestCase):
         np.testing.assert_allclose(moved, 0.5 * movers.speed, atol=0.5)
         self.assertAlmostEqual(np.median(moved / movers.speed), 0.5, delta=1e-3)
 
-    def test_drives_do_not_loosen_the_solver(self):
+    def test_inertia_of_movers_does_not_loosen_the_solver(self):
         # The solver stops by a tolerance relative to the mean inertia.
         with_drives, without = Stage('dynamic_obstacles3d', load=CUBE), Stage('plane', load=CUBE)
         expected = without.model.stat.meaninertia
@@ -484,7 +484,7 @@ class WorldTest(parameterized.TestCase):
         return stage, np.array([start[2] for start in starts])
 
     def advance(self, stage, heading, steps):
-        """Goes with the balls; returns all that is seen."""
+        """Follows the balls; returns all observations."""
         seen = []
         for _ in range(steps):
             xy = stage.position[:, :2].copy()
@@ -496,10 +496,10 @@ class WorldTest(parameterized.TestCase):
         return np.stack(seen, 1)
 
     @parameterized.parameters(*SOURCES)
-    def test_every_row_of_a_batch_has_its_own_ground_and_equals_a_physics(self, source):
+    def test_every_simulation_has_its_own_ground_and_equals_a_physics(self, source):
         seeds = (11, 4, 8)
         stage, heading = self.begin(source, seeds, batch=True)
-        seen = self.advance(stage, heading, 60)  # far enough to lay windows anew
+        seen = self.advance(stage, heading, 60)  # far enough to move windows
         for env_id, seed in enumerate(seeds):
             single, psi = self.begin(source, (seed,), batch=False)
             np.testing.assert_array_equal(self.advance(single, psi, 60)[0], seen[env_id])
@@ -507,7 +507,7 @@ class WorldTest(parameterized.TestCase):
             self.assertFalse(np.array_equal(seen[0][:, 6:], seen[1][:, 6:]))
 
     @parameterized.parameters(*SOURCES)
-    def test_saved_and_restored(self, source):
+    def test_a_restored_state_continues_exactly(self, source):
         stage, heading = self.begin(source, (5,), batch=False)
         self.advance(stage, heading, 40)
         state = pickle.loads(pickle.dumps((stage.arena.state(0), stage.world.get_state(0))))
@@ -520,7 +520,7 @@ class WorldTest(parameterized.TestCase):
             np.testing.assert_array_equal(self.advance(other, heading, 30), seen)
 
     @parameterized.parameters('hills3d', 'pillars3d', 'dynamic_obstacles3d')
-    def test_restored_into_a_row_of_a_batch(self, source):
+    def test_restored_into_one_of_many_simulations(self, source):
         stage, heading = self.begin(source, (5,), batch=False)
         self.advance(stage, heading, 40)
         state = stage.arena.state(0), stage.world.get_state(0)
@@ -532,8 +532,8 @@ class WorldTest(parameterized.TestCase):
         found = self.advance(batch, heading.repeat(3), 20)
         np.testing.assert_array_equal(found[1], seen[0])
 
-    def test_rows_by_themselves(self):
-        """A simulation that is begun or followed leaves the others alone."""
+    def test_simulations_are_independent(self):
+        """Resetting or following one simulation does not change the others."""
         stage, heading = self.begin('pillars3d', (1, 2, 3), batch=True)
         self.advance(stage, heading, 10)
         models = [stage.world.models[env_id].geom_pos.copy() for env_id in range(3)]
@@ -553,7 +553,7 @@ class WorldTest(parameterized.TestCase):
             np.testing.assert_array_equal(rays[0], rays[1])
             self.assertFalse(np.array_equal(rays[0], rays[2]))
 
-    def test_nothing_is_compiled_anew(self):
+    def test_nothing_is_recompiled(self):
         stage = Stage('pillars3d')
         model = stage.model
         stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, 5))
@@ -583,7 +583,7 @@ class WorldTest(parameterized.TestCase):
         second = picture(*one, 2, 0.0)
         self.assertGreater(np.abs(first - second).mean(), 1)
         np.testing.assert_array_equal(picture(*other, 2, 30.0), second)
-        # Laid anew in mid-episode, after there were pictures.
+        # Refilled within an episode, after frames were rendered.
         np.testing.assert_array_equal(picture(*other, 2, 30.0), second)
         np.testing.assert_array_equal(picture(*other, 1, -30.0), first)
 

@@ -14,14 +14,14 @@ from trl_suite.terrain.planar import windows as planar_ground
 TIMESTEP = 1 / 300  # s
 GRAVITY = 9.8  # m/s^2; the original's
 CELL = terrain.SPACING
-BEHIND, AHEAD = 5.9, 17.9  # m; how far the window of boxes reaches about where it was laid
+BEHIND, AHEAD = 5.9, 17.9  # m; extent of the window of boxes around its centre
 LEVEL = (
     'flat', 'gaps_humanoid', 'walls_humanoid', 'steps_humanoid', 'mixed_humanoid', 'gaps', 'walls',
     'steps', 'mixed', 'cliffs_rugged', 'narrow_gaps_raptor', 'tight_gaps', 'stairs',
 )  # fmt: skip
 # Largest and typical deviation, m. Pieces longer than 0.1 m stay within 4 mm of the profile. Where
-# there are faces, the level post of 1.5 cells beside a face adds 0.0375 m times the slope, which in
-# these presets stays below 0.27 (three standard deviations). slopes_humanoid: pieces of 0.1 m.
+# there are faces, the level post of 1.5 cells next to a face adds 0.0375 m times the slope, which
+# in these presets stays below 0.27 (three standard deviations). slopes_humanoid: pieces of 0.1 m.
 SLOPED = {
     'inclines': (0.005, 0.002), 'slopes': (0.006, 0.002), 'slopes_mixed': (0.010, 0.002),
     'slopes_mixed_humanoid': (0.010, 0.002), 'slopes_gaps_raptor': (0.010, 0.002),
@@ -39,7 +39,7 @@ OF_GAITS = (
 
 
 class SpatialGround:
-    """An arena by itself, or with one planar body on it."""
+    """An arena alone, or with one planar body on it."""
 
     def __init__(self, source, seed=0, timestep=TIMESTEP, body=None, **strip):
         self.arena = PlanarArena(terrain.load(source))
@@ -64,7 +64,7 @@ class SpatialGround:
         self.world.forward(np.zeros(1, int))
 
     def ray(self, start, direction):
-        """Where a ray meets the ground first: distance, normal, and whether it is the ground."""
+        """First hit of a ray: distance, normal, and whether it is the ground."""
         geom, normal = np.zeros(1, np.int32), np.zeros(3)
         distance = mujoco.mj_ray(
             self.model, self.data, np.array(start, float), np.array(direction, float), None, True,
@@ -147,7 +147,7 @@ class GeometryTest(parameterized.TestCase):
 
     @parameterized.parameters('slopes_mixed_humanoid', 'slopes_gaps_raptor', 'slopes_narrow_gaps')
     def test_gaps_in_slopes_are_empty(self, source):
-        """No lower end of a tilted box leans out of a side of a gap."""
+        """No lower end of a tilted box protrudes from a side of a gap."""
         gaps = 0
         for seed in range(5):
             ground = SpatialGround(source, seed)
@@ -169,7 +169,7 @@ class GeometryTest(parameterized.TestCase):
             ground.follow(6.5)
             np.testing.assert_allclose(ground.heights(xs), first, atol=1e-9)
 
-    def test_a_strip_two_metres_wide(self):
+    def test_ground_is_two_metres_wide(self):
         ground = SpatialGround('steps_humanoid')
         for lateral, hit in ((0.99, True), (-0.99, True), (1.01, False)):
             self.assertEqual(ground.ray((3, lateral, 5), (0, 0, -1))[2], hit)
@@ -186,7 +186,7 @@ class GeometryTest(parameterized.TestCase):
 
 
 class QueryTest(parameterized.TestCase):
-    """Height and slope come from the strip, not from the boxes."""
+    """Height and slope are those of the ground, not of the boxes."""
 
     @parameterized.parameters('slopes_humanoid', 'gaps_humanoid', 'cliffs_rugged')
     def test_height_and_slope(self, source):
@@ -236,7 +236,7 @@ class QueryTest(parameterized.TestCase):
         self.assertTrue(np.isnan(planar_ground.height(0, np.nan, arrays)))
         self.assertFalse(planar_ground.has_left(0, np.nan, arrays))
 
-    def test_wrong_shapes_are_refused(self):
+    def test_wrong_shapes_are_rejected(self):
         ground = SpatialGround('flat')
         with self.assertRaisesRegex(ValueError, r'shape \(2, 1\); expected \(1, k\)'):
             ground.arena.height(np.zeros((2, 1)))
@@ -252,12 +252,12 @@ class PoolTest(parameterized.TestCase):
         for seed in range(100, 140):
             strip = terrain.PlanarGround(ground.terrain, seed)
             for centre in range(-1, 10):
-                first = (centre - 1) * 240  # windows of 24 m are laid every 6 m
+                first = (centre - 1) * 240  # windows of 24 m, every 6 m
                 window = strip.window(first, 961)
                 most = max(most, len(boxes.from_profile(first, *window).position))
         self.assertLessEqual(most, pool)
 
-    def test_rows_use_these_terrains(self):
+    def test_environments_use_these_terrains(self):
         planar = [spec for spec in catalogue.SPECS if 'planar' in spec.tags]
         self.assertEqual({spec.terrain for spec in planar}, {*OF_ROWS, *OF_GAITS})
 
@@ -349,7 +349,7 @@ class DynamicsTest(parameterized.TestCase):
 
 
 class LongWalkTest(parameterized.TestCase):
-    """The ground never ends, and laying it anew is not felt."""
+    """The ground is unbounded, and moving the window does not affect the physics."""
 
     @parameterized.parameters('slopes_mixed_humanoid', 'cliffs_rugged')
     def test_two_hundred_metres(self, source):
@@ -372,7 +372,7 @@ class LongWalkTest(parameterized.TestCase):
             ground.follow(x)
         np.testing.assert_array_equal(ground.heights(xs), before)
 
-    def test_environment_lays_ground_under_a_walker(self):
+    def test_environment_moves_the_window_with_a_walker(self):
         environment = suite.make('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'random': 3})
         environment.reset()
         physics, arena = environment.physics, environment.task.arena
@@ -395,7 +395,7 @@ class LongWalkTest(parameterized.TestCase):
                 self.assertAlmostEqual(19.0 - distance, float(strip.height(x)), delta=0.007)
 
     def test_moving_far_boxes_does_not_change_a_trajectory(self):
-        """What makes it safe to lay ground ahead in mid-episode."""
+        """Ground ahead can therefore be replaced within an episode."""
         states = []
         for disturb in (False, True):
             environment = suite.make('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'random': 11})
@@ -416,7 +416,7 @@ class LongWalkTest(parameterized.TestCase):
             states.append(np.array(trajectory))
         np.testing.assert_array_equal(*states)
 
-    def test_laying_the_same_window_again_does_not_change_a_trajectory(self):
+    def test_refilling_the_same_window_does_not_change_a_trajectory(self):
         states = []
         for disturb in (False, True):
             environment = suite.make('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'random': 11})

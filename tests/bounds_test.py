@@ -1,4 +1,4 @@
-"""Tests of bounds: what the engine knows of re-posed geoms is what `mj_setConst` would have it know."""
+"""Tests of bounds: derived data of re-posed geoms equal those of `mj_setConst`."""
 
 import copy
 
@@ -23,11 +23,11 @@ def array_names(model):
 
 
 def assert_like_set_const(model, names):
-    """Has `mj_setConst` do its work on a copy of a model, and compares arrays of the two."""
+    """Calls `mj_setConst` on a copy of a model, and compares arrays of the two."""
     expected = copy.copy(model)
     mujoco.mj_setConst(expected, mujoco.MjData(expected))
     for name in names:
-        # Of bounding volumes the last bits may differ: they only tell what may be near.
+        # Last bits of bounding volumes may differ: they only select pairs for collision tests.
         tolerance = 1e-13 * max(1.0, np.abs(model.geom_pos).max()) if name == 'bvh_aabb' else 0.0
         np.testing.assert_allclose(
             getattr(model, name), getattr(expected, name), rtol=tolerance, atol=tolerance,
@@ -36,10 +36,10 @@ def assert_like_set_const(model, names):
 
 
 class ArenaTest(parameterized.TestCase):
-    """After the ground was laid, and laid anew, a model is as `mj_setConst` leaves it."""
+    """After the ground was replaced, a model is as after `mj_setConst`."""
 
     @parameterized.parameters(*PLANAR, *SPATIAL)
-    def test_bounds(self, name):
+    def test_bounds_equal_those_of_mj_set_const(self, name):
         ground = terrain.load(name)
         arena = (SpatialArena if ground.spatial else PlanarArena)(ground)
         arena.mjcf_model.worldbody.add('body', name='ball').add('geom', size=(0.1,))
@@ -61,7 +61,7 @@ class RefreshTest(parameterized.TestCase):
     """Any box, any body."""
 
     @parameterized.parameters(range(5))
-    def test_random_boxes(self, seed):
+    def test_bounds_of_random_boxes_equal_those_of_mj_set_const(self, seed):
         rng = np.random.default_rng(seed)
         root = mjcf.RootElement()
         bodies = [root.worldbody]

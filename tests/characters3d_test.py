@@ -1,4 +1,4 @@
-"""Tests of characters in three dimensions, bodies and actuation, against the original's figures."""
+"""Tests of characters in three dimensions, bodies and actuation, against the original's values."""
 
 import dataclasses
 import functools
@@ -226,7 +226,7 @@ def random_targets(name, rng, share=1.0):
 
 
 def alone(name):
-    """The character compiled by itself, its root at the origin."""
+    """The character compiled alone, its root at the origin."""
     physics = mjcf.Physics.from_mjcf_model(characters.make(name).mjcf_model)
     return physics.model.ptr, physics.data.ptr
 
@@ -496,17 +496,17 @@ class MirrorTest(parameterized.TestCase):
             np.testing.assert_allclose(position, other, atol=atol, err_msg=link)
 
     @parameterized.parameters(*NAMES)
-    def test_poses(self, name):
+    def test_mirrored_poses_give_mirrored_positions(self, name):
         first, second = (Floating(name, 'position', root=False) for _ in range(2))
         pose = random_targets(name, np.random.default_rng(3))
         first.pose(pose)
         second.pose(self.mirrored(second.character, pose))
         here, there = self.positions(first), self.positions(second)
         self.assert_mirrored(here, there, first.character, 1e-12)
-        self.assertGreater(abs(here['right_ankle'][1] + here['left_ankle'][1]), 0.01)  # not alike
+        self.assertGreater(abs(here['right_ankle'][1] + here['left_ankle'][1]), 0.01)  # not equal
 
     @parameterized.product(name=NAMES, model=('position', 'torque', 'velocity'))
-    def test_motion(self, name, model):
+    def test_mirrored_controls_give_mirrored_motion(self, name, model):
         first, second = (Floating(name, model) for _ in range(2))
         self.assertFalse(first.map.action_offset.any())
         # Below the clamps: at them, which steps MuJoCo damps implicitly depends on the last bit.
@@ -524,7 +524,7 @@ class MirrorTest(parameterized.TestCase):
 
 
 class CollisionTest(parameterized.TestCase):
-    """Who can touch whom, as the engine answers."""
+    """Pairs of links that can collide, according to the engine."""
 
     def touching(self, name):
         """Pairs of links (and the floor) that touch when every box is 20 m large."""
@@ -549,7 +549,7 @@ class CollisionTest(parameterized.TestCase):
         self.assertLen(pairs, FIGURES[name].pairs)
 
     @parameterized.parameters(*NAMES)
-    def test_ground_touches_every_link(self, name):
+    def test_every_link_collides_with_the_ground(self, name):
         links = characters.CHARACTERS[name].links
         floor = {next(iter(p - {'floor'})) for p in self.touching(name) if 'floor' in p}
         self.assertEqual(floor, set(links))
@@ -582,7 +582,7 @@ class CollisionTest(parameterized.TestCase):
 
 
 class OwnArenaTest(parameterized.TestCase):
-    """A character lives in any composer arena."""
+    """A character works in any composer arena."""
 
     def place(self, name, model, **options):
         arena = users_arena()
@@ -622,7 +622,7 @@ class OwnArenaTest(parameterized.TestCase):
         self.assertAlmostEqual(height, FIGURES[name].height, delta=0.01)
 
     @parameterized.parameters(*NAMES)
-    def test_falls_and_rests_on_the_floor_with_its_weight(self, name):
+    def test_falls_and_its_contact_forces_equal_its_weight(self, name):
         _, physics = self.place(name, 'torque')
         model, data = physics.model.ptr, physics.data.ptr
         data.qvel[:2] = 0.3, 0.2
@@ -690,7 +690,7 @@ class OwnArenaTest(parameterized.TestCase):
 
 
 class PlanarTaskTest(parameterized.TestCase):
-    """What is of the plane refuses a character that is not."""
+    """Planar tasks reject spatial characters."""
 
     @parameterized.parameters(
         ({'task': 'gait'}, "'biped3d_mocap'"),
@@ -698,13 +698,13 @@ class PlanarTaskTest(parameterized.TestCase):
         ({'terrain': 'gaps'}, "'biped3d_mocap'.*'gaps'|'gaps'.*'biped3d_mocap'"),
         ({'actuation': 'muscle'}, "'biped3d_mocap' has no muscles"),
     )
-    def test_refusal(self, options, message):
+    def test_planar_tasks_reject_spatial_characters(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.build('biped3d_mocap', **options)
 
 
 class ActionMapTest(parameterized.TestCase):
-    """What an action means."""
+    """The map from actions to controls."""
 
     @parameterized.product(name=NAMES, model=('torque', 'velocity', 'position'))
     def test_three_actions_for_every_ball_joint(self, name, model):
@@ -726,7 +726,9 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(control, mapping.action_scale * small)
         np.testing.assert_allclose(mapping.action(control), small, atol=1e-12)
         for action, row in zip(small, control, strict=True):
-            np.testing.assert_array_equal(mapping.control(action), row)  # alone as in a batch
+            np.testing.assert_array_equal(
+                mapping.control(action), row
+            )  # equal alone and in a batch
         far = mapping.control(np.full(len(mapping), 9.0))
         np.testing.assert_array_equal(far, mapping.control(np.ones(len(mapping))))
 
@@ -734,12 +736,12 @@ class ActionMapTest(parameterized.TestCase):
         ('torque', 'torque', 'N m'), ('velocity', 'target velocity', 'rad/s'),
         ('position', 'target rotation vector', 'rad'),
     )  # fmt: skip
-    def test_what_a_control_is(self, model, quantity, unit):
+    def test_controls_are_an_affine_map_of_actions(self, model, quantity, unit):
         mapping = Floating('biped3d', model).map
         self.assertEqual((mapping.quantity, mapping.unit), (quantity, unit))
 
     @parameterized.parameters(*NAMES)
-    def test_reach(self, name):
+    def test_largest_actions_reach_their_limits(self, name):
         reach = {
             model: dict(zip(mapping.names, mapping.action_scale, strict=True))
             for model in ('torque', 'velocity', 'position')
@@ -752,7 +754,7 @@ class ActionMapTest(parameterized.TestCase):
                 rigid = max(np.abs(np.ravel([axis for axis in limits if axis is not None]))) < 0.1
                 self.assertAlmostEqual(reach['position'][part], 0.04 if rigid else 1.5)
 
-    def test_centre_and_half_range(self):
+    def test_action_offset_and_action_scale(self):
         rng = np.random.default_rng(0)
         action_offset, reach = rng.uniform(-0.2, 0.2, 17), rng.uniform(0.5, 1, 17)
         mapping = Floating(
@@ -822,7 +824,7 @@ class AngleAxisTest(parameterized.TestCase):
         self.assertEqual(body.model.nu, FIGURES[name].sizes[0])
 
     @parameterized.parameters(
-        # Where a part begins, what it is, its value at 0 and its change per unit.
+        # First index, kind, value at action 0 and change per unit of each part.
         ('biped3d', 0, 'torso_angle', 0, 4), ('biped3d', 4, 'right_hip_angle', 0, 10.28),
         ('biped3d', 8, 'right_knee', -1.57, 6.28), ('biped3d', 9, 'right_ankle_angle', 0, 6.28),
         ('biped3d_mocap', 12, 'right_ankle_right', 0.2, 1),
@@ -862,7 +864,7 @@ class AngleAxisTest(parameterized.TestCase):
             )
             np.testing.assert_allclose(got, expected)
 
-    def test_forward_swing(self):
+    def test_positive_angle_swings_forward(self):
         """A positive angle about the axis to the right lifts the front, as in the plane."""
         body = self.make('biped3d')
         action = np.zeros(22)
@@ -882,7 +884,7 @@ class AngleAxisTest(parameterized.TestCase):
         np.testing.assert_array_equal(mapping.control(action[0])[:3], control[0, :3])
 
     @parameterized.parameters(*NAMES)
-    def test_action_that_causes_a_control(self, name):
+    def test_action_inverts_control(self, name):
         mapping = self.make(name).map
         rng = np.random.default_rng(6)
         target = np.array([random_targets(name, rng) for _ in range(20)])
@@ -909,11 +911,11 @@ class AngleAxisTest(parameterized.TestCase):
         torques = (body.data.qfrc_actuator[body.dofs][3:6] for body in (by_axis, by_vector))
         np.testing.assert_allclose(*torques, atol=1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for options in ({'action_offset': np.zeros(22)}, {'action_scale': 1.0}):
-            with self.assertRaisesRegex(ValueError, 'those of the original: no action_offset'):
+            with self.assertRaisesRegex(ValueError, 'do not pass action_offset'):
                 Floating('biped3d', 'position', rotations='angle_axis', **options)
-        with self.assertRaisesRegex(ValueError, "unknown way to describe rotations 'axis'"):
+        with self.assertRaisesRegex(ValueError, "unknown description of rotations 'axis'"):
             Floating('biped3d', 'position', rotations='axis')
 
     def test_planar_character(self):
@@ -925,7 +927,7 @@ class AngleAxisTest(parameterized.TestCase):
 
 
 class ServoTest(parameterized.TestCase):
-    """What the compiled actuators do."""
+    """Forces of the compiled actuators."""
 
     @parameterized.parameters(*NAMES)
     def test_position_law(self, name):
@@ -1060,7 +1062,7 @@ class ServoTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_velocity_control_comes_to_rest(self, name):
-        """Clamps of single axes do not make thin limbs shiver."""
+        """Clamps of single axes do not make thin limbs oscillate."""
         body = Floating(name, 'velocity')
         rng = np.random.default_rng(0)
         for _ in range(60):
@@ -1071,7 +1073,7 @@ class ServoTest(parameterized.TestCase):
         self.assertLess(body.speed, 1)
 
     @parameterized.product(name=NAMES, model=('torque', 'velocity', 'position'))
-    def test_torque_limits_in_a_violent_rollout(self, name, model):
+    def test_torque_limits_hold_under_extreme_actions(self, name, model):
         arena = users_arena()
         character = characters.make(name)
         character.create_root_joints(arena.attach(character))
@@ -1092,11 +1094,11 @@ class ServoTest(parameterized.TestCase):
                         norm = np.linalg.norm(data.qfrc_actuator[dof : dof + size])
                         highest[i] = max(highest[i], norm)
         np.testing.assert_array_less(highest, limits * (1 + 1e-9))
-        self.assertGreater((highest / limits).max(), 0.99)  # the limits are met
+        self.assertGreater((highest / limits).max(), 0.99)  # the limits are reached
         self.assertFalse(data.warning.number.any())
 
     @parameterized.parameters(*NAMES)
-    def test_limits_of_joints_hold(self, name):
+    def test_joint_limits_hold(self, name):
         body = Floating(name, 'position', root=False)
         limits = body.character.joint_ranges
         rng = np.random.default_rng(12)

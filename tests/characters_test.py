@@ -1,4 +1,4 @@
-"""Tests of planar characters: the figures of the original's character files, and physics."""
+"""Tests of planar characters: properties from the original's character files, and physics."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from trl_suite import actuation, characters
 
 GRAVITY = 9.81  # m/s^2; of MuJoCo's default, which a user's own arena has
 
-# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, limits rad as they act;
+# link: mass kg, torque limit N m, kp N m/rad, kd N m s/rad, reward weight, effective limits rad;
 # of the hopper's leg, which slides, N and m instead of N m and rad.
 FREE = (-np.inf, np.inf)
 BIPED_LEG = {
@@ -197,7 +197,7 @@ def to_mujoco(vector):
 
 
 def alone(name):
-    """The character compiled by itself, its root at the origin."""
+    """The character compiled alone, its root at the origin."""
     physics = mjcf.Physics.from_mjcf_model(characters.make(name).mjcf_model)
     return physics.model.ptr, physics.data.ptr
 
@@ -245,7 +245,7 @@ class FiguresTest(parameterized.TestCase):
         self.assertAlmostEqual(-min(lowest(model, data)), figures.height, delta=5e-5)
 
     @parameterized.parameters(*NAMES)
-    def test_body_figures_reports_the_same(self, name):
+    def test_body_figures_agree(self, name):
         figures, reported = FIGURES[name], characters.body_figures(characters.make(name))
         self.assertAlmostEqual(reported['mass'], figures.mass, delta=1e-9)
         self.assertAlmostEqual(reported['standing_height'], figures.height, delta=5e-5)
@@ -280,7 +280,7 @@ class FiguresTest(parameterized.TestCase):
             self.assertEqual(model.body(model.body(link).parentid[0]).name, parent)
 
     @parameterized.parameters('dog', 'goat')
-    def test_only_the_pelvis_box_is_turned(self, name):
+    def test_only_the_pelvis_box_is_rotated(self, name):
         model, data = alone(name)
         mujoco.mj_forward(model, data)
         for link in characters.CHARACTERS[name].links:
@@ -390,7 +390,7 @@ class FiguresTest(parameterized.TestCase):
 
 
 class CollisionTest(parameterized.TestCase):
-    """Who can touch whom, as the engine answers."""
+    """Pairs of links that can collide, according to the engine."""
 
     def touching(self, name):
         """Pairs of links (and the floor) that touch when every box is 20 m large."""
@@ -435,7 +435,7 @@ class CollisionTest(parameterized.TestCase):
         ('biped2d_full', 'right_forearm', 'right_hip', False),
         ('biped2d_full', 'right_shoulder', 'right_forearm', False),
     )  # fmt: skip
-    def test_pair(self, name, a, b, touch):
+    def test_links_that_collide_with_each_other(self, name, a, b, touch):
         self.assertEqual(frozenset((a, b)) in self.touching(name), touch)
 
     @parameterized.parameters(*NAMES)
@@ -447,7 +447,7 @@ class CollisionTest(parameterized.TestCase):
         np.testing.assert_array_equal(model.geom_condim[boxes], 3)
 
     @parameterized.parameters(*NAMES)
-    def test_what_is_drawn_weighs_and_touches_nothing(self, name):
+    def test_visual_geoms_have_no_mass_and_no_contacts(self, name):
         model, _ = alone(name)
         looks = model.geom_group == 0
         self.assertGreaterEqual(looks.sum(), len(JOINTS[name]))
@@ -473,7 +473,7 @@ class CollisionTest(parameterized.TestCase):
 
 
 class OwnArenaTest(parameterized.TestCase):
-    """A character lives in any composer arena."""
+    """A character works in any composer arena."""
 
     def place(self, name, model, timestep=1 / 600):
         arena = users_arena(timestep)
@@ -486,7 +486,7 @@ class OwnArenaTest(parameterized.TestCase):
         return character, physics
 
     @parameterized.parameters(*NAMES)
-    def test_falls_and_rests_on_the_floor_with_its_weight(self, name):
+    def test_falls_and_its_contact_forces_equal_its_weight(self, name):
         _, physics = self.place(name, 'torque')
         if name == 'hopper':
             physics.named.data.qvel[f'{name}/root_pitch/'] = 0.5  # it would balance on its point
@@ -562,7 +562,7 @@ class OwnArenaTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, "unknown character 'rapter'.*'raptor'"):
             characters.make('rapter')
 
-    def test_row_of_an_incomplete_file(self):
+    def test_spec_of_an_incomplete_file(self):
         spec = characters.CHARACTERS['biped2d']
         joints = {**spec.joints, 'third_leg': next(iter(spec.joints.values()))}
         with self.assertRaisesRegex(ValueError, "biped2d.xml has no joint named 'third_leg'"):

@@ -1,4 +1,4 @@
-"""Every command of the command line, what it prints, what it leaves, and how it fails."""
+"""Every command of the command line: its output, its files, and its errors."""
 
 import contextlib
 import dataclasses
@@ -101,12 +101,12 @@ class ListTest(CommandTest):
         self.assertEqual(lines[-1], f'{count} environments')
         self.assertLen(lines, count + 2 if count else 1)
 
-    def test_those_with_a_policy(self):
+    def test_trained_lists_environments_with_a_policy(self):
         lines = self.output('list', '--trained', '--domain', 'plaid').splitlines()
         shipped = {id_ for id_ in policies.available() if suite.find(id_).domain == 'plaid'}
         self.assertEqual({line.split()[0] for line in lines[1:-1]}, shipped)
 
-    def test_one_is_singular(self):
+    def test_a_single_match_is_counted_in_the_singular(self):
         out = self.output('list', '--domain', 'plaid', '--terrain', 'flat', '--character', 'dog',
                           '--tag', 'blind')  # fmt: skip
         self.assertEndsWith(out, '\n1 environment\n')
@@ -124,7 +124,7 @@ class ListTest(CommandTest):
 
 class InfoTest(CommandTest):
     @parameterized.parameters(*catalogue.BY_ID)
-    def test_speaks_about_every_environment(self, id_):
+    def test_describes_every_environment(self, id_):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
@@ -299,7 +299,7 @@ class InfoTest(CommandTest):
         self.assertIn('within 0.5 m of the goal and within 2 m of the walker', out)
         self.assertNotRegex(out, r'\n  (speed|upright) ')
 
-    def test_an_alias_is_as_good(self):
+    def test_an_alias_gives_the_same_text(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
 
     def test_only_the_differences_that_apply(self):
@@ -316,9 +316,9 @@ class InfoTest(CommandTest):
             'takes physical units': 'imitation',
             'control at 600 Hz': 'gait',
             'ends with its cycle': 'gait',
-            'taken at touch-down': 'hopper',
+            'applied at touch-down': 'hopper',
             'base action 1': 'raptor',
-            'tuned anew': 'biped',
+            're-tuned': 'biped',
             'z up': 'space',
             'one cone': 'space',
             'rotation vectors': 'vectors',
@@ -395,14 +395,14 @@ class InfoTest(CommandTest):
                 out = self.output('info', id_).split('\nDifferences')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
-    def test_unknown(self):
+    def test_unknown_ids_suggest_the_closest(self):
         self.assert_refused("did you mean 'PD_Biped2D_Gaps_Terrain-v0'", 'info', GAPS[:-1])
         self.assert_refused("did you mean 'plaid/dog_gaps'", 'info', 'plaid/dog_gap')
 
 
 class RolloutTest(CommandTest):
     @parameterized.parameters('random', 'zero', 'clip')
-    def test_trajectory_is_what_the_environment_does(self, policy):
+    def test_trajectory_equals_that_of_the_environment(self, policy):
         steps = 100
         out = self.output(
             'rollout', GAPS, '--seed', '3', '--steps', str(steps), '--policy', policy,
@@ -413,13 +413,13 @@ class RolloutTest(CommandTest):
             t = dict(data)
         self.assertEqual((str(t['id']), int(t['seed'])), (GAPS, 3))
         episodes = int((t['step_types'] == 0).sum())
-        self.assertGreater(episodes, 1)  # it ran over ends of episodes
+        self.assertGreater(episodes, 1)  # it continued after ends of episodes
         self.assertLen(t['rewards'], steps + episodes)
         self.assertEqual(t['observations'].shape, (steps + episodes, 104))
         self.assertEqual(t['qpos'].shape, (steps + episodes, 14))
         self.assertLessEqual(np.abs(t['actions']).max(), 1)
         ends = np.flatnonzero(t['step_types'] == 2)
-        np.testing.assert_array_equal(t['actions'][[*ends, -1]], 0)  # nothing is done there
+        np.testing.assert_array_equal(t['actions'][[*ends, -1]], 0)  # there is no action
 
         # The recorded actions lead a fresh environment through the recorded states, bit for bit.
         environment = suite.make(GAPS, {'random': 3})
@@ -450,7 +450,7 @@ class RolloutTest(CommandTest):
             end = 'goes on' if i == episodes and t['step_types'][-1] != 2 else 'fell'
             self.assertRegex(out, rf'\n +{i} +{length} +[\d.]+ +-?[\d.]+ +{end}\n')
 
-    def test_an_episode_that_is_cut(self):
+    def test_a_truncated_episode(self):
         def short(id_, task_kwargs):
             return suite.build('raptor', task_kwargs={**task_kwargs, 'step_limit': 3})
 
@@ -461,7 +461,7 @@ class RolloutTest(CommandTest):
         for i, line in enumerate(episodes, 1):
             self.assertRegex(line, rf'^ +{i} +3 +[\d.]+ +[\d.]+  was cut$')
 
-    def test_many_episodes_are_summed_up(self):
+    def test_many_episodes_are_summarised(self):
         out = self.output('rollout', GAPS, '--steps', '600', '--seed', '1')
         lines = out.splitlines()
         self.assertLen(lines, rollout.SHOWN_EPISODES + 3)
@@ -523,7 +523,7 @@ class RolloutTest(CommandTest):
         )  # fmt: skip
         self.assert_only()
 
-    def test_how_an_episode_of_a_gait_ends(self):
+    def test_ends_of_episodes_of_gaits_are_named(self):
         for end in ('fell', 'stuck'):
 
             def fail(task, env_ids, finish=GaitTask.finish_step, end=end):
@@ -562,11 +562,11 @@ class RolloutTest(CommandTest):
         ('required: ID', '--seed', '1'),
         ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
     )  # fmt: skip
-    def test_refusals_leave_nothing_behind(self, message, *arguments):
+    def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'rollout', *arguments)
         self.assert_only()
 
-    def test_an_interrupt_leaves_nothing_behind(self):
+    def test_an_interrupt_leaves_no_files(self):
         frame, calls = rendering.frame, []
 
         def interrupted(*arguments):
@@ -620,7 +620,7 @@ def save_policy(path, id_, seed=0):
 class TrainedTest(CommandTest):
     """Policies from a file or shipped, in rollout."""
 
-    def test_a_file(self):
+    def test_a_policy_file(self):
         policy = save_policy('mine.npz', GAPS)
         self.output(
             'rollout', GAPS, '--steps', '40', '--policy', 'mine.npz', '--trajectory', 'a.npz'
@@ -632,7 +632,7 @@ class TrainedTest(CommandTest):
             expected = policy(t['observations'][acted])
             np.testing.assert_array_equal(t['actions'][acted], expected)
 
-    def test_the_reference(self):
+    def test_the_shipped_policy(self):
         save_policy(f'{GAPS}.npz', GAPS)
         with mock.patch.object(resources, 'directory', lambda kind: self.folder):
             self.assertEqual(policies.available(), (GAPS,))
@@ -651,7 +651,7 @@ class TrainedTest(CommandTest):
                     command, 'PD_Dog2D_Gaps_Terrain-v0', '--policy', 'reference',
                 )  # fmt: skip
 
-    def test_one_that_does_not_fit(self):
+    def test_a_policy_of_another_environment_is_rejected(self):
         save_policy('mine.npz', GAPS)
         pathlib.Path('broken.npz').write_bytes(b'no')
         for command in ('rollout', 'evaluate'):
@@ -733,7 +733,7 @@ class EvaluateTest(CommandTest):
         ("suffix '.txt'; expected .json", GAPS, '--json', 'a.txt'),
         ("the folder 'no' does not exist", GAPS, '--json', 'no/a.json'),
     )
-    def test_refusals_leave_nothing_behind(self, message, *arguments):
+    def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'evaluate', *arguments)
         self.assert_only()
 
@@ -755,13 +755,13 @@ class TerrainTest(CommandTest):
         self.assert_refused('length is 400.0', 'terrain', 'plane', '--length', '400')
         self.assert_only('terrain_stairs3d.png', 'b.png')
 
-    def test_a_file(self):
+    def test_a_policy_file(self):
         (self.folder / 'own').mkdir()
         (self.folder / 'own' / 'mine.json').write_text('{"Type": "var2d_gaps"}')
         self.assertEqual(self.output('terrain', 'own/mine.json'), 'terrain_mine.png\n')
         self.assert_only('own', 'terrain_mine.png')
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         pathlib.Path('bad.json').write_text('{"Type": "var2d_gap"}')
         for message, *arguments in (
             ("unknown terrain 'gasp'; did you mean 'gaps'", 'gasp'),
@@ -782,7 +782,7 @@ class ProgramTest(CommandTest):
     def test_version(self):
         self.assertRegex(self.output('--version'), r'^trl-suite \d+\.\d+\.\d+\n$')
 
-    def test_no_or_another_command(self):
+    def test_a_missing_or_unknown_command_is_an_error(self):
         self.assert_refused('required: command', *())
         self.assert_refused("invalid choice: 'lst'", 'lst')
 
@@ -791,7 +791,7 @@ class ProgramTest(CommandTest):
             self.assert_refused("pip install 'trl_suite", 'rollout', GAPS, '--video', 'a.mp4')
 
     def test_other_errors_are_not_hidden(self):
-        # A defect of ours must keep its traceback.
+        # A bug must keep its traceback.
         with (
             mock.patch.object(listing, '_values', lambda *_: 1 / 0),
             self.assertRaises(ArithmeticError),
@@ -810,14 +810,16 @@ class ProgramTest(CommandTest):
         self.assertRegex(done.stderr, "^trl-suite: error: nothing can be drawn.* is 'disable'.*\n$")
         self.assert_only()
         done = self.program('rollout', GAPS, '--steps', '5', MUJOCO_GL='disable')
-        self.assertEqual((done.returncode, done.stderr), (0, ''))  # without pictures all is well
+        self.assertEqual(
+            (done.returncode, done.stderr), (0, '')
+        )  # without rendering there is no error
 
     def test_a_broken_library_or_a_wrong_name(self):
         done = self.program('info', GAPS, MUJOCO_GL='nonsense')
         self.assertEqual((done.returncode, done.stdout), (2, ''))
         self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
 
-    def test_a_reader_that_stops_reading(self):
+    def test_a_closed_pipe_is_not_an_error(self):
         with subprocess.Popen(
             [sys.executable, '-m', 'trl_suite', 'list'], stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -833,7 +835,7 @@ class ProgramTest(CommandTest):
 
 
 class ReadmeTest(CommandTest):
-    """What the README and the expert show."""
+    """Code and commands of the README and the guide."""
 
     text = ''.join(
         (pathlib.Path(__file__).parents[1] / name).read_text(encoding='utf-8')

@@ -1,4 +1,4 @@
-"""Programs that use the suite through other libraries: the examples run, and get what they expect."""
+"""Programs that use the suite through other libraries: the examples run with expected results."""
 
 import contextlib
 import importlib
@@ -46,7 +46,7 @@ def output(name, *arguments):
 
 
 def run_page(word):
-    """Runs the code of docs/clients.md that has a word in it; returns its names."""
+    """Runs the code block of docs/clients.md that contains a word; returns its names."""
     page = (ROOT / 'docs' / 'clients.md').read_text(encoding='utf-8')
     (code,) = (
         found for found in re.findall('```python\n(.*?)```', page, re.DOTALL) if word in found
@@ -64,14 +64,14 @@ def load(name):
 
 
 class GymnasiumTest(absltest.TestCase):
-    def test_example(self):
+    def test_example_runs(self):
         out = output('gymnasium_rollout')
         self.assertRegex(out, r'^one: return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
         # Random actions fell a walker within a second or so: 16 simulations of 256 steps.
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
 
-    def test_rows_say_how_they_are_reset(self):
-        """As an attribute too, as Gymnasium's own vector environments: TorchRL asks for it."""
+    def test_metadata_has_the_autoreset_mode(self):
+        """Also as an attribute, as in Gymnasium's vector environments: TorchRL reads it."""
         for mode in gymnasium.vector.AutoresetMode:
             envs = trl_suite.gym.SuiteVectorEnv(GAPS, 2, num_threads=1, autoreset_mode=mode)
             self.assertIs(envs.autoreset_mode, mode)
@@ -80,7 +80,7 @@ class GymnasiumTest(absltest.TestCase):
 @needs('stable_baselines3', 'sb3')
 class StableBaselinesTest(absltest.TestCase):
     @pytest.mark.slow
-    def test_example(self):
+    def test_example_runs(self):
         out = output(
             'stable_baselines_ppo', '--minutes', '1.5', '--every', '4096', '--num_threads', '1'
         )
@@ -121,7 +121,7 @@ class TorchRLTest(parameterized.TestCase):
         self.assertEqual(found, sizes)
 
     @parameterized.parameters(0, 3)
-    def test_a_seed_is_an_episode(self, num_envs):
+    def test_a_seed_determines_the_episode(self, num_envs):
         import torch
 
         rollouts = []
@@ -133,8 +133,8 @@ class TorchRLTest(parameterized.TestCase):
         self.assertTrue((rollouts[0] == rollouts[1]).all())
         self.assertFalse((rollouts[0] == rollouts[2]).all())
 
-    def test_rows_are_those_of_the_suite(self):
-        """What a rollout over ends of episodes says, in every simulation, a single environment does."""
+    def test_simulations_equal_those_of_the_suite(self):
+        """A rollout through successive episodes equals that of single environments."""
         import torch
 
         environment = self.make(3)
@@ -156,13 +156,13 @@ class TorchRLTest(parameterized.TestCase):
                 if terminated or truncated:
                     observation, _ = single.reset()
 
-    def test_page(self):
+    def test_code_of_the_page_runs(self):
         names = run_page('torchrl')
         self.assertEqual(names['simulations'].batch_size, (16,))
         self.assertEqual(names['one'].batch_size, ())
 
     @pytest.mark.slow
-    def test_example(self):
+    def test_example_runs(self):
         out = output('torchrl_ppo', '--samples', '24576')
         returns = [float(found) for found in re.findall(r'return +([\d.]+)\n', out)]
         self.assertLen(returns, 12)
@@ -181,7 +181,7 @@ class ShimmyTest(parameterized.TestCase):
 
         check_env(DmControlCompatibilityV0(suite.make(id_)), skip_render_check=True)
 
-    def test_a_seed_is_an_episode(self):
+    def test_a_seed_determines_the_episode(self):
         from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
         env = DmControlCompatibilityV0(suite.make(GAPS))
@@ -197,12 +197,12 @@ class ShimmyTest(parameterized.TestCase):
             for name, block in time_step.observation.items():
                 np.testing.assert_array_equal(observation[name], block)
 
-    def test_page(self):
+    def test_code_of_the_page_runs(self):
         expected = suite.make(FLAT, {'random': 1}).reset().observation
         for name, block in run_page('shimmy')['observation'].items():
             np.testing.assert_array_equal(block, expected[name])
 
-    def test_example(self):
+    def test_example_runs(self):
         out = output('shimmy_rollout')
         self.assertRegex(out, r'^return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
         self.assertEndsWith(out, 'picture of shape (240, 320, 3)\n')

@@ -98,10 +98,10 @@ class ClipsTest(parameterized.TestCase):
         self.assertGreater(self.reports[name].clearance, 0.02)
 
     @each_clip
-    def test_planted_feet_stand(self, name):
+    def test_planted_feet_do_not_slide(self, name):
         report = self.reports[name]
         self.assertLess(report.slide, SLIDE)
-        self.assertGreater(report.planted, 0.3)  # else the check above has seen nothing
+        self.assertGreater(report.planted, 0.3)  # otherwise the check above is not effective
 
     @each_clip
     def test_pace(self, name):
@@ -254,20 +254,20 @@ class SelectionTest(parameterized.TestCase):
         np.testing.assert_array_equal(library.select(query), np.arange(len(library)))
         np.testing.assert_allclose(query, library.features, atol=0.017)  # toes up, toes down
 
-    def test_rows_do_not_see_each_other(self):
+    def test_queries_are_independent(self):
         library = motion.load_steps('biped3d_mocap')
         query = np.random.default_rng(0).normal(0, 0.5, (50, 7))
         rows = [library.select(row[None])[0] for row in query]
         np.testing.assert_array_equal(library.select(query), rows)
 
-    def test_is_the_nearest(self):
+    def test_selects_the_nearest(self):
         library = motion.load_steps('biped3d_mocap')
         query = np.random.default_rng(0).normal(0, 0.5, (50, 7))
         gap = (query[:, None] - library.features)[..., 4:] * (0.54, 0.54, 0.48)
         nearest = np.linalg.norm(gap, axis=2).argmin(axis=1)
         np.testing.assert_array_equal(library.select(query), nearest)
 
-    def test_weights(self):
+    def test_weights_scale_the_distance(self):
         library = motion.load_steps('biped3d_mocap')
         query = library.features.copy()
         query[:, 4:6] = 0

@@ -75,13 +75,13 @@ class ClipsTest(parameterized.TestCase):
         self.assertGreater(self.reports[name].lowest, -DEEPEST)
 
     @each_clip
-    def test_planted_feet_stand(self, name):
+    def test_planted_feet_do_not_slide(self, name):
         report = self.reports[name]
         self.assertLess(report.slide, SLIDE)
-        self.assertGreater(report.planted, 0.3)  # else the check above has seen nothing
+        self.assertGreater(report.planted, 0.3)  # otherwise the check above is not effective
 
     @each_clip
-    def test_goes_as_fast_as_the_original(self, name):
+    def test_speed_and_period_are_those_of_the_original(self, name):
         speed, period = ORIGINAL[name]
         clip = motion.load(name)
         self.assertAlmostEqual(clip.speed / speed, 1, delta=0.1)
@@ -108,7 +108,7 @@ class ClipsTest(parameterized.TestCase):
 
 
 class ChecksTest(absltest.TestCase):
-    """The measurements find the faults they are for."""
+    """The checks find the corresponding faults."""
 
     def setUp(self):
         super().setUp()
@@ -119,20 +119,20 @@ class ChecksTest(absltest.TestCase):
         poses[:, column] = change(poses[:, column])
         return checks.measure(dataclasses.replace(self.clip, poses=poses), 'raptor', 400)
 
-    def test_sunk(self):
+    def test_penetration_is_found(self):
         self.assertAlmostEqual(self.changed(1, lambda z: z - 0.02).lowest, -0.02, delta=1e-3)
 
-    def test_sliding(self):
+    def test_sliding_is_found(self):
         # 10 % more travel: while a foot stands for 0.12 s the body should not gain 5 cm on it.
         self.assertGreater(self.changed(0, lambda x: 1.1 * x).slide, SLIDE)
 
-    def test_beyond_a_limit(self):
+    def test_a_violated_limit_is_found(self):
         column = 3 + self.clip.joints.index('left_knee')
         margin, joint = self.changed(column, lambda angle: angle + 0.5).margin
         self.assertLess(margin, 0)
         self.assertEqual(joint, 'left_knee')
 
-    def test_open_seam(self):
+    def test_a_jump_at_the_seam_is_found(self):
         def kink(z):
             return z + 0.01 * np.linspace(0, 1, len(z)) ** 2
 

@@ -1,4 +1,4 @@
-"""The commands doctor, bench, gallery and clip, and what is behind them."""
+"""The commands doctor, bench, gallery and clip, and the functions that they use."""
 
 import importlib.metadata
 import json
@@ -62,7 +62,7 @@ class TryTest(CommandTest):
 
 class DoctorTest(CommandTest):
     def test_this_installation_runs(self):
-        """The part that everything else needs: a process of its own steps and draws."""
+        """The essential check: a separate process steps and renders an environment."""
         (found,) = doctor.self_test(())
         self.assertEqual((found.state, found.remedy), (doctor.OK, ''))
         self.assertRegex(found.text, r'runs: \d+ steps per second, first picture after \d')
@@ -75,11 +75,11 @@ class DoctorTest(CommandTest):
         self.assertEqual([f.state for f in found], [doctor.OK, doctor.FAILED, doctor.FAILED])
         self.assertEqual(found[1].remedy, "pip install 'mujoco>=99'")
         self.assertIn('no-such-thing is missing', found[2].text)
-        # What the suite itself asks for is here.
+        # All required packages are installed.
         self.assertEqual({finding.state for finding in doctor.versions()}, {doctor.OK})
 
-    def test_a_process_says_why_it_failed(self):
-        # At exit, a half-loaded library may complain at length.
+    def test_a_failed_process_reports_its_error(self):
+        # At exit, a partly loaded library may print long messages.
         code = 'import atexit; atexit.register(lambda: print(1 / 0)); import no_such_module'
         status, _, error = doctor._end(doctor._start(code))
         self.assertEqual(
@@ -96,7 +96,7 @@ class DoctorTest(CommandTest):
             (),
             'MUJOCO_GL=disable if you need no',
         ),
-        ((1, '', 'ImportError: mujoco'), (), 'see what failed above'),
+        ((1, '', 'ImportError: mujoco'), (), 'see failures above'),
     )
     def test_remedies(self, end, works, remedy):
         with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):
@@ -116,7 +116,7 @@ class DoctorTest(CommandTest):
         self.assertEqual((found['osmesa'].state, found['glfw'].state), (doctor.NOTE, doctor.OK))
         self.assertIn('libosmesa6', found['osmesa'].remedy)
 
-    def test_fewer_cores_than_there_are(self):
+    def test_fewer_usable_cores_are_noted(self):
         with (
             mock.patch.object(machine, 'cores', return_value=2),
             mock.patch.object(doctor.os, 'cpu_count', return_value=8),
@@ -125,7 +125,7 @@ class DoctorTest(CommandTest):
         self.assertStartsWith(found.text, '2 of 8 cores usable')
         self.assertIn('num_threads=2', found.remedy)
 
-    def test_where_compiled_code_is_kept(self):
+    def test_cache_of_compiled_code_is_reported(self):
         found = doctor.compiled_code()
         self.assertEqual(found.state, doctor.OK)
         self.assertIn(str(doctor.compiled.cache_folder()), found.text)
@@ -138,8 +138,8 @@ class DoctorTest(CommandTest):
     def test_exit_status(self):
         good, bad = doctor.Finding('ok', 'fine'), doctor.Finding('FAILED', 'no engine', 'mend it')
         for found, status, last in (
-            ([good], 0, 'all is well'),
-            ([good, bad], 1, '1 thing to mend'),
+            ([good], 0, 'all checks passed'),
+            ([good, bad], 1, '1 check failed'),
         ):
             with mock.patch.object(doctor, 'findings', lambda found=found: iter(found)):
                 code, out, _ = run('doctor')
@@ -148,7 +148,7 @@ class DoctorTest(CommandTest):
 
 
 class BenchTest(CommandTest):
-    def test_measures(self):
+    def test_results_are_printed_and_written(self):
         out = self.output(
             'bench', 'plaid/dog_gaps', '--num-envs', '3', '--threads', '1', '--seconds', '0.05',
             '--json', 'bench.json',
@@ -165,14 +165,14 @@ class BenchTest(CommandTest):
             self.assertGreater(found[name], 0, name)
 
     def test_counts_physics_steps(self):
-        """Also of a gait, whose steps last differently."""
+        """Also for a gait, whose steps differ in duration."""
         self.enterContext(mock.patch.object(bench, 'WARM', 0.1))
         found = bench.vector('FSM_Hopper2D_Terrain_Gaps-v0', 2, 1, 0.05)
         self.assertGreater(found['physics'], 50 * found['control'])
         found = bench.vector('PD_Dog2D_Flat-v0', 2, 1, 0.05)
         self.assertAlmostEqual(found['physics'] / found['control'], 10, delta=2)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         self.assert_refused("did you mean 'PD_Dog2D_Gaps", 'bench', 'PD_Dog_Gaps_Terrain-v0')
         self.assert_refused('seconds is 0', 'bench', '--seconds', '0')
         self.assert_refused('folder', 'bench', '--json', 'no/bench.json')
@@ -212,7 +212,7 @@ class GalleryTest(CommandTest):
             height, width = gallery.STRIP_SIZE
             self.assertEqual(image.size, (6 * width + 5 * 4, height))
 
-    def test_what_is_there_stays(self):
+    def test_existing_pictures_are_kept(self):
         old = pathlib.Path('characters')
         old.mkdir()
         (old / 'dog.jpg').write_text('mine')
@@ -222,7 +222,7 @@ class GalleryTest(CommandTest):
         self.output('gallery', '--filter', 'characters/dog', '--output', '.', '--overwrite')
         self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
 
-    def test_a_policy_that_was_replaced_is_drawn_again(self):
+    def test_pictures_of_a_replaced_policy_are_redrawn(self):
         only = ('gallery', '--filter', f'curves/{GAPS}', '--output', 'g')
         for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
             with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
@@ -232,7 +232,7 @@ class GalleryTest(CommandTest):
             gallery.save(np.zeros((9, 9, 3), np.uint8), path, 'digest')
             self.assertEqual(gallery._source(path), 'digest')
 
-    def test_one_that_fails_stops_no_other(self):
+    def test_an_error_does_not_stop_other_pictures(self):
         def draw():
             raise ValueError('no such\nthing')
 
@@ -260,14 +260,14 @@ class ActingTest(parameterized.TestCase):
         ('PD_Dog2D_Flat-v0', 'clip'), ('Torque_Dog2D_LLC_Imitate_Flat-v0', 'zero'),
         ('FSM_Hopper2D_Terrain_Gaps-v0', 'zero'), ('PD_Biped3D_HLC_Soccer-v0', 'scripted'),
     )  # fmt: skip
-    def test_the_best_there_is(self, id_, name):
+    def test_best_policy_that_exists_is_chosen(self, id_, name):
         environment = suite.make(id_, {'random': 0})
         with mock.patch.object(policies, 'reference', side_effect=FileNotFoundError):
             found, policy = acting.best(environment, id_)
         self.assertEqual(found, name)
         self.assertEqual(policy(environment.reset()).shape, environment.action_spec().shape)
 
-    def test_a_shipped_one_is_best(self):
+    def test_a_shipped_policy_is_best(self):
         environment = suite.make(GAPS, {'random': 0})
         self.assertEqual(acting.best(environment, GAPS)[0], 'reference')
 
@@ -303,7 +303,7 @@ class ClipTest(CommandTest):
         self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
         self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
 
-    def test_bad_maps(self):
+    def test_invalid_maps_are_rejected(self):
         for text, message in (
             ('[1, 2]', 'map.json: expected an object of names'),
             ('[1, 2', 'map.json: not JSON'),
@@ -314,7 +314,7 @@ class ClipTest(CommandTest):
                 message, 'clip', 'run.json', '--character', 'raptor', '--map', 'map.json'
             )
 
-    def test_refusals_leave_nothing_behind(self):
+    def test_errors_leave_no_files(self):
         here = [path.name for path in self.folder.iterdir()]
         for message, *arguments in (
             ("unknown character 'cat'", 'run.json', '--character', 'cat'),

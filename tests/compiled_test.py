@@ -1,4 +1,4 @@
-"""Compiled functions: what they may do, and where their machine code is kept."""
+"""Compiled functions: supported features, and the cache of their machine code."""
 
 import contextlib
 import io
@@ -92,9 +92,9 @@ def allocates(n):
 
 
 class FunctionTest(parameterized.TestCase):
-    """What compiled functions can do."""
+    """Features of compiled functions."""
 
-    def test_loops_take_packs(self):
+    def test_compiled_loops_accept_packs(self):
         pair = Pair(np.array([1.0, 2.0, 3.0]), np.zeros(3))
         scale_all(np.array([0, 2]), packed(pair))
         np.testing.assert_array_equal(pair.second, [-2, 0, 6])
@@ -108,7 +108,7 @@ class FunctionTest(parameterized.TestCase):
         other = packed(whole._replace(pair=Pair(frozen[::2], np.zeros((1, 1)))))
         self.assertEqual(mixed(other), (2.0, 1, 3.5, 1))
 
-    def test_what_cannot_be_packed(self):
+    def test_unsupported_values_cannot_be_packed(self):
         with self.assertRaisesRegex(TypeError, 'Whole.pair.second is list; expected an array, a'):
             packed(Whole(Pair(np.zeros(2), [1.0]), 7, 0.5, True))
 
@@ -121,17 +121,17 @@ class FunctionTest(parameterized.TestCase):
         second = np.zeros(2000)
         pack, others = packed(Pair(np.full(2000, 3.0), second)), []
         for _ in range(20):
-            others.append(np.full(2000, 7.0))  # would take the place of what was freed
+            others.append(np.full(2000, 7.0))  # would reuse freed memory
         scale_all(np.array([5]), pack)
         self.assertEqual(second[5], 1.5)
 
-    def test_who_allocates_is_refused(self):
+    def test_allocation_is_rejected(self):
         import numba
 
         with self.assertRaises(numba.core.errors.NumbaError):
             allocates(3)
 
-    def test_the_python_function_remains(self):
+    def test_the_python_function_is_accessible(self):
         self.assertEqual(twice.function(4), 8)
         self.assertEqual(twice.__name__, 'twice')
 
@@ -152,7 +152,7 @@ class FunctionTest(parameterized.TestCase):
 
 
 class CacheTest(FolderTest):
-    """The folder of the machine code, in processes of their own."""
+    """The cache folder of the machine code, in separate processes."""
 
     def setUp(self):
         super().setUp()
@@ -184,14 +184,14 @@ class CacheTest(FolderTest):
     def folders(self, base=None):
         return sorted((base or self.cache).glob('trl_suite-*'))
 
-    def test_code_is_kept_for_each_state_of_the_sources(self):
+    def test_code_is_cached_per_state_of_the_sources(self):
         self.assertEqual(self.ask(), (['11.0'], ''))
         (first,) = self.folders()
         files = {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')}
         self.assertNotEmpty(files)
         self.assertEqual(self.ask()[0], ['11.0'])
         self.assertEqual(files, {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')})
-        # Numba alone would go on with the code of `outer`, whose file is as it was.
+        # Numba alone would reuse the code of `outer`, whose file has not changed.
         self.write('x * 20.0')
         self.assertEqual(self.ask()[0], ['21.0'])
         self.assertLen(self.folders(), 2)
@@ -216,7 +216,7 @@ class CacheTest(FolderTest):
             self.assertEqual(found, [str(path) for path in self.folders(base)])
         self.assertFalse(self.cache.exists())
 
-    def test_without_a_folder_that_can_be_written(self):
+    def test_without_a_writable_folder(self):
         file = self.folder / 'file'
         file.touch()
         nowhere = str(file / 'cache')
@@ -228,7 +228,7 @@ class CacheTest(FolderTest):
         self.assertEqual(found, ['11.0', '20.0'])
         self.assertEqual(warned.count('no folder for compiled code is writable'), 1)
 
-    def test_numbas_setting_is_left_alone(self):
+    def test_numbas_setting_is_not_changed(self):
         found, _ = self.ask("""
             import numba
             from trl_suite.outer import outer
@@ -249,8 +249,8 @@ class CacheTest(FolderTest):
         self.ask(FOLDER)
         self.assertEqual([p.exists() for p in (old, new, other)], [False, True, True])
 
-    def test_types_of_others_are_not_kept(self):
-        """Who has not the module of a type could not read the list in which it is."""
+    def test_foreign_types_are_not_cached(self):
+        """A process without the module of a type could not read the index that contains it."""
         (self.folder / 'foreign.py').write_text(TUPLE.format('Foreign'))
         (self.package / 'own.py').write_text(TUPLE.format('Own') + FIRST)
         self.ask(f'{PACKED} from foreign import Foreign; print(first(packed(Foreign(np.ones(2)))))')
@@ -313,7 +313,7 @@ class CacheTest(FolderTest):
 
 
 class DisabledTest(parameterized.TestCase):
-    """Environments return the same numbers where their rules run as Python."""
+    """Environments return the same numbers if their rules run as Python."""
 
     SCRIPT = """
         import hashlib, sys
@@ -337,7 +337,7 @@ class DisabledTest(parameterized.TestCase):
         'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_LLC_Symetric_Step-v0',
         'PD_Biped3D_HLC_DynamicsObstacles-v0', 'PD_Biped3D_Terrain_Soccer_Hard-v0',
     )  # fmt: skip
-    def test_the_same_numbers(self, id_):
+    def test_results_are_equal_without_compilation(self, id_):
         found = [
             subprocess.run(
                 [sys.executable, '-c', textwrap.dedent(self.SCRIPT), id_], capture_output=True,

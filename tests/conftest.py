@@ -1,9 +1,9 @@
-"""Spares the garbage collector."""
+"""Exempts modules and tests from garbage collection."""
 
 import gc
 
 
 def pytest_collection_finish():
-    # Modules and tests are never garbage. The collector would look through them whenever an
-    # environment, which is full of cycles, was let go: a sixth of the whole run.
+    # Modules and tests are never garbage. The collector would traverse them whenever an
+    # environment, which is full of cycles, is released: a sixth of the time of the whole run.
     gc.freeze()

@@ -1,4 +1,4 @@
-"""Tests of the gait state machines: figures, dynamics, laws and transitions, by other means."""
+"""Tests of the gait state machines: parameters, dynamics, laws and transitions, recomputed."""
 
 import mujoco
 import numpy as np
@@ -82,9 +82,9 @@ SOLES = {'toe': (0.03, -0.035), 'finger': (0.03, -0.035)}
 
 
 class ParametersTest(parameterized.TestCase):
-    """Vectors, base actions, and what an action means."""
+    """Parameter vectors, base actions, and the map from actions to parameters."""
 
-    def test_who_has_a_gait(self):
+    def test_characters_with_a_gait(self):
         self.assertCountEqual(controllers.available(), NAMES)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
             controllers.load('dgo')
@@ -127,11 +127,11 @@ class ParametersTest(parameterized.TestCase):
         gait = controllers.load(name)
         actions = gait.action(gait.base_actions)
         self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
-        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # none is out of reach
+        np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # all are within [-1, 1]
         found = gait.vector(np.clip(actions, -1, 1))
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
 
-    def test_what_action_0_means(self):
+    def test_action_0_is_the_default_gait(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
         np.testing.assert_array_equal(dog.action_offset, dog.base_actions[0])
         np.testing.assert_array_equal(hopper.action_offset, hopper.base_actions[0])
@@ -169,7 +169,7 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_allclose(gait.action(vectors), actions, atol=1e-9)
         np.testing.assert_allclose(gait.action(vectors[2]), actions[2], atol=1e-9)
 
-    def test_files_that_are_wrong(self):
+    def test_invalid_files_are_rejected(self):
         good = {
             'character': 'hopper', 'kind': 'hop', 'legs': [['hip', 'leg']], 'feet': ['leg'],
             'targets': {'Hip': ['hip']}, 'misc': ['Gain'], 'states': ['Up', 'Down'],
@@ -213,7 +213,7 @@ class Rig:
             model = light_model(arena.mjcf_model)
             self.world = BatchWorld(model, n, 1, dynamics.FIELDS)
         else:
-            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # must be kept alive
+            self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)  # keeps it alive
             self.world = PhysicsWorld(self.physics, dynamics.FIELDS)
         arena.bind(self.world)
         self.gait.bind(self.world)
@@ -251,7 +251,7 @@ class Rig:
         self.world.forward(self.env_ids)
 
     def touches(self, links):
-        """Makes the gait believe in contacts until the next step: names of links, or (n, L) bool."""
+        """Overrides contacts until the next step: names of links, or (n, L) bool."""
         on = np.isin(self.character.spec.links, links) if isinstance(links, tuple) else links
         first, sensed = self.rules.machine.contact, self.world.sensordata
         if isinstance(self.world, BatchWorld):
@@ -278,7 +278,7 @@ class Rig:
 
 
 def enter(rig):
-    """Has all machines enter the states that they are in."""
+    """Calls the state entry of the current states of all machines."""
     for env_id in rig.env_ids:
         machine.enter(env_id, rig.rules)
 
@@ -426,7 +426,7 @@ class DynamicsTest(parameterized.TestCase):
             np.testing.assert_array_equal(matrix[[0, 2]], others)
 
     @parameterized.parameters(*NAMES)
-    def test_rows_do_not_depend_on_each_other(self, name):
+    def test_simulations_are_independent(self, name):
         rig = Rig(name, 5, batch=True)
         rig.scatter(4)
         gait, feet = rig.gait, rig.gait.parameters.feet
@@ -439,7 +439,7 @@ class DynamicsTest(parameterized.TestCase):
 
 
 class LawTest(parameterized.TestCase):
-    """What acts on the joints, against the formulas."""
+    """Joint torques against the formulas."""
 
     @parameterized.product(name=NAMES, batch=(False, True))
     def test_stable_pd(self, name, batch):
@@ -474,7 +474,7 @@ class LawTest(parameterized.TestCase):
         np.testing.assert_array_equal(np.delete(found[0], [hip, rig.joints.index('left_hip')]), 0)
 
     @parameterized.parameters(*NAMES)
-    def test_what_state_entry_sets(self, name):
+    def test_state_entry_sets_targets(self, name):
         rig = Rig(name)
         gait, figures = rig.gait, controllers.load(name)
         vector = np.random.default_rng(0).uniform(-2, 2, len(figures.names))
@@ -501,7 +501,7 @@ class LawTest(parameterized.TestCase):
             found = dict(zip(rig.joints, gait.state.target[0], strict=True))
             self.assertEqual(found, expected)
 
-    def test_targets_of_joints_that_no_state_moves(self):
+    def test_targets_of_joints_without_a_state_target(self):
         dog, raptor = Rig('dog'), Rig('raptor')
         found = dict(zip(dog.joints, dog.gait.state.target[0], strict=True))
         for joint, angle in (
@@ -644,7 +644,7 @@ class LawTest(parameterized.TestCase):
 
 
 class MachineTest(parameterized.TestCase):
-    """When states end, and what follows."""
+    """Transitions of states."""
 
     def leave(self, rig, state, links, phase=0.0):
         """Puts the machine into a state, advances it once, and returns (state, cycle's end)."""
@@ -679,7 +679,7 @@ class MachineTest(parameterized.TestCase):
                     ends = late if state < 3 else swing_foot in links
                     expected = (min(state + 1, 3), state == 3) if ends else (state, False)
                     self.assertEqual(self.leave(rig, state, links, phase), expected)
-                    # The legs change places with the cycle, before anybody looks.
+                    # The legs are exchanged with the cycle, before any query.
                     self.assertEqual(
                         rig.gait.state.stance[0], 1 - stance if expected[1] else stance
                     )
@@ -713,7 +713,7 @@ class MachineTest(parameterized.TestCase):
         vector[...] = 0  # the caller's own
         np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[2:3])
 
-    def test_rows_move_on_by_themselves(self):
+    def test_simulations_change_states_independently(self):
         rig = Rig('dog', 4, batch=True)
         gait = rig.gait
         gait.state.number[:], gait.state.phase[:] = (0, 1, 3, 0), (0.999, 0.2, 0.1, 0.3)
@@ -752,7 +752,7 @@ class MachineTest(parameterized.TestCase):
                     )
                     self.assertEqual(bool(gait.state.rising[0]), now)
 
-    def test_hop_begins_in_the_air_and_goes_on_at_touch_down(self):
+    def test_hop_begins_in_the_air_and_continues_at_touch_down(self):
         rig = Rig('hopper')
         gait = rig.gait
         gait.apply(rig.env_ids, gait.parameters.base_actions[3:4])
@@ -811,7 +811,7 @@ def run(rig, steps):
 
 
 class AloneTest(parameterized.TestCase):
-    """A gait needs no environment of the suite."""
+    """A gait works without an environment of the suite."""
 
     def test_a_dog_on_a_floor_of_dm_control(self):
         arena, dog = floors.Floor(), characters.make('dog')
@@ -848,7 +848,7 @@ class AloneTest(parameterized.TestCase):
         self.assertGreater(world.qpos[0, places[0]], 6.0)
         self.assertLess(abs(world.qpos[0, places[2]]), 1.2)
 
-    def test_who_has_none_is_refused(self):
+    def test_characters_without_a_gait_are_rejected(self):
         arena, biped = floors.Floor(), characters.make('biped2d')
         arena.attach(biped)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'biped2d'"):

@@ -1,4 +1,4 @@
-"""The pages in docs/: as fresh as the code, with all that they link to; and the README."""
+"""The pages in docs/ and the README: up to date, with existing link targets."""
 
 import importlib.util
 import pathlib
@@ -27,8 +27,8 @@ generate = load('generate')
 
 
 class PagesTest(absltest.TestCase):
-    def test_fresh(self):
-        """Made anew, all pages are what is there: run `python docs/generate.py` if this fails."""
+    def test_pages_are_up_to_date(self):
+        """Generated pages equal the stored ones: run `python docs/generate.py` if this fails."""
         pages = generate.pages()
         self.assertEqual(list(generate.stale(pages)), [])
         for folder, names in (
@@ -38,8 +38,8 @@ class PagesTest(absltest.TestCase):
             for name in names:
                 self.assertIn(f'{folder}/{name}.md', pages)
 
-    def test_links(self):
-        """Whatever a page links to is there, and is not empty."""
+    def test_links_have_targets(self):
+        """Every link target of a page exists, and is not empty."""
         files = [ROOT / 'README.md', *DOCS.rglob('*.md')]
         for file in files:
             for link in _LINK.findall(file.read_text(encoding='utf-8')):
@@ -70,8 +70,8 @@ class WordsTest(parameterized.TestCase):
     @parameterized.parameters(
         'PD_Dog2D_Gaps_Terrain-v0', 'FSM_Raptor2D_Terrain_Walls-v0', 'PD_Biped3D_HLC_LargeBlocks-v0'
     )
-    def test_what_is_built_on_other_ground_is_told_the_same(self, id_):
-        """Pages of environments that differ by their ground share what was built."""
+    def test_descriptions_do_not_depend_on_the_ground(self, id_):
+        """Environments that differ only in their ground have equal descriptions."""
         spec = suite.find(id_)
         other = next(
             each for each in catalogue.SPECS

@@ -1,4 +1,4 @@
-"""Simulations as arrays: what the engine does is what MuJoCo does."""
+"""Simulations as arrays: results of the engine equal those of MuJoCo."""
 
 import pathlib
 import tempfile
@@ -57,7 +57,7 @@ def state_of(model, data):
 
 
 class StepTest(parameterized.TestCase):
-    """A step is `mj_step` as often as asked."""
+    """A step is `mj_step`, repeated."""
 
     def raw(self, ctrl):
         """States, and what is computed from them, after plain steps of MuJoCo."""
@@ -112,7 +112,7 @@ class StepTest(parameterized.TestCase):
                 found = getattr(world, name)[i]
                 np.testing.assert_array_equal(found, getattr(data, name), err_msg=name)
 
-    def test_others_do_not_move(self):
+    def test_other_simulations_do_not_move(self):
         world = BatchWorld(model(), 4, 1)
         world.forward(world.all_ids)
         before = [world.get_state(i) for i in range(4)]
@@ -121,7 +121,7 @@ class StepTest(parameterized.TestCase):
         self.assertEqual(moved, [False, True, False, True])
         np.testing.assert_array_equal(world.time > 0, moved)
 
-    def test_what_is_written_reaches_the_physics(self):
+    def test_written_arrays_reach_the_physics(self):
         world = BatchWorld(model(), 2, 1)
         world.qpos[1, :4], world.qvel[1, :4] = (1.0, 0.2, 0.3, -0.4), 0.5
         world.mocap_pos[1, 0] = (3.0, 0.0, 1.0)
@@ -147,7 +147,7 @@ class StepTest(parameterized.TestCase):
         self.assertEqual(world.time[0], 0)
 
     @parameterized.parameters(False, True)
-    def test_what_may_be_written(self, one):
+    def test_writable_arrays(self, one):
         world = (
             PhysicsWorld(mjcf.Physics.from_xml_string(XML)) if one else BatchWorld(model(), 2, 1)
         )
@@ -157,7 +157,7 @@ class StepTest(parameterized.TestCase):
 
 
 class StateTest(parameterized.TestCase):
-    """States that are saved and restored, and simulations that break down."""
+    """States that are saved and restored, and simulations that diverge."""
 
     def worlds(self):
         return PhysicsWorld(mjcf.Physics.from_xml_string(XML)), BatchWorld(model(), 2, 1)
@@ -168,7 +168,7 @@ class StateTest(parameterized.TestCase):
             world.step(SUBSTEPS)
         return np.concatenate([world.qpos[0], world.qvel[0], world.sensordata[0], world.time[:1]])
 
-    def test_a_restored_state_goes_on_bit_for_bit(self):
+    def test_a_restored_state_continues_bit_for_bit(self):
         for world in self.worlds():
             world.forward(world.all_ids)
             self.advance(world, 30, 1)
@@ -178,7 +178,7 @@ class StateTest(parameterized.TestCase):
             np.testing.assert_array_equal(world.get_state(0), state)
             np.testing.assert_array_equal(self.advance(world, 30, 2), expected)
 
-    def test_a_state_of_another_world(self):
+    def test_a_state_of_another_world_is_rejected(self):
         one, many = self.worlds()
         one.forward(one.all_ids)
         self.advance(one, 30, 1)
@@ -199,7 +199,7 @@ class StateTest(parameterized.TestCase):
             world.step(SUBSTEPS)
             np.testing.assert_array_equal(world.diverged(), [True, False][: world.n])
             self.assertTrue(world.any_diverged())
-            world.step(SUBSTEPS)  # MuJoCo has put it back; it stays known as diverged
+            world.step(SUBSTEPS)  # MuJoCo has reset it; it remains marked as diverged
             self.assertTrue(world.diverged()[0])
             world.set_state(0, good)
             self.assertFalse(world.any_diverged())
@@ -211,7 +211,7 @@ class StateTest(parameterized.TestCase):
 
 
 class NamesTest(parameterized.TestCase):
-    """Where things are, by name."""
+    """Ids and addresses by name."""
 
     def test_ids_and_addresses(self):
         world = BatchWorld(model(), 1, 1)
@@ -252,7 +252,7 @@ class LibraryTest(parameterized.TestCase):
         self.assertLen(set(found), len(native.NAMES))
         self.assertTrue(all(found))
 
-    def test_another_version(self):
+    def test_another_version_is_rejected(self):
         native.check_version('3.17.0', '3.17.0', 'libmujoco.so')
         with self.assertRaisesRegex(
             ImportError,
@@ -260,7 +260,7 @@ class LibraryTest(parameterized.TestCase):
         ):
             native.check_version('3.9.0', '3.17.0', 'libmujoco.so')
 
-    def test_no_library(self):
+    def test_a_missing_library_is_an_error(self):
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / '__init__.py')
             with (
@@ -297,7 +297,7 @@ class ShareTest(parameterized.TestCase):
         self.world().share(lambda part: parts.append(len(part)), np.arange(0))
         self.assertEqual(sum(parts), 0)
 
-    def test_the_other_parts_are_finished_before_it_raises(self):
+    def test_other_parts_finish_before_an_error_is_raised(self):
         world, done, go = self.world(), [], threading.Event()
 
         def work(part):

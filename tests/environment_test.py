@@ -17,7 +17,7 @@ from trl_suite.tasks.imitation.planar import PlanarImitation
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
 SMALL_BIPED = (7, 6, 16)  # of the Imitation family
 GAIT_LINKS = {'Dog2D': 21, 'Goat2D': 21, 'Raptor2D': 19, 'Biped2D': 7, 'Hopper2D': 3}
-# Sizes as the original's papers and programs have them.
+# Sizes in the original's papers and programs.
 SIZES = {
     'PD_Biped2D_Gaps_Terrain-v0': (104, 11), 'PD_Dog2D_Steps_Terrain-v0': (140, 20),
     'PD_Raptor2D_Walls_Terrain-v0': (132, 18), 'PD_Biped2D_Flat-v0': (54, 11),
@@ -112,7 +112,7 @@ def expected_blocks(id_):
 
 def random_actions(environment, steps, seed=0):
     spec = environment.action_spec()
-    # Of wilder gaits many a cycle lasts until it is cut, which takes long.
+    # Many cycles of random gaits last until truncation, which takes long.
     scale = 0.3 if hasattr(environment.task, 'gait') else 1.0
     return scale * np.random.default_rng(seed).uniform(
         spec.minimum, spec.maximum, (steps, *spec.shape)
@@ -131,15 +131,15 @@ def rollout(environment, actions):
     )
 
 
-def every_row(id_):
-    """What holds for all environments, dm_env's own tests among it, for one of them.
+def every_environment(id_):
+    """Tests of one environment that apply to all, including those of dm_env.
 
-    It is built once for all tests, as building takes most of the time; a seed brings it back to
-    where a new one begins.
+    It is built once for all tests, as building takes most of the time; seeding restores the state
+    of a new one.
     """
     gait, high = is_gait(id_), is_high(id_)
 
-    class EveryRow(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    class EveryEnvironment(test_utils.EnvironmentTestMixin, absltest.TestCase):
         @classmethod
         def setUpClass(cls):
             super().setUpClass()
@@ -156,7 +156,7 @@ def every_row(id_):
                 cls.kept.popitem()[1].close()
 
         def made(self, seed, flat=False, step_limit=256):
-            """The environment, seeded anew, before the first reset of that seed."""
+            """The environment, newly seeded, before its first reset."""
             if flat not in self.kept:
                 self.kept[flat] = suite.make(id_, {'random': seed}, {'flat_observation': flat})
             environment = self.kept[flat]
@@ -164,7 +164,7 @@ def every_row(id_):
             environment._step_limit = step_limit
             return environment
 
-        # By another name, so that it comes first: then the environment is fresh.
+        # Renamed so that it runs first: then the environment is fresh.
         test_a_step_on_fresh_environment = (
             test_utils.EnvironmentTestMixin.test_step_on_fresh_environment
         )
@@ -179,18 +179,18 @@ def every_row(id_):
             absltest.TestCase.tearDown(self)  # the mixin's closes the environment
 
         def make_action(self):
-            # dm_env's is the least that is allowed: of such a gait a cycle lasts until it is cut.
+            # dm_env uses the minimum: with such an action, a cycle of a gait lasts until truncation.
             return np.zeros(self.environment.action_spec().shape) if gait else super().make_action()
 
         def make_action_sequence(self):
             return random_actions(self.environment, 3 if gait or high else 30)
 
-        def test_specs(self):
+        def test_action_spec_is_minus_1_to_1(self):
             spec = self.environment.action_spec()
             self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
             self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
 
-        def test_blocks(self):
+        def test_observation_blocks_have_the_expected_sizes(self):
             environment, blocks = self.environment, expected_blocks(id_)
             spec = environment.observation_spec()
             self.assertEqual(list(spec), list(blocks))  # terrain first
@@ -204,18 +204,18 @@ def every_row(id_):
 
         if id_ in SIZES:
 
-            def test_sizes(self):
+            def test_sizes_are_those_of_the_original(self):
                 environment, (observation, action) = self.made(0, flat=True), SIZES[id_]
                 spec = environment.observation_spec()
                 self.assertEqual(spec['observations'].shape, (observation,))
                 self.assertEqual(environment.action_spec().shape, (action,))
 
-        def test_random_rollout(self):
-            # A walker that is told nonsense may well stay up: its episode is cut.
+        def test_random_rollout_is_finite_with_rewards_in_0_to_1(self):
+            # A walker with random plans may not fall: its episode is truncated.
             self.wander(*((6, 4) if gait else (16, 12) if high else (200, 256)))
 
         @pytest.mark.slow
-        def test_long_random_rollout(self):
+        def test_long_random_rollout_is_finite_with_rewards_in_0_to_1(self):
             self.wander(300 if gait or high else 5000, 256)
 
         def wander(self, steps, step_limit):
@@ -230,17 +230,19 @@ def every_row(id_):
             self.assertTrue(((rewards[~first] >= 0) & (rewards[~first] <= 1)).all())
             self.assertTrue(np.isin(discounts[~first], (0, 1)).all())
             last = np.array([each is dm_env.StepType.LAST for each in types])
-            self.assertTrue(last.any())  # random actions fall, or the episode is cut
+            self.assertTrue(
+                last.any()
+            )  # random actions lead to a fall, or the episode is truncated
             np.testing.assert_array_equal(rewards[discounts == 0], 0)
             np.testing.assert_array_equal(last[discounts == 0], True)
 
-        def test_flat_observation_is_the_blocks_side_by_side(self):
+        def test_flat_observation_is_the_concatenated_blocks(self):
             blocks, flat = self.made(2), self.made(2, flat=True)
             actions = random_actions(blocks, 1 if gait else 3 if high else 20)
             for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
                 np.testing.assert_array_equal(ours, theirs)
 
-        if not gait and not high:  # these run their physics by themselves: see gait_test, and below
+        if not gait and not high:  # these step their physics in the task: see gait_test, and below
 
             def test_plain_composer_environment_agrees(self):
                 ours = self.made(3)
@@ -258,7 +260,7 @@ def every_row(id_):
 
         if high:
 
-            def test_plain_composer_environment_is_refused(self):
+            def test_plain_composer_environment_is_rejected(self):
                 idle = {'idle': (0.1, lambda task: np.zeros(task.world.n))}
                 for options in ({}, {'interface': 'frame'}, {'rewards': idle}):
                     task = suite.build_task(suite.find(id_), options)
@@ -273,12 +275,14 @@ def every_row(id_):
                     ):
                         environment.step(np.zeros(len(task.action_map)))
 
-    EveryRow.__name__ = EveryRow.__qualname__ = f'EveryRow_{id_}'.replace('-', '_')
-    return EveryRow
+    EveryEnvironment.__name__ = EveryEnvironment.__qualname__ = f'EveryEnvironment_{id_}'.replace(
+        '-', '_'
+    )
+    return EveryEnvironment
 
 
 for _id in suite.ALL_IDS:
-    _class = every_row(_id)
+    _class = every_environment(_id)
     globals()[_class.__name__] = _class
 del _class  # else it would be collected twice
 
@@ -291,7 +295,7 @@ class ActionTest(parameterized.TestCase):
         (np.inf, 'action\\[2\\] \\(right_ankle\\) is inf'),
         (-np.inf, 'action\\[2\\] \\(right_ankle\\) is -inf'),
     )
-    def test_not_finite(self, value, message):
+    def test_actions_that_are_not_finite_are_rejected(self, value, message):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         action = np.zeros(11)
@@ -303,13 +307,13 @@ class ActionTest(parameterized.TestCase):
         self.assertTrue(environment.step(np.zeros(11)).mid())
 
     @parameterized.parameters(((),), ((1, 11),), ((10,),), ((12,),))
-    def test_wrong_shape(self, shape):
+    def test_actions_of_wrong_shape_are_rejected(self, shape):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         with self.assertRaisesRegex(ValueError, r'shape .*; expected \(11,\)'):
             environment.step(np.zeros(shape))
 
-    def test_not_numbers(self):
+    def test_actions_that_are_not_numbers_are_rejected(self):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         with self.assertRaisesRegex(ValueError, 'not an array of numbers'):
@@ -326,7 +330,7 @@ class ActionTest(parameterized.TestCase):
         np.testing.assert_array_equal(poses[0], poses[1])
         np.testing.assert_array_equal(poses[0], poses[2])
 
-    def test_the_given_action_is_left_alone(self):
+    def test_the_given_action_is_not_changed(self):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         action = np.full(11, 2.0)
@@ -371,7 +375,7 @@ class EpisodeTest(parameterized.TestCase):
                 return i, step
         return None
 
-    def test_every_row_is_cut_after_256_steps(self):
+    def test_every_environment_is_truncated_after_256_steps(self):
         for id_ in suite.ALL_IDS:
             # Plans of half a second, of a run 0.3 s: 200 s.
             plans = 667 if id_.endswith('PathFollowing_Run-v0') else 400
@@ -379,7 +383,7 @@ class EpisodeTest(parameterized.TestCase):
         self.assertEqual(suite.make(GAPS).step_limit, 256)
 
     @parameterized.parameters(({}, 256), ({'step_limit': 7}, 7), ({'time_limit': 0.5}, 15))
-    def test_a_cut_is_no_failure(self, options, steps):
+    def test_truncation_is_not_a_failure(self, options, steps):
         environment = held(**options)
         count, step = self.length(environment)
         self.assertEqual(count, steps)
@@ -414,7 +418,7 @@ class EpisodeTest(parameterized.TestCase):
         self.assertTrue(step.first())
         self.assertFalse(environment.info['fell'])
 
-    def test_touching_with_other_links_is_no_fall(self):
+    def test_contact_of_other_links_is_not_a_fall(self):
         environment = held()
         with environment.physics.reset_context():
             qpos = environment.physics.named.data.qpos
@@ -462,7 +466,7 @@ class DivergenceTest(parameterized.TestCase):
     """Physics that breaks down ends the episode and nothing else."""
 
     @parameterized.parameters(*EXAMPLES)
-    def test_a_huge_velocity(self, id_):
+    def test_a_huge_velocity_is_divergence(self, id_):
         environment = suite.make(id_, {'random': 6})
         environment.reset()
         actions = random_actions(environment, 4)
@@ -477,7 +481,7 @@ class DivergenceTest(parameterized.TestCase):
             np.testing.assert_array_equal(value, kept[name])
         self.recovers(environment, actions)
 
-    def test_not_a_number(self):
+    def test_nan_is_divergence(self):
         environment = suite.make(GAPS, {'random': 6})
         environment.reset()
         actions = random_actions(environment, 4)
@@ -491,7 +495,7 @@ class DivergenceTest(parameterized.TestCase):
             self.assertTrue(np.isfinite(value).all())
         self.recovers(environment, actions)
 
-    def test_a_joint_that_spins_too_fast(self):
+    def test_a_joint_that_spins_too_fast_is_divergence(self):
         environment = suite.make('Torque_Dog2D_LLC_Imitate_Flat-v0', {'random': 6})
         environment.reset()
         environment.physics.model.dof_damping[:] = 0
@@ -514,7 +518,7 @@ class DivergenceTest(parameterized.TestCase):
 
 
 class ObservableTest(parameterized.TestCase):
-    """A user's own observables beside the blocks."""
+    """A user's own observables in addition to the blocks."""
 
     def build(self, **options):
         spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
@@ -524,7 +528,7 @@ class ObservableTest(parameterized.TestCase):
             getattr(observables, name).enabled = True
         return Environment(task, random=7, **options)
 
-    def test_they_are_there_and_current(self):
+    def test_observables_are_current(self):
         environment = self.build()
         spec = environment.observation_spec()
         self.assertEqual(list(spec)[:4], ['terrain', 'pose', 'velocity', 'phase'])
@@ -556,7 +560,7 @@ class ObservableTest(parameterized.TestCase):
         self.assertEqual(list(observation), ['observations'])
         self.assertEqual(observation['observations'].shape, (140 + 20 + 63 + 3,))
 
-    def test_observations_are_the_users_to_keep(self):
+    def test_returned_observations_are_not_overwritten(self):
         environment = suite.make(GAPS, {'random': 0})
         first = environment.reset().observation
         copies = {name: value.copy() for name, value in first.items()}
@@ -578,7 +582,7 @@ class HookTest(parameterized.TestCase):
         )  # fmt: skip
 
     @parameterized.parameters('before_substep', 'after_substep')
-    def test_refused(self, hook):
+    def test_invalid_arguments_are_rejected(self, hook):
         hooked = type('Hooked', (PlanarImitation,), {hook: lambda self, *_: None})
         with self.assertRaisesRegex(ValueError, f'{hook} hook.*composer.Environment'):
             Environment(self.task(hooked))
@@ -594,7 +598,7 @@ class HookTest(parameterized.TestCase):
         environment.step(np.zeros(6))
         self.assertEqual(calls, ['reset', 'after_step'])
 
-    def test_an_entity_with_substep_hooks_is_refused(self):
+    def test_an_entity_with_substep_hooks_is_rejected(self):
         class Prop(composer.Entity):
             def _build(self):
                 self._root = mjcf.RootElement('prop')
@@ -620,7 +624,7 @@ class ConstructionTest(parameterized.TestCase):
         ({'time_limit': 0}, 'time_limit is 0'), ({'time_limit': np.nan}, 'time_limit is nan'),
         ({'random': -1}, 'random is -1'), ({'random': 2**32}, 'random is 4294967296'),
     )  # fmt: skip
-    def test_refused(self, options, message):
+    def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.make(GAPS, options)
 
@@ -641,7 +645,7 @@ class ConstructionTest(parameterized.TestCase):
         np.testing.assert_array_equal(heights(5), heights(np.random.RandomState(5)))
         self.assertTrue((heights(5) != heights(6)).any())
 
-    def test_closed(self):
+    def test_a_closed_environment_raises_errors(self):
         environment = suite.make('PD_Biped2D_Flat-v0', {'random': 0})
         environment.reset()
         environment.close()

@@ -55,9 +55,11 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual(found['lengths'], lengths)
         self.assertEqual(found['distances'], distances)
         self.assertEqual(found['fell'], fell)
-        self.assertGreater(len(set(lengths)), 1)  # some rows went on while others had ended
+        self.assertGreater(
+            len(set(lengths)), 1
+        )  # some simulations continued after others had ended
 
-    def test_the_clip_is_followed_as_in_single_environments(self):
+    def test_clip_actions_equal_those_of_single_environments(self):
         id_ = 'PD_Raptor2D_LLC_Imitate_Flat-v0'
         found = evaluation.evaluate(id_, evaluation.clip, 4, 1, factory=True)
         returns, lengths, *_ = alone(
@@ -68,7 +70,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
 
     def test_gaits(self):
-        """Rows whose steps last differently."""
+        """Simulations whose steps differ in duration."""
         spec = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
         found = evaluation.evaluate(spec, evaluation.zero, 3, 5, factory=True)
         returns, lengths, distances, fell, _ = alone(
@@ -77,7 +79,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
         self.assertEqual((found['distances'], found['fell']), (distances, fell))
 
-    def test_threads_and_chunks_do_not_matter(self):
+    def test_results_do_not_depend_on_threads_and_chunks(self):
         policy = make(GAPS)
         expected = evaluation.evaluate(GAPS, policy, 7, 2, num_threads=1)
         self.assertEqual(evaluation.evaluate(GAPS, policy, 7, 2, num_threads=2), expected)
@@ -93,7 +95,7 @@ class EvaluateTest(parameterized.TestCase):
         first = evaluation.evaluate(GAPS, evaluation.random, 5, 1, 1, factory=True)
         self.assertEqual(evaluation.evaluate(GAPS, evaluation.random, 5, 1, 2, factory=True), first)
 
-    def test_doing_nothing_falls_early(self):
+    def test_zero_actions_fall_early(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 10, factory=True)
         self.assertEqual((found['falls'], found['completion_rate'], found['diverged']), (1, 0, 0))
         self.assertEqual(found['fell'], [True] * 10)
@@ -101,7 +103,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertLess(found['normalized_return'], 0.3)
         self.assertGreater(found['normalized_return'], 0)
 
-    def test_episodes_that_are_cut(self):
+    def test_truncated_episodes(self):
         # A step limit that all reach: the rewards of three steps and no fall.
         spec = dataclasses.replace(suite.find(GAPS), step_limit=3)
         found = evaluation.evaluate(spec, make(GAPS), 4)
@@ -149,7 +151,7 @@ class EvaluateTest(parameterized.TestCase):
         found = evaluation.evaluate(FLAT, make(blind), 2, task_kwargs={'terrain_observation': 0})
         self.assertEqual(found['returns'], expected['returns'])
 
-    def test_refuses(self):
+    def test_invalid_arguments_are_rejected(self):
         policy = make(GAPS)
         for message, *arguments in (
             ('episodes is 0', GAPS, policy, 0),

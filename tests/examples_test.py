@@ -32,7 +32,7 @@ class JobsTest(parameterized.TestCase):
         self.assertLen(again, 12)
         self.assertLen([id_ for id_ in again if id_.startswith('MTU_')], 3)
 
-    def test_what_a_run_begins_with_is_trained_before(self):
+    def test_initial_policies_are_trained_before(self):
         seen = set()
         for id_, _ in train_all.jobs('*'):
             start = ppo_settings.settings_for(id_).start
@@ -40,7 +40,7 @@ class JobsTest(parameterized.TestCase):
                 self.assertIn(start, seen, id_)
             seen.add(id_)
 
-    def test_starts_act_as_what_begins_with_them(self):
+    def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
         for id_ in catalogue.BY_ID:
             start = ppo_settings.settings_for(id_).start
@@ -95,7 +95,7 @@ class TrimTest(absltest.TestCase):
 
 
 class TransferTest(parameterized.TestCase):
-    def test_flat_ground_of_every_row(self):
+    def test_flat_ground_of_every_environment(self):
         for spec in catalogue.SPECS:
             if spec.domain == 'plaid':
                 flat = catalogue.BY_ID[compare_transfer.flat_ground(spec)]
@@ -106,7 +106,7 @@ class TransferTest(parameterized.TestCase):
 
 
 class PlansTest(absltest.TestCase):
-    def test_what_is_measured(self):
+    def test_measurements_of_plans(self):
         """Two episodes of a controller that walks nowhere: they end early, without a goal."""
         id_ = 'PD_Biped3D_HLC_PathFollowing-v0'
 
@@ -135,8 +135,8 @@ class PlansTest(absltest.TestCase):
         self.assertLess(found['reward'], found['seconds'] / evaluate_plans.SECONDS)
 
 
-class GuideTest(parameterized.TestCase):
-    """Who shows policies how to plan footsteps."""
+class ExpertTest(parameterized.TestCase):
+    """The expert for footstep plans."""
 
     def test_a_trail(self):
         trail = SimpleNamespace(
@@ -151,7 +151,7 @@ class GuideTest(parameterized.TestCase):
             aim = expert.on_trail(trail, np.array(place), np.array(goal), ahead)
             np.testing.assert_allclose(aim + place, expected, atol=1e-9)
 
-    def test_a_way_on_a_map(self):
+    def test_a_path_on_a_map(self):
         map_ = expert.Map()
         x, y = map_.places.T
         np.testing.assert_allclose(map_.places[map_.middle], 0)
@@ -171,14 +171,14 @@ class GuideTest(parameterized.TestCase):
         ('PD_Biped3D_HLC_Forest-v0', {'interface': 'frame'}),
         ('PD_Biped2D_Flat-v0', {}),
     )
-    def test_ways_that_it_does_not_know(self, id_, options):
+    def test_expert_rejects_unsupported_tasks(self, id_, options):
         environments = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
         with self.assertRaisesRegex(ValueError, 'the expert does not support the task'):
             expert.expert(environments)
 
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
-    def test_it_arrives_where_it_is_dangerous(self, name):
-        """20 s of 8 episodes, towards goals at the least speed that is asked of who has learnt it."""
+    def test_expert_arrives_on_difficult_ground(self, name):
+        """20 s of 8 episodes, towards goals at the least speed required of trained policies."""
         environments = VectorEnvironment(
             f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled'
         )

@@ -49,7 +49,7 @@ def walked(n, switches, **options):
 
 
 class ClockTest(parameterized.TestCase):
-    """Clock and clip agree on who stands."""
+    """Clock and clip agree on the stance foot."""
 
     @parameterized.parameters(
         (0.0, [15, 30, 45, 60, 75, 90]), (0.1, [12, 27, 42]), (0.6, [12, 27, 42])
@@ -65,13 +65,13 @@ class ClockTest(parameterized.TestCase):
             self.assertEqual(environment.info['landed'], task.plan.stance[0] != before)
             right = (phase + i / 30 + 1e-9) % 1 < 0.5
             self.assertEqual(task.plan.stance[0], RIGHT if right else LEFT)
-            # What is observed says the same.
+            # The observation agrees.
             self.assertEqual(step.observation['phase'][0] < 0.5, right)
             self.assertEqual(step.observation['phase'][1:3].any(), right)
         self.assertEqual(found, expected)
 
     @parameterized.parameters('biped2d', 'biped2d_full', 'raptor')
-    def test_the_foot_that_stands_is_planted(self, character):
+    def test_the_stance_foot_is_planted(self, character):
         # In the middle of its half it carries the clip, and the other foot swings ahead.
         environment = suite.build(character, task='footsteps', task_kwargs={'random': 0})
         environment.reset()
@@ -86,7 +86,7 @@ class ClockTest(parameterized.TestCase):
             self.assertLess(z[:, stance].max() + 0.02, z[:, 1 - stance].min())
             self.assertLess(np.ptp(x[:, stance]), 0.25 * np.ptp(x[:, 1 - stance]))
 
-    def test_a_clip_that_begins_with_the_other_foot(self):
+    def test_a_clip_that_starts_in_left_stance(self):
         mirrored = motion.load('biped2d_full_walk').mirrored()
         with self.assertRaisesRegex(ValueError, r'its right foot does not stand.*clip\.mirrored'):
             suite.build('biped2d_full', task='footsteps', clip=mirrored)
@@ -95,7 +95,7 @@ class ClockTest(parameterized.TestCase):
 
 
 class PlanTest(parameterized.TestCase):
-    """How plans are drawn and seen."""
+    """How plans are drawn and observed."""
 
     @parameterized.parameters(0.0, 0.2, 0.5, 0.8)
     def test_the_first_plan(self, phase):
@@ -119,13 +119,13 @@ class PlanTest(parameterized.TestCase):
         self.assertLess(np.abs(lengths - even).max(), 0.35 * 1.95 / np.sqrt(len(lengths)))
 
     @parameterized.parameters(0.0, 0.1, 0.6)
-    def test_they_change_now_and_then(self, change):
+    def test_lengths_change_occasionally(self, change):
         found = walked(60, 15, plans={**VARIED, 'change': change})
         lengths = np.array([after[:, 1, 0] - after[:, 0, 0] for _, after in found])
         changed = np.abs(np.diff(lengths, axis=0)) > 1e-9
         deviation = np.sqrt(change * (1 - change) / changed.size)
         self.assertAlmostEqual(changed.mean(), change, delta=4 * deviation)
-        self.assertGreater(np.ptp(lengths[0]), 0.2)  # drawn anew at every start
+        self.assertGreater(np.ptp(lengths[0]), 0.2)  # redrawn at every start
 
     @parameterized.parameters(0.0, 0.3, 0.5, 0.9)
     def test_plan_slots(self, phase):
@@ -146,7 +146,7 @@ class PlanTest(parameterized.TestCase):
             self.assertEqual(step.observation['plan'][12], 0)
             step = environment.step(task.clip_action(0))
 
-    def test_who_looks_back_sees_the_plan_behind(self):
+    def test_plan_is_relative_to_the_heading(self):
         environment, step = started(start_phase=0.1)
         ahead = step.observation['plan'][3]  # of the left foot
         environment.physics.data.qpos[environment.task.figure.pose_qpos[2]] = np.pi
@@ -212,7 +212,7 @@ class RewardTest(parameterized.TestCase):
             self.assertAlmostEqual(task.TERMS[name][0], weight, delta=1e-12)
 
     @parameterized.parameters(0.02, 0.11, 0.24, 0.49999, 0.53, 0.7, 0.99999)
-    def test_the_clip_is_perfect(self, phase):
+    def test_the_clip_has_full_reward(self, phase):
         # In the second half of a step the swing foot is only there when it lands.
         environment, _ = self.placed(phase)
         for found, (name, weight) in zip(
@@ -235,14 +235,14 @@ class RewardTest(parameterized.TestCase):
             self.assertAlmostEqual(task.reward_terms[0, 2], expected, delta=1e-3)
 
     @parameterized.parameters(0.1, 0.24, 0.6)
-    def test_first_half_of_a_step_does_not_see_the_plan(self, phase):
+    def test_first_half_of_a_step_ignores_the_plan(self, phase):
         environment, _ = self.placed(phase)
         environment.task.plan.landing[0] += 1.0
         environment.task.observe()
         found = environment.task.reward_terms[0, 2]
         self.assertAlmostEqual(found, WEIGHTS['end_effector'], delta=1e-3)
 
-    def test_a_foot_out_of_place(self):
+    def test_a_displaced_foot_lowers_the_reward(self):
         environment, _ = self.placed(0.1)  # in the first half of a step
         before = ankles(environment)
         environment.physics.named.data.qpos['biped2d_full/left_knee'] -= 0.25
@@ -279,7 +279,7 @@ class RewardTest(parameterized.TestCase):
 
 
 class LandingTest(parameterized.TestCase):
-    """How well a foot met its place, and what a miss does."""
+    """The landing error, and the end of an episode by a miss."""
 
     @parameterized.parameters(0.3, 0.8)
     def test_landing_error(self, phase):
@@ -302,7 +302,7 @@ class LandingTest(parameterized.TestCase):
         self.assertEqual(environment.info['landing_error'], error)  # stays until the next one
 
     @parameterized.parameters((0.01, True), (50.0, False), (None, False))
-    def test_a_miss(self, max_landing_error, ends):
+    def test_max_landing_error_ends_the_episode(self, max_landing_error, ends):
         environment, _ = started(start_phase=0.3, max_landing_error=max_landing_error)
         for i in range(1, 7):
             step = environment.step(environment.task.clip_action(0))
@@ -316,7 +316,7 @@ class LandingTest(parameterized.TestCase):
             self.assertFalse(environment.info['landed'])
             self.assertEqual(environment.info['landing_error'], 0)
 
-    def test_what_breaks_down_lands_nowhere(self):
+    def test_a_diverged_simulation_has_no_landing(self):
         environment, _ = started(start_phase=0.4, max_landing_error=5.0)
         for _ in range(2):
             kept = environment.step(ZERO).observation
@@ -333,7 +333,7 @@ class LandingTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """Seeds decide; state and pickles go on bit for bit; many simulations are single ones."""
+    """Seeds, saved states and pickles are exact; simulations equal single environments."""
 
     def advance(self, environment, seed):
         task = environment.task
@@ -343,7 +343,7 @@ class SaveTest(parameterized.TestCase):
         )  # fmt: skip
 
     @parameterized.parameters({}, {'plans': VARIED, 'max_landing_error': 0.5})
-    def test_goes_on_in_the_middle_of_a_step(self, **options):
+    def test_a_state_within_a_step_continues_exactly(self, **options):
         environment, other = (suite.make(ID, {'random': seed, **options}) for seed in (6, 9))
         for each in (environment, other):
             each.reset()
@@ -352,7 +352,7 @@ class SaveTest(parameterized.TestCase):
         self.advance(other, 4)
         assert_goes_on(environment, other, self.advance)
 
-    def test_the_seed_decides(self):
+    def test_a_seed_determines_the_episode(self):
         first, again, another = (
             self.advance(suite.make(ID, {'random': seed, 'plans': VARIED}), 0) for seed in (3, 3, 4)
         )
@@ -360,7 +360,7 @@ class SaveTest(parameterized.TestCase):
         self.assertTrue((first != another).any())
 
     @parameterized.product(n=(1, 2, 5), options=({}, {'plans': VARIED, 'max_landing_error': 0.5}))
-    def test_rows_are_single_environments(self, n, options):
+    def test_simulations_equal_single_environments(self, n, options):
         assert_rows_are_singles(ID, n, 45, 19, options, scale=0.2)
 
 

@@ -48,7 +48,7 @@ def held(environment):
 
 
 def walked(n, switches, id_=GENERAL, **options):
-    """The plans of n walkers who stand still while their clocks run: what plans are made of.
+    """The plans of n walkers that stand still while their clocks run: distributions of plans.
 
     Returns:
       A list over the switches: landing places before and after, headings before and after, stance
@@ -69,7 +69,7 @@ def walked(n, switches, id_=GENERAL, **options):
 
 
 class ClockTest(parameterized.TestCase):
-    """The clock says who stands."""
+    """The clock determines the stance foot."""
 
     @parameterized.parameters(
         (GENERAL, 0.0, [15, 30, 45, 60]), (GENERAL, 0.1, [12, 27, 42, 57]),
@@ -125,7 +125,7 @@ class ClockTest(parameterized.TestCase):
                 break
         self.assertGreater(len(seen), 1)
 
-    def test_breakdown_of_the_documented_rows(self):
+    def test_observation_sizes_of_the_documentation(self):
         self.assertEqual(started()[0].blocks, {
             'pose': slice(0, 57), 'velocity': slice(57, 105), 'phase': slice(105, 110),
             'contact': slice(110, 112), 'plan': slice(112, 125),
@@ -148,7 +148,7 @@ class PlanTest(parameterized.TestCase):
 
     @parameterized.parameters(0.0, 0.2, 0.5, 0.8)
     def test_the_first_plan(self, phase):
-        # Along +x, the feet on lines half a width beside the start.
+        # Along +x, the feet on lines half a width from the line of the start.
         environment, _ = started(start_phase=phase)
         task, feet = environment.task, ankles(environment)
         stance = RIGHT if phase < 0.5 else LEFT
@@ -206,7 +206,7 @@ class PlanTest(parameterized.TestCase):
         self.assertAlmostEqual(turns.mean(), 0.0, delta=0.1 * 4 / np.sqrt(turns.size))
 
     def ways(self, found):
-        """Lengths and widths of the steps that were laid, (switches, n) each."""
+        """Lengths and widths of the planned steps, (switches, n) each."""
         lengths, widths = [], []
         for _, _, after, heading, stance in found:
             x, y = (after[:, 1] - after[:, 0])[:, :2].T
@@ -225,13 +225,13 @@ class PlanTest(parameterized.TestCase):
         self.assertLess(abs(np.corrcoef(lengths.ravel(), widths.ravel())[0, 1]), 0.13)
 
     @parameterized.parameters(0.0, 0.1, 0.6)
-    def test_they_change_now_and_then(self, change):
+    def test_lengths_change_occasionally(self, change):
         _, found = walked(60, 20, plans={'length': (0.25, 0.7), 'change': change})
         lengths, _ = self.ways(found)
         changed = np.abs(np.diff(lengths, axis=0)) > 1e-9
         deviation = np.sqrt(change * (1 - change) / changed.size)
         self.assertAlmostEqual(changed.mean(), change, delta=4 * deviation)
-        self.assertGreater(np.ptp(lengths[0]), 0.3)  # drawn anew at every start
+        self.assertGreater(np.ptp(lengths[0]), 0.3)  # redrawn at every start
 
     def test_plans_made_from_the_root(self):
         environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
@@ -250,7 +250,7 @@ class PlanTest(parameterized.TestCase):
         assert_uniform(widths, 0.08 - 1e-9, 0.28 + 1e-9)
         turns = np.ravel(turns)
         self.assertLessEqual(np.abs(turns).max(), 1.2 + 1e-9)
-        # N(0, 0.45) cut at 1.2, which is 2.67 deviations.
+        # N(0, 0.45) truncated at 1.2, which is 2.67 deviations.
         self.assertAlmostEqual(turns.std(), 0.448, delta=0.045)
         self.assertBetween(np.mean(np.abs(turns) > 1.2 - 1e-6), 0.0, 0.025)
 
@@ -272,7 +272,7 @@ class PlanTest(parameterized.TestCase):
             step = environment.reset()
             for _ in range(6):
                 x, y, z = task.landing[0].T
-                # Height grids are kept in single precision.
+                # Height grids are stored in single precision.
                 np.testing.assert_allclose(z, ground(environment, x, y), atol=1e-6)
                 root = body(environment, 'xpos', 'root')
                 slots = step.observation['plan'][:12].reshape(2, 2, 3)
@@ -311,7 +311,7 @@ class GoalTest(parameterized.TestCase):
     """Plans that head for a goal."""
 
     @parameterized.parameters(TRAIL, GENERAL)
-    def test_plans_head_for_it(self, id_):
+    def test_plans_head_for_the_goal(self, id_):
         environment, _ = started(id_, goal=True, start_phase=0.0)
         task = environment.task
         for _ in range(5):
@@ -341,7 +341,7 @@ class GoalTest(parameterized.TestCase):
         way = task.goal[0, :2] - places.mean(0)[:2]
         self.assertLess(angle_between(task.heading[0], np.arctan2(way[1], way[0])), 1e-9)
 
-    def test_it_is_drawn_anew_on_arrival(self):
+    def test_goal_is_redrawn_on_arrival(self):
         for near in (False, True):
             environment, _ = started(goal=True, start_phase=0.4)
             task = environment.task
@@ -353,7 +353,7 @@ class GoalTest(parameterized.TestCase):
                 environment.step(np.zeros(17))
             self.assertEqual((task.goal[0] != goal).any(), near)
 
-    def test_too_near_a_goal_there_is_no_direction(self):
+    def test_a_goal_that_is_too_near_has_no_direction(self):
         environment, _ = started(start_phase=0.4, goal=True)
         task = environment.task
         before = task.heading[0]
@@ -365,7 +365,7 @@ class GoalTest(parameterized.TestCase):
             environment.step(np.zeros(17))
         self.assertEqual(task.heading[0], before)
 
-    def test_the_walk_on_the_trail_goes_on(self):
+    def test_the_walk_on_the_trail_continues(self):
         environments, found = walked(20, 4, TRAIL)
         task = environments._task
         for env_id in range(20):
@@ -420,7 +420,7 @@ class RewardTest(parameterized.TestCase):
         *((id_, phase) for id_ in (GENERAL, MIRRORED, RUN, FULL) for phase in
           (0.02, 0.11, 0.24, 0.499999, 0.53, 0.7, 0.999999)),
     )  # fmt: skip
-    def test_a_placed_reference_is_perfect(self, id_, phase):
+    def test_the_reference_pose_has_full_reward(self, id_, phase):
         # In the second half of a step the swing foot is only there when it lands.
         environment, _ = self.placed(id_, phase)
         for found, (name, weight) in zip(
@@ -449,14 +449,14 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(task.reward_terms[0, 2], expected, delta=2e-3)
 
     @parameterized.parameters(0.1, 0.2, 0.6, 0.7)
-    def test_first_half_of_a_step_does_not_see_the_plan(self, phase):
+    def test_first_half_of_a_step_ignores_the_plan(self, phase):
         environment, _ = self.placed(GENERAL, phase)
         task = environment.task
         task.landing[0] += 1.0
         task.observe()
         self.assertAlmostEqual(task.reward_terms[0, 2], WEIGHTS['end_effector'], delta=1e-4)
 
-    def test_a_foot_out_of_place(self):
+    def test_a_displaced_foot_lowers_the_reward(self):
         environment, _ = self.placed(GENERAL, 0.1)  # in the first half of a step
         task = environment.task
         before = ankles(environment)
@@ -487,7 +487,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.observation()['plan'][12], off, delta=1e-9)
 
     @parameterized.parameters((0.2, 3.0, 0.6), (-0.4, 2.0, 0.8), (2.0, 3.0, np.pi))
-    def test_a_heading_taken_more_seriously(self, off, scale, counted):
+    def test_heading_scale_multiplies_the_heading_error(self, off, scale, counted):
         environment, _ = self.placed(GENERAL, 0.1, heading_scale=scale)
         task = environment.task
         task.heading[0] = heading_of(environment) + off
@@ -544,7 +544,7 @@ class RewardTest(parameterized.TestCase):
 
 
 class LandingTest(parameterized.TestCase):
-    """How well a foot met its place, and what a miss does."""
+    """The landing error, and the end of an episode by a miss."""
 
     @parameterized.parameters((GENERAL, 0.3), (GENERAL, 0.8), (MIRRORED, 0.3), (BUMPS, 0.3))
     def test_landing_error(self, id_, phase):
@@ -574,7 +574,7 @@ class LandingTest(parameterized.TestCase):
             self.assertEqual(environment.info['landing_error'], error)  # stays until the next one
 
     @parameterized.parameters((0.01, True), (50.0, False), (None, False))
-    def test_a_miss(self, max_landing_error, ends):
+    def test_max_landing_error_ends_the_episode(self, max_landing_error, ends):
         environment, _ = started(start_phase=0.3, max_landing_error=max_landing_error)
         for i in range(1, 7):
             step = environment.step(np.zeros(17))
@@ -589,7 +589,7 @@ class LandingTest(parameterized.TestCase):
             self.assertEqual(environment.info['landing_error'], 0)
 
     @parameterized.parameters({}, {'goal': True}, {'plans': {'from_root': 1.0}})
-    def test_what_breaks_down_lands_nowhere(self, **options):
+    def test_a_diverged_simulation_has_no_landing(self, **options):
         environment, _ = started(start_phase=0.4, max_landing_error=5.0, **options)
         for _ in range(2):
             kept = environment.step(np.zeros(17)).observation
@@ -609,7 +609,7 @@ class LandingTest(parameterized.TestCase):
         self.assertGreater(environment.step(np.zeros(17)).reward, 0.2)
 
     @parameterized.parameters(*IDS)
-    def test_a_fall_ends_it(self, id_):
+    def test_a_fall_ends_the_episode(self, id_):
         environment, _ = started(id_)
         fall = set(environment.task.character.spec.fall_links)
         size, rng = len(environment.action_map), np.random.default_rng(0)
@@ -626,7 +626,7 @@ class StartTest(parameterized.TestCase):
     """Where episodes start."""
 
     @parameterized.parameters(*sorted(terrain.PRESETS3D))
-    def test_nothing_is_sunk_into_the_ground(self, preset):
+    def test_starts_do_not_penetrate_the_ground(self, preset):
         environment = suite.build(
             'biped3d_mocap', terrain=preset, task='footsteps', task_kwargs={'random': 31}
         )
@@ -682,7 +682,7 @@ class MovingGroundTest(parameterized.TestCase):
         np.testing.assert_allclose(upon[:, :2], beside[:, :2] - seen, atol=1e-9)
         np.testing.assert_allclose(upon[:, 2:], beside[:, 2:], atol=1e-9)
 
-    def test_among_moving_boxes(self):
+    def test_walks_among_moving_boxes(self):
         environment = suite.build(
             'biped3d_mocap', terrain='dynamic_obstacles3d', task='footsteps',
             task_kwargs={'random': 2, 'goal': True, 'terrain_observation': 'height'},
@@ -715,7 +715,7 @@ class PushTest(parameterized.TestCase):
                                       + [True] * 3)  # fmt: skip
 
     @parameterized.parameters((0.03, True), (0.1, False))
-    def test_who_was_pushed_may_miss(self, grace_period, ends):
+    def test_pushed_walkers_may_miss(self, grace_period, ends):
         # A push is over after 4/30 s, when grace begins; the foot lands after 6/30 s.
         pushes = {'force': (0, 0), 'duration': (1 / 30,) * 2, 'interval': (0.1, 0.1)}
         environment, _ = started(
@@ -725,7 +725,7 @@ class PushTest(parameterized.TestCase):
             self.assertEqual(environment.step(np.zeros(17)).last(), ends and i == 6)
 
     @parameterized.parameters((0.0, True), (0.6, False))
-    def test_who_is_to_turn_sharply_may_miss(self, grace_period, ends):
+    def test_sharp_turns_allow_a_miss(self, grace_period, ends):
         # The plan turns when a foot lands, after 6/30 s; the next one lands 15/30 s later.
         environment, _ = started(
             start_phase=0.3, max_landing_error=1e-3, grace_period=grace_period, plans={'sharp': 1.0}
@@ -738,7 +738,7 @@ class PushTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         (GENERAL, {}), (TRAIL, {'terrain_observation': 'height'}), (MIRRORED, {'plans': {'from_root': 0.5}}),
@@ -754,7 +754,7 @@ class SaveTest(parameterized.TestCase):
         )  # fmt: skip
 
     @parameterized.parameters(*OPTIONS)
-    def test_goes_on_in_the_middle_of_a_step(self, id_, options):
+    def test_a_state_within_a_step_continues_exactly(self, id_, options):
         environment, other = (suite.make(id_, {'random': seed, **options}) for seed in (6, 9))
         environment.reset()
         other.reset()
@@ -778,7 +778,7 @@ class SaveTest(parameterized.TestCase):
         np.testing.assert_array_equal(self.advance(other, 1), self.advance(environment, 1))
 
     @parameterized.parameters(*OPTIONS)
-    def test_rows_are_single_environments(self, id_, options):
+    def test_simulations_equal_single_environments(self, id_, options):
         assert_rows_are_singles(id_, 4, 45, 19, options, scale=0.2)
 
 

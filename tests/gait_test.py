@@ -1,4 +1,4 @@
-"""Tests of the gait task: observation, reward, falls and cycles, recomputed by other means."""
+"""Tests of the gait task: observation, reward, falls and cycles, recomputed independently."""
 
 import ctypes
 import dataclasses
@@ -13,7 +13,7 @@ from trl_suite import controllers, suite, terrain
 from trl_suite.engine import native
 from trl_suite.vector import VectorEnvironment
 
-# One of each character, on ground of which much is seen.
+# One of each character, on ground with many features in view.
 DOG, GOAT = 'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 RAPTOR, BIPED = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0'
 HOPPER = 'FSM_Hopper2D_Terrain_Mixed_Easy-v0'
@@ -72,7 +72,7 @@ def around_physics(environment, before=None, after=None):
     }
     for number, call in calls.items():
         functions[number] = ctypes.cast(call, ctypes.c_void_p).value
-    environment.calls = calls  # must be kept alive
+    environment.calls = calls  # keeps it alive
 
 
 class Probe:
@@ -174,7 +174,7 @@ class ObservationTest(parameterized.TestCase):
         self.assertAlmostEqual(observation['velocity'][0], 2.813878, delta=0.1)
 
     @parameterized.parameters(1, 3)
-    def test_who_points_backwards_looks_backwards(self, n):
+    def test_a_backward_heading_observes_the_ground_behind(self, n):
         """10 m behind is further than the boxes reach, and another simulation's ground lies there."""
         env_ids = VectorEnvironment(DOG, n, 1, seed=range(7, 7 + n))
         env_ids.reset()
@@ -266,7 +266,7 @@ class RewardTest(parameterized.TestCase):
 
     @parameterized.parameters(*EXAMPLES)
     def test_rollout(self, id_):
-        """Speed and stumbling from what the engine did in between."""
+        """Speed and stumbling, recomputed from the engine's substeps."""
         environment = make(id_, seed=1)
         probe, stumbles = Probe(environment), []
         self.assertEqual(environment.physics.timestep(), 1 / 1200)
@@ -354,24 +354,24 @@ class FallTest(parameterized.TestCase):
     @parameterized.parameters(
         (DOG, 'knee'), (GOAT, 'torso'), (RAPTOR, 'tail3'), (BIPED, 'left_hip')
     )
-    def test_other_links_may_lie_on_the_ground(self, id_, link):
+    def test_contact_of_other_links_is_not_a_fall(self, id_, link):
         adrift = Adrift(id_, velocity=(1, 0, 0))
         adrift.contacts = lambda time: (link,)
         self.assertIsNone(adrift.lasts(3.0))
         self.assertAlmostEqual(adrift.environment.info['stumbled'], 50 / 30)  # the last cycle
 
-    def test_short_touches_are_forgiven(self):
+    def test_short_contacts_are_not_a_fall(self):
         adrift = Adrift(DOG, velocity=(1, 0, 0))
         adrift.contacts = lambda time: ('head',) if 0.05 < time < 0.35 else ()
         self.assertIsNone(adrift.lasts(3.0))
         adrift = Adrift(DOG, velocity=(1, 0, 0))
-        # Between two samples nobody looks.
+        # Between two samples, contacts have no effect.
         adrift.contacts = lambda time: ('head',) if 0.02 < time % 0.1 < 0.08 else ()
         self.assertIsNone(adrift.lasts(3.0))
         self.assertGreater(adrift.environment.info['stumbled'], 0.9)
 
     @parameterized.parameters((3, True), (4, True), (5, False))
-    def test_a_share_of_touches(self, every, falls):
+    def test_a_large_share_of_contacts_is_a_fall(self, every, falls):
         adrift = Adrift(DOG, velocity=(1, 0, 0))
         adrift.contacts = lambda time: () if round(time * 10) % every else ('head',)
         share, expected = 0.0, None
@@ -397,7 +397,7 @@ class FallTest(parameterized.TestCase):
             self.assertIsNone(ends)
 
     @parameterized.parameters((BIPED, 0.1), (DOG, None), (RAPTOR, None), (HOPPER, None))
-    def test_only_the_biped_may_not_go_back(self, id_, expected):
+    def test_only_the_biped_fails_when_it_moves_back(self, id_, expected):
         adrift = Adrift(id_, velocity=(-1, 0, 0))
         found = adrift.lasts(1.0)
         self.assertEqual(found is None, expected is None)
@@ -416,7 +416,7 @@ class FallTest(parameterized.TestCase):
             info = adrift.environment.info
             self.assertEqual((info['fell'], info['stuck'], info['diverged']), (False, True, False))
             self.assertEqual(float(adrift.environment.task.reward[0]), 0.0)
-        # Up counts as well, and every 5 s anew.
+        # Vertical motion counts as well; the window restarts every 5 s.
         adrift = Adrift(RAPTOR, velocity=(0, 0.2, 0))
         self.assertIsNone(adrift.lasts(6.0))
         adrift.environment.physics.data.qvel[:] = 0
@@ -439,7 +439,7 @@ class FallTest(parameterized.TestCase):
         self.assertFalse(environment.info['fell'])
         self.assertTrue(environment.step(idle(environment)).mid())  # all is forgotten
 
-    def test_a_cut_is_no_failure(self):
+    def test_truncation_is_not_a_failure(self):
         environment = make(DOG, step_limit=2)
         self.assertTrue(environment.step(idle(environment)).mid())
         step = environment.step(idle(environment))
@@ -451,7 +451,7 @@ class CycleTest(parameterized.TestCase):
     """How long a step lasts."""
 
     @parameterized.parameters(*EXAMPLES)
-    def test_it_ends_with_the_cycle(self, id_):
+    def test_a_step_ends_with_the_cycle(self, id_):
         environment = make(id_)
         probe, gait = Probe(environment), environment.task.gait
         landing = {DOG: 'toe', GOAT: 'toe', HOPPER: 'leg'}
@@ -478,7 +478,7 @@ class CycleTest(parameterized.TestCase):
             self.assertBetween(np.mean(durations), 3 * 0.0825, 0.3)
 
     @parameterized.parameters(DOG, RAPTOR)
-    def test_one_that_does_not_end_is_cut(self, id_):
+    def test_a_cycle_that_does_not_end_is_truncated(self, id_):
         adrift = Adrift(id_, velocity=(1, 0, 0))
         environment = adrift.environment
         for _ in range(2):
@@ -496,7 +496,7 @@ class CycleTest(parameterized.TestCase):
         if id_ == RAPTOR:  # no step was made
             self.assertEqual(environment.task.gait.state.stance[0], 0)
 
-    def test_the_first_action_counts(self):
+    def test_the_first_action_takes_effect(self):
         for id_ in EXAMPLES:
             environment = make(id_)
             action = np.random.default_rng(0).uniform(-0.3, 0.3, len(environment.action_map))
@@ -528,7 +528,7 @@ class CycleTest(parameterized.TestCase):
             )
             self.assertEqual(action_map.names, tuple(figures.names[i] for i in figures.actions))
 
-    def test_a_plain_composer_environment_is_refused(self):
+    def test_a_plain_composer_environment_is_rejected(self):
         environment = composer.Environment(suite.build_task(suite.find(DOG)), random_state=0)
         environment.reset()
         with self.assertRaisesRegex(RuntimeError, r'environments\.environment\.Environment'):
@@ -580,7 +580,7 @@ class BaseActionTest(parameterized.TestCase):
 
 
 class OptionTest(parameterized.TestCase):
-    """What makes no sense is refused."""
+    """Invalid options are rejected."""
 
     @parameterized.parameters(
         ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
@@ -619,7 +619,7 @@ class GaitTest(parameterized.TestCase):
 
     @parameterized.parameters((DOG, 3.4, 4.4), (GOAT, 1.4, 2.2), (RAPTOR, 3.0, 4.1),
                               (BIPED, 2.6, 3.4), (HOPPER, 2.5, 4.6))  # fmt: skip
-    def test_they_run(self, id_, slowest, fastest):
+    def test_all_gaits_run(self, id_, slowest, fastest):
         """Six simulations with action 0, and six with random ones of amplitude 0.1, for 6 s."""
         environments = VectorEnvironment(
             on_flat(id_), 12, 1, seed=0, autoreset='disabled', step_limit=None,
@@ -646,7 +646,7 @@ class GaitTest(parameterized.TestCase):
 
 
 class StateTest(parameterized.TestCase):
-    """Save anywhere, go on bit for bit."""
+    """States saved at any step continue bit for bit."""
 
     @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
     def test_save_restore_and_pickle(self, id_, interface):
@@ -662,18 +662,18 @@ class StateTest(parameterized.TestCase):
 
         assert_goes_on(environment, other, go)
 
-    def test_a_state_of_another_gait_is_refused(self):
+    def test_a_state_of_another_gait_is_rejected(self):
         states = [make(DOG), make(RAPTOR), make(DOG, interface='base_action')]
         for other in states[1:]:
             with self.assertRaisesRegex(ValueError, 'state'):
                 states[0].set_state(other.get_state())
 
 
-class RowsTest(parameterized.TestCase):
+class BatchTest(parameterized.TestCase):
     """Simulations whose cycles end at different times are single environments all the same."""
 
     @parameterized.product(id_=EXAMPLES, interface=('parameters', 'base_action'))
-    def test_bit_for_bit(self, id_, interface):
+    def test_simulations_equal_single_environments_bit_for_bit(self, id_, interface):
         limit = 3 if interface == 'parameters' else 15
         found, ends = assert_rows_are_singles(
             id_, 4, 2 * limit + 2, limit, {'interface': interface, 'start_noise': 0.02},
@@ -684,7 +684,7 @@ class RowsTest(parameterized.TestCase):
             durations = np.stack([600 * step.info['duration'] for step in found])
             self.assertGreater(len(np.unique(durations.round())), 3)
 
-    def test_rows_that_all_begin_cost_no_physics(self):
+    def test_simulations_that_all_reset_run_no_physics(self):
         specs = VectorEnvironment(RAPTOR, 2, 1, seed=0, step_limit=1)
         specs.reset()
         self.assertTrue(specs.step(np.zeros((2, 28))).truncated.all())
@@ -693,7 +693,7 @@ class RowsTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.reward, 0)
         np.testing.assert_array_equal(step.info['duration'], 0)
 
-    def test_a_row_that_breaks_down(self):
+    def test_a_diverged_simulation_does_not_affect_others(self):
         """Huge and undefined velocities end their simulations, quietly, and no other."""
         specs = VectorEnvironment(DOG, 3, 1, seed=0)
         calm = VectorEnvironment(DOG, 3, 1, seed=0)

@@ -34,7 +34,7 @@ class GoldenTest(parameterized.TestCase):
         self.assertCountEqual(STORED, suite.ALL_IDS)
 
     @parameterized.parameters(*suite.ALL_IDS)
-    def test_first_steps(self, id_):
+    def test_first_steps_equal_the_stored_ones(self, id_):
         stored = dict(STORED[id_])
         found = GOLDEN.summary(id_, stored.pop('seed'))
         self.assertCountEqual(found, stored)

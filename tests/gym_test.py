@@ -24,7 +24,7 @@ FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SHORT = {'step_limit': 20}  # so that random actions meet both ends: falls and the limit
 SMALL = {'height': 48, 'width': 64}
 LONG = ('gait', 'goal_navigation', 'soccer')  # rules of tasks whose steps last many control steps
-# Two for each Box: what has no bounds is declared without.
+# Two for each Box: unbounded values are declared without bounds.
 UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
 
 
@@ -65,9 +65,7 @@ def every_id(id_):
     build another to draw it and one to close it: both are done here with the one.
     """
     spec = suite.find(id_)
-    scale = (
-        0.3 if spec.task_type == 'gait' else 1.0
-    )  # of wilder gaits a cycle lasts until it is cut
+    scale = 0.3 if spec.task_type == 'gait' else 1.0  # cycles of random gaits last until truncation
 
     class EveryId(Same, absltest.TestCase):
         @classmethod
@@ -83,7 +81,7 @@ def every_id(id_):
         def tearDownClass(cls):
             super().tearDownClass()
             cls.env.close()
-            cls.env.close()  # which may be said twice
+            cls.env.close()  # may be called twice
 
         def test_check_env(self):
             with warnings.catch_warnings(record=True) as caught:
@@ -100,7 +98,7 @@ def every_id(id_):
 
         def test_episode_of_a_seed_is_that_of_the_suite(self):
             env = self.env
-            env.reset(seed=1)  # what came before does not matter
+            env.reset(seed=1)  # earlier episodes have no effect
             observation, info = env.reset(seed=7)
             self.assertEqual(set(info['reward_terms'].values()), {0.0})
             theirs = suite.make(id_, {'random': 7}, {'flat_observation': True})
@@ -155,7 +153,7 @@ def every_id(id_):
                 low, high = (0, 1) if name == 'phase' else (-np.inf, np.inf)
                 self.assertEqual((box.low == low).all() and (box.high == high).all(), True)
             # All of PLAiD, the planar footsteps, and in three dimensions all but the one that
-            # observes a target and those above a controller, which are not told the phase.
+            # observes a target and those above a controller, which do not observe the phase.
             self.assertEqual('phase' in blocks, spec.domain == 'plaid' or spec.task_type == 'planar_footsteps' or (
                 'spatial' in spec.tags and 'hierarchical' not in spec.tags
                 and not spec.options.get('reference_observation')
@@ -190,7 +188,7 @@ class SingleTest(Same, parameterized.TestCase):
 
     @parameterized.parameters(GAPS, 'FSM_Raptor2D_Terrain_Slopes-v0', 'PD_Biped3D_HLC_Soccer-v0')
     def test_check_env(self, id_):
-        """All of Gymnasium's checker, with the environments that it builds by itself."""
+        """Gymnasium's full checker, with the environments that it builds."""
         env = gymnasium.make(f'trl_suite/{id_}', render_kwargs=SMALL).unwrapped
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always')
@@ -213,7 +211,7 @@ class SingleTest(Same, parameterized.TestCase):
             self.assertTrue((double[0].astype(np.float32) == single[0]).all())
         self.assertEqual(SuiteEnv(GAPS, dtype=np.float64).action_space.dtype, np.float64)
 
-    def test_ends(self):
+    def test_falls_terminate_and_limits_truncate(self):
         """A fall terminates; the own limit truncates, once."""
         env = gymnasium.make(f'trl_suite/{FLAT}', task_kwargs={'step_limit': 3})
         env.reset(seed=0)
@@ -276,13 +274,13 @@ class SingleTest(Same, parameterized.TestCase):
         ({'dtype': np.int32}, 'int32'),
         ({'task_kwargs': {'step_limt': 3}}, 'step_limt'),
     )
-    def test_refused_options(self, options, message):
+    def test_invalid_options_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             SuiteEnv(GAPS, **options)
         with self.assertRaisesRegex(ValueError, message):
             SuiteVectorEnv(GAPS, 2, **options)
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         env = SuiteEnv(FLAT)
         idle = np.zeros(6)
         with self.assertRaises(gymnasium.error.ResetNeeded):
@@ -308,7 +306,7 @@ class SingleTest(Same, parameterized.TestCase):
 
 
 class VectorTest(Same, parameterized.TestCase):
-    """Rows against Gymnasium's own vector environment of single ones."""
+    """Simulations against Gymnasium's vector environment of single environments."""
 
     def pair(self, mode, n=3, seed_list=(5, 9, 11), **options):
         single = {'task_kwargs': SHORT, **options}
@@ -358,7 +356,7 @@ class VectorTest(Same, parameterized.TestCase):
             if ended.any():
                 # Gymnasium's takes the mask out of the dict.
                 options = [{'reset_mask': ended.copy()} for _ in range(2)]
-                seed = [100 + step] * 3 if step % 2 else None  # of the rows that are reset
+                seed = [100 + step] * 3 if step % 2 else None  # of the simulations that are reset
                 self.assert_same(
                     ours.reset(seed=seed, options=options[0]),
                     theirs.reset(seed=seed, options=options[1]),
@@ -370,7 +368,7 @@ class VectorTest(Same, parameterized.TestCase):
             for _ in range(21):
                 ours.step(idle)
 
-    def test_seed_of_the_whole(self):
+    def test_one_seed_gives_every_simulation_its_own(self):
         ours = SuiteVectorEnv(GAPS, 3)
         first, _ = ours.reset(seed=5)
         children = np.random.SeedSequence(5).generate_state(3)
@@ -414,7 +412,7 @@ class VectorTest(Same, parameterized.TestCase):
         self.assertEqual(count, expected)
 
     @parameterized.parameters(0, 2.5, -3)
-    def test_refused_max_episode_steps(self, steps):
+    def test_invalid_max_episode_steps_are_rejected(self, steps):
         with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
             SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
         with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
@@ -448,7 +446,7 @@ class VectorTest(Same, parameterized.TestCase):
         self.assertTrue((frames[0] != frames[1]).any())
         self.assertIsNone(SuiteVectorEnv(GAPS, 1).render())
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         with self.assertRaisesRegex(ValueError, 'NextStep'):
             SuiteVectorEnv(FLAT, 2, autoreset_mode='NexStep')
         with self.assertRaisesRegex(ValueError, 'step_limit'):

@@ -1,4 +1,4 @@
-"""What several test modules share: looks at a simulation, and checks of simulations and of saved states."""
+"""Shared by test modules: access to simulations, and checks of simulations and saved states."""
 
 import pathlib
 import pickle
@@ -20,7 +20,7 @@ STEP_WEIGHTS = {  # of the reward of footsteps
 }  # fmt: skip
 
 
-# What a simulation holds, by named access.
+# Values of a simulation, by named access.
 
 
 def body(environment, field, link):
@@ -44,7 +44,7 @@ def ground(environment, x, y):
 
 
 def links_on_ground(environment):
-    """Names of the links that touch the terrain, as the engine's list of contacts says."""
+    """Names of the links that touch the terrain, according to the engine's contacts."""
     model, contact = environment.physics.model.ptr, environment.physics.data.ptr.contact
     pairs = model.geom_bodyid[contact.geom]
     names = np.array([model.body(b).name.split('/')[-1] for b in pairs.ravel()]).reshape(-1, 2)
@@ -53,7 +53,7 @@ def links_on_ground(environment):
 
 
 def put(environment, pose, rate):
-    """Puts the character into a pose of a clip: root and joints in link order."""
+    """Sets the character to a pose of a clip: root and joints in link order."""
     task, data = environment.task, environment.physics.data
     data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof] = pose, rate
     environment.physics.forward()
@@ -64,7 +64,7 @@ def angle_between(a, b):
 
 
 def flattened(angle):
-    """Matrix that takes world axes to axes turned about z by an angle."""
+    """Matrix from world axes to axes rotated about z by an angle."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
 
@@ -84,7 +84,7 @@ def assert_uniform(values, low, high):
 def assert_rows_are_singles(
     id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2
 ):
-    """Checks that simulations return what single environments with their seeds do, bit for bit.
+    """Checks that simulations equal single environments with their seeds, bit for bit.
 
     One single environment plays the simulations, one after the other: building many would take most of the
     time, and what it did before must not matter either.
@@ -144,7 +144,7 @@ def _assert_same_info(of_rows, of_one, env_id, where):
 
 
 def advance(environment, seed, steps, scale, look=lambda environment: ()):
-    """Random actions; returns all that came back, and what is looked at, as one array."""
+    """Takes random actions; returns all results and probed values as one array."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(steps):
         step = environment.step(scale * rng.uniform(-1, 1, len(environment.action_map)))
@@ -154,7 +154,7 @@ def advance(environment, seed, steps, scale, look=lambda environment: ()):
 
 
 def assert_goes_on(environment, other, go, before=lambda environment: None):
-    """Checks that a pickled twin and one that took over its state go on like an environment.
+    """Checks that a pickled copy and a restored environment continue exactly like the original.
 
     Args:
       environment: in the middle of an episode.
@@ -180,12 +180,12 @@ def assert_goes_on(environment, other, go, before=lambda environment: None):
 
 
 class FolderTest(parameterized.TestCase):
-    """Has a temporary folder."""
+    """A test with a temporary folder."""
 
     def setUp(self):
         super().setUp()
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def assert_only(self, *names):
-        """Checks what the folder holds."""
+        """Checks the names of the files in the folder."""
         self.assertCountEqual([path.name for path in self.folder.iterdir()], names)

@@ -1,4 +1,4 @@
-"""Tests of the tasks above a footstep controller: clock, plans, rewards, goals, ball, controllers."""
+"""Tests of hierarchical navigation: clock, plans, rewards, goals, ball, controllers."""
 
 import contextlib
 import dataclasses
@@ -63,7 +63,7 @@ def turned(way, angle):
 
 
 def carry(environment, away=(0, 0, 0), yaw=0.0):
-    """Moves the walker by a way, and turns it about its root."""
+    """Moves the walker by a displacement, and rotates it about its root."""
     task, data = environment.task, environment.physics.data
     pose = data.qpos[task.figure.pose_qpos]
     pose[:3] += away
@@ -139,7 +139,7 @@ class ClockTest(parameterized.TestCase):
         self.assertEqual(set(phases), {0.1, 0.6})
         self.assertAlmostEqual((phases == 0.1).mean(), 0.5, delta=4 * np.sqrt(0.25 / 200))
 
-    def test_rows_switch_each_in_its_time(self):
+    def test_simulations_switch_independently(self):
         specs = VectorEnvironment(
             PLANE, 12, 2, seed=1, task_kwargs={'start_phases': (0.0, 0.1, 0.6), 'controller': idle}
         )
@@ -153,7 +153,7 @@ class ClockTest(parameterized.TestCase):
 
 
 class PlanTest(parameterized.TestCase):
-    """What an action means."""
+    """The map from actions to plans."""
 
     def test_native_mapping(self):
         action_map = started()[0].action_map
@@ -162,7 +162,7 @@ class PlanTest(parameterized.TestCase):
         np.testing.assert_allclose(action_map.control(-np.ones(5)), [-0.5, -1, -1, -2, -np.pi])
 
     @parameterized.parameters(FOREST, MOVERS, SOCCER, TRAIL)
-    def test_it_is_laid_out_from_the_beginning_of_the_step_and_stays_put(self, id_):
+    def test_plan_is_relative_to_the_start_of_the_step_and_fixed(self, id_):
         environment, _ = started(id_)
         task = environment.task
         rng = np.random.default_rng(0)
@@ -178,7 +178,7 @@ class PlanTest(parameterized.TestCase):
             for which, way in enumerate((plan[:2], plan[2:4])):
                 place = task.landing[0, which]
                 np.testing.assert_allclose(place[:2], root[:2] + turned(way, heading), atol=1e-9)
-                # Height grids are kept in single precision.
+                # Height grids are stored in single precision.
                 height = float(ground(environment, *place[:2]))
                 self.assertAlmostEqual(place[2], height, delta=1e-5)
             self.assertLess(angle_between(task.heading[0], heading + plan[4]), 1e-9)
@@ -190,7 +190,7 @@ class PlanTest(parameterized.TestCase):
             off = angle_between(task.heading[0], heading_of(environment))
             self.assertAlmostEqual(environment.info['heading_error'], off, delta=1e-9)
 
-    def test_what_the_controller_is_told(self):
+    def test_inputs_of_the_controller(self):
         found = []
 
         def controller(observation):
@@ -222,10 +222,10 @@ class PlanTest(parameterized.TestCase):
                 self.assertLess(angle_between(heading + off, task.heading[0]), 1e-9)
 
 
-class HikeRewardTest(parameterized.TestCase):
+class GoalRewardTest(parameterized.TestCase):
     """0.8 exp(-1.5 min(0, v - 1)^2) + 0.2, over the whole step."""
 
-    def test_from_the_physics(self):
+    def test_reward_from_the_physics(self):
         environment, _ = started(PLANE, start_phases=(0.1,))
         task = environment.task
         for i, angle in enumerate((0.0, np.pi, 1.5, -0.4)):
@@ -259,7 +259,7 @@ class HikeRewardTest(parameterized.TestCase):
 
     @parameterized.parameters((0.9, {}, 1), (1.1, {}, STILL), (1.9, {'goal_reached': 2.0}, 1),
                               (0.6, {'goal_reached': 0.5}, STILL))  # fmt: skip
-    def test_near_the_goal_it_is_full(self, distance, options, expected):
+    def test_reward_is_full_near_the_goal(self, distance, options, expected):
         environment, _ = started(PLANE, controller=idle, **options)
         environment.task.goal[0] = com_of(environment) + np.array((0, distance, 0))
         with moved(environment.task):
@@ -304,7 +304,7 @@ class FallTest(parameterized.TestCase):
         task, share = environment.task, 0.0
         for i, touch in enumerate(samples, 1):
             share = 0.9 * share + int(touch) / 11
-            self.assertEqual(share > 0.25, i == fall)  # the case is what it says
+            self.assertEqual(share > 0.25, i == fall)  # the case is as described
         height = environment.physics.data.qpos[task.figure.pose_qpos[2]]
 
         def place():
@@ -322,13 +322,13 @@ class FallTest(parameterized.TestCase):
         if fall is not None:
             self.assertEqual(task.clock.steps[0], 3 * fall)
 
-    def test_a_touch_of_the_feet_is_none(self):
+    def test_contact_of_the_feet_is_not_a_fall(self):
         environment, _ = started(PLANE)
         for _ in range(10):
             self.assertTrue(environment.step(AHEAD).mid())
 
     @parameterized.parameters(FOREST, SOCCER)
-    def test_what_breaks_down(self, id_):
+    def test_divergence_ends_the_episode_without_a_fall(self, id_):
         environment, _ = started(id_)
         kept = environment.step(AHEAD).observation
         environment.physics.data.qvel[:6] = 1e12
@@ -346,7 +346,7 @@ class FallTest(parameterized.TestCase):
 class GoalTest(parameterized.TestCase):
     """Where to go."""
 
-    def test_target_block(self):
+    def test_goal_block(self):
         environment, _ = started(PLANE, controller=idle)
         task = environment.task
         for yaw in (0.0, 0.9, -2.5):
@@ -358,7 +358,7 @@ class GoalTest(parameterized.TestCase):
             found = environment.observation()['goal']
             np.testing.assert_allclose(found, [bearing, distance], atol=1e-9)
 
-    def test_it_is_drawn_anew_when_reached(self):
+    def test_goal_is_redrawn_when_reached(self):
         environment, _ = started(PLANE, controller=idle)
         task = environment.task
         root = body(environment, 'xpos', 'root')
@@ -376,7 +376,7 @@ class GoalTest(parameterized.TestCase):
         environment.reset()
         self.assertEqual(environment.info['goals_reached'], 0)
 
-    def test_it_is_drawn_anew_by_a_timer(self):
+    def test_goal_is_redrawn_by_a_timer(self):
         n, steps = 12, 420
         specs = VectorEnvironment(
             PLANE, n, 1, seed=0, step_limit=None, task_kwargs={'controller': idle}
@@ -396,7 +396,7 @@ class GoalTest(parameterized.TestCase):
                     begun[env_id] = 0.5 * i
                 before = task.goal.copy()
         self.assertGreaterEqual(len(lasted), 2 * n)
-        # 50 to 100 s, looked at every half second.
+        # 50 to 100 s, checked every half second.
         assert_uniform(lasted, 50.0, 100.5)
         self.assertEqual(task.goals.reached.max(), 0)
 
@@ -412,7 +412,7 @@ class GoalTest(parameterized.TestCase):
 
 
 class MapTest(parameterized.TestCase):
-    """What is seen of the ground: lines from the left to the right, along them ahead."""
+    """Observed ground: lines from left to right, samples of a line from behind to ahead."""
 
     POINTS = (
         np.tile(np.linspace(-1, 10, 32), 32),
@@ -427,7 +427,7 @@ class MapTest(parameterized.TestCase):
         expected = ground(environment, x, y) - ground(environment, *root[:2])
         np.testing.assert_allclose(step.observation['terrain'], expected, atol=1e-5)
         if id_ == FOREST:
-            self.assertBetween(step.observation['terrain'].max(), 2, 8)  # pillars are seen
+            self.assertBetween(step.observation['terrain'].max(), 2, 8)  # pillars are in view
 
     @parameterized.parameters((BELTS, (3, 5), 0.4), (WIDE, (3, 8), 0.6))
     def test_velocities_beside_a_belt(self, id_, belt, speed):
@@ -452,7 +452,7 @@ class MapTest(parameterized.TestCase):
         (('height', 'velocity'), 1024, 2048), ('height', 1024, 0), (('velocity',), 0, 2048),
         ((), 0, 0),
     )  # fmt: skip
-    def test_sight(self, sight, heights, velocities):
+    def test_terrain_observation_option(self, sight, heights, velocities):
         _, step = started(MOVERS, terrain_observation=sight)
         sizes = {name: value.size for name, value in step.observation.items()}
         self.assertEqual(sizes.pop('terrain', 0), heights)
@@ -490,7 +490,7 @@ class BallTest(parameterized.TestCase):
     def test_a_kicked_ball_rolls(self):
         environment, _ = started(SOCCER)
         task = environment.task
-        carry(environment, (0, 20, 0))  # out of the way
+        carry(environment, (0, 20, 0))  # away from the ball
         put_ball(environment, (0, 0, 0.2), (3, 0, 0))
         place = []
         for _ in range(30):
@@ -515,7 +515,7 @@ class BallTest(parameterized.TestCase):
             heading.append(environment.physics.named.data.qpos['ball'][0] - place[0])
         self.assertGreater(heading[-1], 0.9)
 
-    def test_it_sets_no_contacts_of_feet_and_is_no_fall(self):
+    def test_contact_with_the_ball_is_no_foot_contact_and_no_fall(self):
         seen = []
 
         def controller(observation):
@@ -596,7 +596,7 @@ class BallTest(parameterized.TestCase):
         assert_uniform(lasted['goal'], 50, 100.5)
         self.assertGreater(len(lasted['goal']), len(lasted['ball']))
 
-    def test_reaching_the_goal_leaves_it_where_it_is(self):
+    def test_a_reached_goal_is_not_redrawn(self):
         environment, _ = started(SOCCER, controller=idle)
         task = environment.task
         with moved(task):
@@ -651,7 +651,7 @@ class SoccerRewardTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.info['speed'], towards_goal, delta=1e-9)
 
     @parameterized.parameters((1.9, 0.4, True), (2.1, 0.4, False), (1.0, 0.5, False))
-    def test_at_the_goal_all_is_full(self, to_ball, gap, full):
+    def test_all_terms_are_full_at_the_goal(self, to_ball, gap, full):
         environment, _ = started(SOCCER, controller=idle)
         ball = com_of(environment)[:2] + np.array((to_ball, 0))
         put_ball(environment, (*ball, 0.2))
@@ -676,7 +676,7 @@ class FrameTest(parameterized.TestCase):
         self.assertEqual(step.observation['low_level'].shape, (125,))
 
     @parameterized.parameters(BLOCKS, SOCCER, BELTS, MOVERS)
-    def test_driven_by_the_shipped_controller_it_is_the_other_interface(self, id_):
+    def test_with_the_shipped_controller_frames_equal_plans(self, id_):
         options = {'start_phases': (0.1,), 'random': 3}
         plan, first = started(id_, **options)
         frame, begun = started(id_, interface='frame', **options)
@@ -701,7 +701,7 @@ class FrameTest(parameterized.TestCase):
                 np.testing.assert_array_equal(found.observation[name], value)
             np.testing.assert_array_equal(frame.task.landing, plan.task.landing)
 
-    def test_a_plan_counts_where_a_footstep_begins(self):
+    def test_a_plan_takes_effect_at_the_start_of_a_footstep(self):
         environment, _ = started(PLANE, interface='frame')
         task, rng, plans = environment.task, np.random.default_rng(0), []
         for i in range(31):
@@ -740,7 +740,7 @@ class ControllerTest(FolderTest):
             environment.step(AHEAD)
         return environment.physics.data.qpos.copy()
 
-    def test_all_ways_to_name_it(self):
+    def test_a_controller_by_id_alias_path_policy_or_function(self):
         shipped = policies.reference(hierarchical_rules.CONTROLLER)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
@@ -756,7 +756,7 @@ class ControllerTest(FolderTest):
         controller = shipped_controller()
         self.assertIs(footstep_controller.load(controller), controller)
 
-    def test_one_of_ones_own(self):
+    def test_a_function_as_controller(self):
         def mine(observation):
             calls.append(observation.shape)
             return [[0.0] * 17] * len(observation)
@@ -777,7 +777,7 @@ class ControllerTest(FolderTest):
         (lambda n: None, r'no numbers|shape'), (lambda n: 'left', 'no numbers'),
         (lambda n: [[1, 2], [3]], 'no numbers'),
     )  # fmt: skip
-    def test_wrong_answers(self, answer, message):
+    def test_invalid_actions_of_a_controller_are_rejected(self, answer, message):
         def crooked(observation):
             return answer(len(observation))
 
@@ -785,7 +785,7 @@ class ControllerTest(FolderTest):
         with self.assertRaisesRegex(ValueError, f'controller crooked gives .*({message})'):
             environment.step(AHEAD)
 
-    def test_the_row_is_named(self):
+    def test_errors_name_the_simulation(self):
         def half(observation):
             return np.where(np.arange(len(observation))[:, None] == 2, np.nan, np.zeros((1, 17)))
 
@@ -796,7 +796,7 @@ class ControllerTest(FolderTest):
         ):
             environments.step(np.zeros((4, 5)))
 
-    def test_errors_of_the_function_are_its_own(self):
+    def test_errors_of_the_function_are_passed_on(self):
         def broken(observation):
             raise TypeError('mine')
 
@@ -809,7 +809,7 @@ class ControllerTest(FolderTest):
         far = self.positions(controller=lambda o: np.full((len(o), 17), 50.0))
         np.testing.assert_array_equal(ones, far)
 
-    def test_unknown(self):
+    def test_unknown_names_suggest_the_closest(self):
         with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical_rules.CONTROLLER}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
@@ -820,7 +820,7 @@ class ControllerTest(FolderTest):
         with self.assertRaisesRegex(ValueError, 'broken.npz'):
             footstep_controller.load(str(self.folder / 'broken.npz'))
 
-    def test_one_that_observes_something_else(self):
+    def test_a_controller_with_other_observations_is_rejected(self):
         task = suite.build_task(suite.find('PD_Biped3D_LLC_Symetric_Step-v0'))
         blocks = [(name, part.stop - part.start) for name, part in task.blocks.items()]
         size = sum(size for _, size in blocks)
@@ -872,7 +872,7 @@ class ScriptedTest(parameterized.TestCase):
         self.assertGreater(np.mean(rewards), 0.8)  # standing still earns 0.38
 
     @parameterized.parameters(*IDS)
-    def test_on_every_row(self, id_):
+    def test_scripted_policy_acts_in_every_environment(self, id_):
         environments = VectorEnvironment(id_, 3, 1, seed=1)
         policy, observation = scripted.scripted(environments), environments.reset()
         for _ in range(6):
@@ -898,7 +898,7 @@ class ScriptedTest(parameterized.TestCase):
         self.assertLess(lengths[1], 0.3)  # something is near
         np.testing.assert_allclose(plans[:, 4], [0, 0.3, -0.3, 1.2])
 
-    def test_goes_around_what_it_sees(self):
+    def test_walks_around_obstacles(self):
         x = np.tile(np.linspace(-1, 10, 32), 32).reshape(32, 32)
         y = np.repeat(np.linspace(5.5, -5.5, 32), 32).reshape(32, 32)
         wall = (x > 1.5) & (x < 2.5) & (y > -0.9) & (y < 3)  # more of it to the left
@@ -910,11 +910,11 @@ class ScriptedTest(parameterized.TestCase):
         moving = np.stack([0.4 * wall.ravel(), np.zeros(1024)])[None].reshape(1, 2048)
         found, _ = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
         self.assertLess(found[0], -0.3)
-        # What lies behind the goal is in nobody's way.
+        # Obstacles behind the goal do not block the path.
         near, room = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
         np.testing.assert_allclose(near, 0)
         np.testing.assert_array_equal(room, np.inf)
-        # Where there is no way at all, it is told how far one gets.
+        # If there is no free path, the result is the free distance.
         around = (np.hypot(x, y) > 1.7).reshape(1, 1024)
         everywhere = {'terrain': 2.0 * around}
         _, room = scripted.free_way(everywhere, np.zeros(1), np.full(1, 8.0))
@@ -931,7 +931,7 @@ class ScriptedTest(parameterized.TestCase):
         place = distance[1] * np.array([np.cos(bearing[1]), np.sin(bearing[1])])
         np.testing.assert_allclose(place, [2, -0.7], atol=1e-9)
 
-    def test_single_and_many_agree(self):
+    def test_single_environments_and_batches_agree(self):
         spec = dataclasses.replace(suite.find(BLOCKS), step_limit=5)
         found = evaluation.evaluate(spec, scripted.scripted, 3, 1, factory=True)
         self.assertIs(evaluation.BASELINES['scripted'], scripted.scripted)
@@ -949,11 +949,11 @@ class ScriptedTest(parameterized.TestCase):
         ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task SpatialFootsteps has no scripted policy'),
         (FOREST, {'interface': 'frame'}, "needs the interface 'plan', not 'frame'"),
     )
-    def test_other_tasks_are_refused(self, id_, options, message):
+    def test_other_tasks_are_rejected(self, id_, options, message):
         with self.assertRaisesRegex(ValueError, message):
             scripted.scripted(suite.make(id_, options))
 
-    def test_with_terms_of_the_users(self):
+    def test_works_with_users_own_reward_terms(self):
         rewards = {'idle': (0.1, lambda task: np.zeros(task.world.n))}
         own, plain = (
             suite.make(SOCCER, {'random': 1, **more}, {'flat_observation': True})
@@ -968,7 +968,7 @@ class ScriptedTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         *((id_, {}) for id_ in IDS), (SOCCER, {'interface': 'frame'}),
@@ -983,7 +983,7 @@ class SaveTest(parameterized.TestCase):
         )  # fmt: skip
 
     @parameterized.parameters(*OPTIONS)
-    def test_goes_on(self, id_, options):
+    def test_a_restored_state_continues_exactly(self, id_, options):
         environment, other = (suite.make(id_, {'random': seed, **options}) for seed in (6, 9))
         environment.reset()
         other.reset()
@@ -1006,7 +1006,7 @@ class SaveTest(parameterized.TestCase):
         assert_goes_on(environment, other, go, draw_soon)
 
     @parameterized.parameters(*OPTIONS)
-    def test_rows_are_single_environments(self, id_, options):
+    def test_simulations_equal_single_environments(self, id_, options):
         limit, n = (16, 3) if options else (3, 3)
         _, ends = assert_rows_are_singles(id_, n, 2 * limit + 3, limit, options, scale=0.6)
         self.assertGreaterEqual(ends, n)
@@ -1108,7 +1108,7 @@ class OptionTest(parameterized.TestCase):
                 suite.build('biped3d_mocap', terrain=name, task=task)
         suite.build('biped3d_mocap', terrain='flat3d', task='soccer').close()
 
-    def test_goals_of_a_ball_as_far_as_asked_for(self):
+    def test_goal_distance_of_a_ball_is_an_option(self):
         environments = VectorEnvironment(SOCCER, 32, 0, 1, task_kwargs={'goal_distance': (1, 2)})
         environments.reset()
         task = environments.task
@@ -1116,7 +1116,7 @@ class OptionTest(parameterized.TestCase):
         self.assertBetween(away.min(), 1, 1.3)
         self.assertBetween(away.max(), 1.7, 2)
 
-    def test_plans_that_are_none(self):
+    def test_invalid_plans_are_rejected(self):
         task = started(PLANE, interface='frame')[0].task
         for action, message in (
             (np.zeros(22), r'shape \(22,\); expected \(1, 22\)'),

@@ -1,4 +1,4 @@
-"""Tests of imitation in three dimensions: observation, reward and start, recomputed by other means."""
+"""Tests of three-dimensional imitation: observation, reward and start, recomputed independently."""
 
 import mujoco
 import numpy as np
@@ -147,13 +147,13 @@ class ObservationTest(parameterized.TestCase):
         environment, step = started(id_, steps, terrain_observation='height')
         self.assertEqual(list(step.observation)[:3], ['terrain', 'pose', 'velocity'])
         for name, value in Probe(environment).blocks().items():
-            # Height grids are kept in single precision.
+            # Height grids are stored in single precision.
             delta = 1e-6 if name == 'terrain' or id_ == HILLS else 1e-9
             np.testing.assert_allclose(
                 step.observation[name], value, rtol=0, atol=delta, err_msg=name
             )
 
-    def test_the_map_is_that_of_the_arena(self):
+    def test_height_map_equals_that_of_the_arena(self):
         environment, step = started(HILLS, 6, terrain_observation='height')
         probe = Probe(environment)
         expected = environment.task.arena.height_map(probe.root[None, :2], probe.heading[None])
@@ -161,7 +161,7 @@ class ObservationTest(parameterized.TestCase):
         np.testing.assert_allclose(step.observation['terrain'], expected[0], atol=1e-12)
 
     @parameterized.parameters(0.0, 1.0, 3.0, -2.5)
-    def test_it_does_not_matter_which_way_one_heads(self, heading):
+    def test_observation_does_not_depend_on_the_heading(self, heading):
         # On a plane pose and velocity stay the same when everything is turned and moved.
         environment, step = started(PLANE, 5)
         task, data = environment.task, environment.physics.data
@@ -213,7 +213,7 @@ class ObservationTest(parameterized.TestCase):
     @parameterized.parameters(
         (0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (-2.0, 1.0, 0.0), (4.0, -3.0, 0.5), (0.5, 2.0, -3.0),
     )  # fmt: skip
-    def test_goal_is_straight_on(self, x, y, heading):
+    def test_goal_is_straight_ahead(self, x, y, heading):
         environment, _ = started(PLANE)
         task, data = environment.task, environment.physics.data
         pose, rate = data.qpos[task.figure.pose_qpos], data.qvel[task.figure.pose_dof]
@@ -228,7 +228,7 @@ class ObservationTest(parameterized.TestCase):
         self.assertTrue(-np.pi <= bearing <= np.pi)
         self.assertAlmostEqual(distance, np.hypot(3, y), delta=1e-12)
 
-    def test_breakdown_of_the_documented_row(self):
+    def test_observation_sizes_of_the_documentation(self):
         blocks = suite.make(PLANE).blocks
         self.assertEqual(blocks, {
             'pose': slice(0, 57), 'velocity': slice(57, 105), 'phase': slice(105, 110),
@@ -254,7 +254,7 @@ class ObservationTest(parameterized.TestCase):
             # 113 for the pose of 16 links, 96 for their velocities, phase and goal.
             self.assertEqual(max(p.stop for p in environment.blocks.values()), 113 + 96 + 5 + 2)
 
-    def test_mirrored(self):
+    def test_mirrored_state_has_the_mirrored_observation(self):
         environment = suite.make(PLANE, {'mirrored': True, 'random': 0})
         sizes = {name: part.stop - part.start for name, part in environment.blocks.items()}
         self.assertEqual(sizes, {'pose': 57, 'velocity': 48, 'phase': 3, 'goal': 2})
@@ -264,7 +264,7 @@ class RewardTest(parameterized.TestCase):
     """The reward of the specification, by hand."""
 
     @parameterized.parameters(*((id_, phase) for id_ in IDS for phase in (0.0, 0.31, 0.77)))
-    def test_a_placed_reference_is_perfect(self, id_, phase):
+    def test_the_reference_pose_has_full_reward(self, id_, phase):
         environment, _ = started(id_, start_phase=phase)
         task, clip = environment.task, environment.task.clip
         pose = clip.pose(phase * clip.duration)
@@ -316,7 +316,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(step.reward, sum(expected.values()), delta=2e-3)
 
     @parameterized.parameters(0.9, -2.0)
-    def test_only_the_way_of_the_centre_of_mass_knows_the_direction(self, heading):
+    def test_only_the_centre_of_mass_term_depends_on_the_direction(self, heading):
         # The pose of the clip, all of it turned: heading is removed everywhere but in `com`.
         environment, _ = started(PLANE, start_phase=0.4)
         task, clip = environment.task, environment.task.clip
@@ -335,7 +335,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(terms['com'] / 0.2, np.exp(-error), delta=2e-3)
 
     @parameterized.parameters(0, 1)
-    def test_a_turned_joint_costs_its_weight(self, axis):
+    def test_a_joint_error_costs_its_weight(self, axis):
         environment, _ = started(PLANE, start_phase=0.3)
         task, data = environment.task, environment.physics.named.data
         task.observe()
@@ -432,7 +432,7 @@ class StartTest(parameterized.TestCase):
         for _ in range(3):
             self.assertAlmostEqual(step.observation['phase'][0], 0.6, delta=1e-9)
             step = environment.reset()
-        # The ground is drawn anew, and is the same whether the phase is drawn or given.
+        # The ground is redrawn, and does not depend on whether the phase is drawn or given.
         grounds = []
         for options in ({}, {'start_phase': 0.6}):
             other = suite.make(HILLS, {'random': 5, **options})
@@ -445,7 +445,7 @@ class StartTest(parameterized.TestCase):
         self.assertEqual(environment.info['distance'], Probe(environment).root[0])
         self.assertNotEqual(environment.info['distance'], 0)
 
-    def test_blend_chooses_the_parameters(self):
+    def test_terrain_level_selects_the_parameters(self):
         content = {'Type': 'var3d_checkers', 'Params': [{'Slope': 0.0}, {'Slope': 0.2}]}
         for terrain_level, height in ((0.0, 0.0), (0.5, 0.1), (1.0, 0.2)):
             environment = suite.build(
@@ -494,7 +494,7 @@ class EpisodeTest(parameterized.TestCase):
         if fell:
             self.assertEqual(step.reward, 0.0)
 
-    def test_a_stray_number_ends_it(self):
+    def test_divergence_ends_the_episode(self):
         environment, _ = started(PLANE, 2)
         kept = environment.observation()
         environment.physics.data.qpos[environment.task.figure.pose_qpos[0]] = np.nan
@@ -510,7 +510,7 @@ class EpisodeTest(parameterized.TestCase):
 
 
 class MovingGroundTest(parameterized.TestCase):
-    """Belts carry what stands on them, and velocities are against them."""
+    """Belts carry characters, and observed velocities are relative to them."""
 
     def test_velocity_against_the_belt(self):
         environment = suite.build(
@@ -535,7 +535,7 @@ class MovingGroundTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many simulations are single ones."""
+    """Saved states and pickles continue bit for bit; simulations equal single environments."""
 
     OPTIONS = (
         (HILLS, {'terrain_observation': 'height'}), (STEPS, {'mirrored': True, 'terrain_observation': 'height'}),
@@ -546,7 +546,7 @@ class SaveTest(parameterized.TestCase):
         return advance(environment, seed, 30, 0.5)
 
     @parameterized.parameters(*OPTIONS)
-    def test_goes_on(self, id_, options):
+    def test_a_restored_state_continues_exactly(self, id_, options):
         environment, other = (suite.make(id_, {'random': seed, **options}) for seed in (6, 9))
         environment.reset()
         for _ in range(7):
@@ -557,7 +557,7 @@ class SaveTest(parameterized.TestCase):
     @parameterized.parameters(
         *OPTIONS, (PLANE, {'action_offset': 'original'}), (STAIRS, {'start_phase': 0.4}),
     )  # fmt: skip
-    def test_rows_are_single_environments(self, id_, options):
+    def test_simulations_equal_single_environments(self, id_, options):
         assert_rows_are_singles(id_, 4, 22, 9, options)
 
 
@@ -621,7 +621,7 @@ class HelperTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, message):
             suite.make(PLANE, {'random': 0, **options}).reset()
 
-    def test_parts_that_do_not_fit(self):
+    def test_parts_that_do_not_fit_are_rejected(self):
         for arguments, message in (
             (('biped3d', 'torque', None, 'imitation', None, {'action_scale': 1.0}),
              'options of position control'),

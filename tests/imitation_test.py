@@ -1,4 +1,4 @@
-"""Tests of the imitation task: observation, reward and reset, recomputed by other means."""
+"""Tests of the imitation task: observation, reward and reset, recomputed independently."""
 
 import mujoco
 import numpy as np
@@ -158,7 +158,7 @@ class ObservationTest(parameterized.TestCase):
                 )
 
     @parameterized.parameters(DOG, RAPTOR, BIPED)
-    def test_a_trunk_that_points_backwards_looks_backwards(self, id_):
+    def test_a_backward_heading_observes_the_ground_behind(self, id_):
         environment, _ = started(id_)
         data, name = environment.physics.named.data, environment.task.character.spec.name
         for pitch in (3.0, -2.5, 2 * np.pi + 0.1, -1.5):
@@ -198,14 +198,14 @@ class ObservationTest(parameterized.TestCase):
             target[2 * links + 1 :], expected['velocity'], atol=2e-3 * max(scale, 1)
         )
 
-    def test_target_belongs_to_the_reset_as_well(self):
+    def test_target_is_observed_after_reset(self):
         environment, step = started('PD_Biped2D_LLC_Imitate_Flat-v0')
         probe = Reference(environment).at(float(environment.task.phase[0]))
         np.testing.assert_allclose(
             step.observation['reference'][:15], probe.blocks()['pose'], atol=1e-4
         )
 
-    def test_breakdown_of_the_documented_rows(self):
+    def test_observation_sizes_of_the_documentation(self):
         blocks = suite.make('PD_Biped2D_Gaps_Terrain-v0').blocks
         self.assertEqual(blocks['terrain'], slice(0, 50))
         self.assertEqual(blocks['pose'], slice(50, 75))  # height, then 12 pairs
@@ -249,7 +249,7 @@ class RewardTest(parameterized.TestCase):
         self.assertEqual({k: s for k, (_, s) in rewards.IMITATION_TERMS.items()}, SCALES)
         self.assertAlmostEqual(sum(WEIGHTS.values()), 1, delta=1e-12)
 
-    def test_wrap(self):
+    def test_joint_angles_are_wrapped(self):
         angles = np.array([0.3, -3.0, 2 * np.pi + 0.3, -7.0, 3 * np.pi + 0.1])
         expected = np.angle(np.exp(1j * angles))
         np.testing.assert_allclose(rewards.wrap(angles), expected, atol=1e-12)
@@ -286,7 +286,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(step.reward, sum(expected.values()), delta=2e-3)
 
     @parameterized.parameters('dog', 'raptor', 'biped2d', 'biped2d_full')
-    def test_a_turned_joint_costs_its_weight(self, name):
+    def test_a_joint_error_costs_its_weight(self, name):
         environment = suite.build(name, task_kwargs={'random': 0, 'start_phase': 0.3})
         environment.reset()
         task, data = environment.task, environment.physics.named.data
@@ -305,7 +305,7 @@ class RewardTest(parameterized.TestCase):
             self.assertLess(after, before)
 
     @parameterized.parameters(*IDS)
-    def test_a_start_is_near_perfect(self, id_):
+    def test_a_start_has_almost_full_reward(self, id_):
         environment = suite.make(id_, {'random': 21})
         for _ in range(3):
             environment.reset()
@@ -396,7 +396,7 @@ class ResetTest(parameterized.TestCase):
             with self.assertRaisesRegex(ValueError, 'start_phase is'):
                 suite.make(BIPED, {'start_phase': bad})
 
-    def test_start_phases_between_numbers(self):
+    def test_ranges_of_start_phases(self):
         pairs = ((0.1, 0.2), (0.5, 0.8))
         specs = VectorEnvironment(BIPED, 400, 1, 5, task_kwargs={'start_phase': pairs})
         specs.reset()
@@ -411,7 +411,7 @@ class ResetTest(parameterized.TestCase):
         specs.reset()
         self.assertTrue((specs.task.phase % 0.5 >= 0.25).all())
 
-    def test_terrain_is_drawn_anew(self):
+    def test_terrain_is_redrawn_at_reset(self):
         environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': 3})
         first, second = (environment.reset().observation['terrain'] for _ in range(2))
         self.assertGreater(np.abs(first - second).max(), 1e-3)
@@ -452,7 +452,7 @@ class ResetTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'spawn'):
             suite.make('PD_Dog2D_Slopes_Terrain-v0', {'spawn': 'nowhere'}).reset()
 
-    def test_blend_chooses_the_parameters(self):
+    def test_terrain_level_selects_the_parameters(self):
         reached = []
         for terrain_level in (0.0, 1.0):
             environment = suite.build(
@@ -509,7 +509,7 @@ class HelperTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, message):
             suite.make(BIPED, options)
 
-    def test_clips_that_do_not_fit(self):
+    def test_clips_that_do_not_fit_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "'dog_bound'.*does not fit character 'raptor'"):
             suite.build('raptor', clip='dog_bound')
         clip = motion.load('biped2d_walk')

@@ -1,4 +1,4 @@
-"""Tests of going from goal to goal without hierarchy: observation, reward, goals, ball, the original."""
+"""Tests of direct navigation: observation, reward, goals, ball, the original."""
 
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -108,20 +108,20 @@ class RewardTest(parameterized.TestCase):
         environment, _ = started(SOCCER)
         self.assertAlmostEqual(sum(weight for weight, _ in environment.task.TERMS.values()), 1)
 
-    def test_far_away_a_start_towards_the_goal_is_all_but_full(self):
+    def test_reward_is_almost_full_for_a_start_towards_a_far_goal(self):
         """The clip's own pose and velocity, straight towards a goal 10 m ahead."""
         environment, _ = started(TRAIL)
         set_goal(environment, 10.0)
         found = terms(environment)
         for name, (weight, _) in rewards.DIRECT_TERMS.items():
-            # Heading and way differ by what the pelvis turns in a step.
+            # Heading and path differ by the rotation of the pelvis in a step.
             least = 0.0 if name == 'proximity' else 0.95 * weight
             self.assertBetween(found[name], least, weight + 1e-12, name)
         self.assertAlmostEqual(
             found['proximity'], 0.1 / 1.15 * np.exp(-100 / (0.25 * 9)), delta=1e-12
         )
 
-    def test_the_wrong_way(self):
+    def test_walking_away_from_the_goal_lowers_the_reward(self):
         environment, _ = started(TRAIL)
         set_goal(environment, -10.0)
         found = terms(environment)
@@ -131,7 +131,7 @@ class RewardTest(parameterized.TestCase):
         self.assertLess(found['heading'], 1e-6)
 
     @parameterized.parameters((2.9, True), (3.1, False))
-    def test_near_the_goal_neither_speed_nor_heading_counts(self, distance, full):
+    def test_speed_and_heading_have_no_effect_near_the_goal(self, distance, full):
         environment, _ = started(TRAIL)
         set_goal(environment, -distance)
         found = terms(environment)
@@ -141,7 +141,7 @@ class RewardTest(parameterized.TestCase):
         self.assertAlmostEqual(found['proximity'], expected, delta=1e-9)
 
     def test_a_ball_that_rolls_to_its_goal(self):
-        """Half of the reward is the ball's: its speed along the way to the goal counts from 0 on."""
+        """Half of the reward is for the ball: its speed towards the goal, from 0."""
         environment, _ = started(SOCCER)
         task = environment.task
         action = task.clip_action(0)
@@ -156,7 +156,7 @@ class RewardTest(parameterized.TestCase):
 
 
 class GoalTest(parameterized.TestCase):
-    def test_it_is_drawn_anew_within_half_a_metre(self):
+    def test_goal_is_redrawn_within_half_a_metre(self):
         environment, _ = started(TRAIL)
         for ahead, reached in ((0.7, 0), (0.3, 1)):
             environment.reset()
@@ -166,7 +166,7 @@ class GoalTest(parameterized.TestCase):
             self.assertEqual(environment.info['goals_reached'], reached)
             self.assertEqual((environment.task.goal[0] != before).any(), bool(reached))
 
-    def test_of_a_trail_it_lies_on_the_next_segment(self):
+    def test_goal_on_a_trail_is_on_the_next_segment(self):
         environments = VectorEnvironment(TRAIL, 32, seed=0)
         environments.reset()
         task = environments.task
@@ -174,7 +174,7 @@ class GoalTest(parameterized.TestCase):
         self.assertLess(np.hypot(*way.T).max(), 6)  # segments are 2 m long
         np.testing.assert_allclose(task.goal[:, 2], 0, atol=1e-6)  # the path is level
 
-    def test_a_ball_at_its_goal_is_counted_and_stays(self):
+    def test_a_ball_at_its_goal_is_counted_and_stays_there(self):
         environment, _ = started(SOCCER)
         ball = environment.physics.named.data.xpos['ball'].copy()
         environment.task.goal[0] = ball
@@ -189,7 +189,7 @@ class GoalTest(parameterized.TestCase):
         environment.step(environment.task.clip_action(0))
         self.assertEqual(environment.info['goals_reached'], 1)
 
-    def test_the_way_is_traced(self):
+    def test_the_path_is_recorded(self):
         environment, _ = started(TRAIL)
         for _ in range(12):
             environment.step(environment.task.clip_action(0))
@@ -199,7 +199,7 @@ class GoalTest(parameterized.TestCase):
 
 
 class OriginalTest(parameterized.TestCase):
-    def test_it_rewards_hidden_footsteps_and_keeps_its_goal(self):
+    def test_original_rewards_unobserved_footsteps_and_keeps_its_goal(self):
         environment, _ = started(FOREST, reward='original')
         self.assertEqual(sizes(environment), SIZES)
         self.assertEqual(list(environment.task.TERMS), list(rewards.STEP_TERMS))
@@ -228,7 +228,7 @@ class OriginalTest(parameterized.TestCase):
         ({'goal_reached': 0.0}, 'goal_reached is 0'),
         ({'goal_reach': 1.0}, 'goal_reached'),
     )
-    def test_wrong_options(self, options, message):
+    def test_invalid_options_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.make(FOREST, options)
 
@@ -239,7 +239,7 @@ class BuildTest(absltest.TestCase):
         time_step = environment.reset()
         self.assertEqual(time_step.observation['goal'].shape, (2,))
 
-    def test_not_in_the_plane(self):
+    def test_planar_characters_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "'dog' is planar; the task 'direct_navigation'"):
             suite.build('dog', task='direct_navigation')
 

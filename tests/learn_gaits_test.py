@@ -1,4 +1,4 @@
-"""Q-learning over base actions: transitions, retries, the policy that comes out, going on exactly."""
+"""Q-learning over base actions: transitions, retries, the exported policy, exact resumption."""
 
 import dataclasses
 import pathlib
@@ -47,7 +47,7 @@ class LearnTest(absltest.TestCase):
         for env_id, past in enumerate(learner.past):
             self.assertLessEqual(len(past), settings.back[1] + 1, env_id)
 
-    def test_a_row_that_goes_back_is_where_it_was(self):
+    def test_a_restored_simulation_has_its_old_state(self):
         learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, retry=1.0), 1)
         seen = []
         for _ in range(3):
@@ -63,7 +63,7 @@ class LearnTest(absltest.TestCase):
         np.testing.assert_array_equal(now[3], seen[left][3])
         np.testing.assert_array_equal(now[:3], learner.observation[:3])
 
-    def test_the_oldest_transitions_make_room(self):
+    def test_the_oldest_transitions_are_replaced(self):
         replay = learn_gaits.Replay(3, 2)
         for i in range(5):
             replay.add(np.full(2, i), i, i, 0.5, np.full(2, i + 1))
@@ -75,7 +75,7 @@ class LearnTest(absltest.TestCase):
         for name in ('before', 'after', 'action', 'reward', 'discount'):
             np.testing.assert_array_equal(getattr(other, name), getattr(replay, name))
 
-    def test_the_policy_chooses_as_the_network_does(self):
+    def test_the_policy_selects_as_the_network(self):
         learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
         for _ in range(6):
             learner.advance()
@@ -92,7 +92,7 @@ class LearnTest(absltest.TestCase):
         expected = learner.choices[values.argmax(1)]
         np.testing.assert_allclose(policy(whole)[clear], expected[clear], atol=1e-6)
 
-    def test_a_run_writes_its_policy_and_goes_on_exactly(self):
+    def test_a_run_writes_its_policy_and_resumes_exactly(self):
         curves = []
         with tempfile.TemporaryDirectory() as name:
             folders = [pathlib.Path(name) / each for each in 'ab']

@@ -112,7 +112,7 @@ class SamplingTest(parameterized.TestCase):
         np.testing.assert_allclose(clip.pose(PERIOD + 0.1)[3:7], clip.pose(0.1)[3:7])
 
     @parameterized.parameters(0.9, -2.5, 1e-5, 1e-12)
-    def test_heading_accumulates_where_it_shall(self, turn):
+    def test_heading_accumulates_if_turning(self, turn):
         clip = circle(turn)
         self.assertAlmostEqual(clip.heading_change, turn)
         cycles = np.array([-3, -1, 0, 1, 2, 7])
@@ -121,7 +121,7 @@ class SamplingTest(parameterized.TestCase):
         heading = quaternion.heading(first[3:7]) + cycles * turn
         gap = quaternion.heading(found[:, 3:7]) - heading
         np.testing.assert_allclose(np.exp(1j * gap), 1, atol=1e-9)
-        # On the circle for ever, but for the sag between frames; the climb goes on.
+        # Stays on the circle, except for linear interpolation between frames; the climb accumulates.
         np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 1]), 2, atol=5e-3)
         np.testing.assert_allclose(found[:, 2], 1.03 + 0.1 * cycles, atol=1e-9)
         np.testing.assert_allclose(found[:, 7:], [first[7:]] * 6, atol=1e-12)
@@ -140,7 +140,7 @@ class SamplingTest(parameterized.TestCase):
         at = clip.velocity([0.0, PERIOD, -3 * PERIOD])
         np.testing.assert_allclose(at[:, 2:], [at[0, 2:]] * 3, atol=1e-9)
 
-    def test_straight_on_when_turning_by_nothing(self):
+    def test_zero_heading_change_is_straight(self):
         straight = dataclasses.replace(free(rate=(0, 0, 0)), turning=True)
         t = np.linspace(-2, 2, 41)
         expected = dataclasses.replace(straight, turning=False).pose(t)
@@ -155,18 +155,18 @@ class SamplingTest(parameterized.TestCase):
             mirrored.pose(t), clip.layout.mirror.pose(clip.pose(t)), atol=1e-9
         )
 
-    def test_heading_change_is_the_shorter_way(self):
+    def test_heading_change_is_the_smaller_angle(self):
         self.assertAlmostEqual(circle(2 * np.pi - 0.5).heading_change, -0.5)
         self.assertEqual(planar().heading_change, 0)
 
-    def test_somersault_goes_on_turning(self):
+    def test_somersault_continues_to_rotate(self):
         times = np.linspace(0, 1, 11)
         poses = np.stack([times, 1 + 0 * times, -2 * np.pi * times], axis=1)
         clip = motion.Clip('flip', times, poses, 'planar', (), (), True)
         np.testing.assert_allclose(clip.pose([-0.5, 1.25])[:, 2], (np.pi, -2.5 * np.pi))
         np.testing.assert_allclose(clip.velocity(1.0), (1, 0, -2 * np.pi))
 
-    def test_without_loop_holds_the_ends(self):
+    def test_a_clip_without_loop_holds_its_ends(self):
         clip = planar(loop=False)
         np.testing.assert_allclose(clip.pose([-1, 9]), clip.poses[[0, -1]], atol=1e-12)
         np.testing.assert_array_equal(clip.velocity([-0.1, 0.9]), np.zeros((2, 5)))
@@ -200,7 +200,7 @@ class SamplingTest(parameterized.TestCase):
         np.testing.assert_allclose(clip.pose(t)[:, 3:7], expected, atol=1e-12)
         np.testing.assert_allclose(clip.velocity(t)[:, 6:9], [(0.3, -0.4, 1.2)] * 20, atol=1e-9)
 
-    def test_slerp_takes_the_shorter_way(self):
+    def test_slerp_takes_the_shorter_arc(self):
         clip = free(n=3, loop=False)
         poses = clip.poses.copy()
         poses[1, 3:7] *= -1
@@ -216,7 +216,7 @@ class SamplingTest(parameterized.TestCase):
         )
         np.testing.assert_allclose(planar(loop=False).phase([-1, 0.2, 1]), (0, 0.25, 1))
 
-    def test_figures_of_a_cycle(self):
+    def test_duration_displacement_and_speed_of_a_cycle(self):
         clip = planar()
         self.assertAlmostEqual(clip.duration, PERIOD)
         np.testing.assert_allclose(clip.displacement, (1.6, 0.4))
@@ -230,12 +230,12 @@ class MirrorTest(absltest.TestCase):
         mirrored = clip.mirrored([('right', 'left')])
         np.testing.assert_array_equal(mirrored.poses, clip.poses[:, [0, 1, 2, 4, 3]])
 
-    def test_twice_is_the_same(self):
+    def test_mirroring_twice_is_the_identity(self):
         clip = free()
         twice = clip.mirrored([]).mirrored([])
         np.testing.assert_allclose(twice.poses, clip.poses)
 
-    def test_free_is_reflected_in_the_sagittal_plane(self):
+    def test_free_root_is_reflected_in_the_sagittal_plane(self):
         clip, mirror = free(), np.diag([1, -1, 1])
         mirrored = clip.mirrored([])
         np.testing.assert_allclose(mirrored.poses[:, :3], clip.poses[:, :3] @ mirror)
@@ -264,7 +264,7 @@ class MirrorTest(absltest.TestCase):
                 mirror.velocity(clip.velocity(t)), clip.mirrored(pairs).velocity(t), atol=1e-9
             )
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "unknown joint 'rihgt'.*'right'"):
             planar().mirrored([('rihgt', 'left')])
         with self.assertRaisesRegex(ValueError, 'differ in kind'):
@@ -287,17 +287,17 @@ class ConstructionTest(parameterized.TestCase):
         ('twice', {'joints': ('left', 'left')}, 'joints: a name occurs twice'),
         ('turning', {'turning': True}, 'turning: a planar root'),
     )
-    def test_refuses(self, change, message):
+    def test_invalid_arguments_are_rejected(self, change, message):
         with self.assertRaisesRegex(ValueError, f"clip 'planar', {message}"):
             dataclasses.replace(planar(), **change)
 
-    def test_refuses_a_quaternion_off_the_unit_sphere(self):
+    def test_a_quaternion_without_unit_norm_is_rejected(self):
         poses = free().poses.copy()
         poses[2, 7:11] *= 1.1
         with self.assertRaisesRegex(ValueError, 'column 7 of frame 2 has length 1.1'):
             dataclasses.replace(free(), poses=poses)
 
-    def test_keeps_its_own_locked_copy(self):
+    def test_keeps_a_read_only_copy(self):
         poses = planar().poses.copy()
         clip = dataclasses.replace(planar(), poses=poses)
         poses[:] = 0
@@ -362,13 +362,13 @@ class FileTest(parameterized.TestCase):
         ('text', b'once upon a time'),
         ('broken_zip', b'PK\x03\x04 and no more'),
     )
-    def test_no_archive(self, content):
+    def test_a_file_that_is_not_an_archive(self, content):
         path = self.folder / 'bad.npz'
         path.write_bytes(content)
         with self.assertRaisesRegex(ValueError, 'bad.npz'):
             motion.load(path)
 
-    def test_cut_short_or_damaged(self):
+    def test_truncated_or_damaged_files_are_rejected(self):
         path = self.folder / 'bad.npz'
         planar().save(path)
         whole = path.read_bytes()
@@ -425,7 +425,7 @@ class FileTest(parameterized.TestCase):
 class StepsTest(parameterized.TestCase):
     """Libraries of made-up steps; the shipped ones are tested with the clips."""
 
-    def test_each_row_has_its_own_step_time_and_side(self):
+    def test_each_query_has_its_own_step_time_and_side(self):
         library = steps()
         index, t = np.array([0, 1, 1, 0]), np.array([0.1, 0.2, 0.5, 0.0])
         mirrored = np.array([False, True, False, True])
@@ -475,7 +475,7 @@ class StepsTest(parameterized.TestCase):
         found = motion.step_features(root, heading, right, left, target, planned, np.array([False]))
         np.testing.assert_allclose(found, [(-0.3, -0.1, 0.2, 0.1, 1.0, 0.05, -0.3)], atol=1e-12)
 
-    def test_heading_takes_the_shorter_way(self):
+    def test_heading_is_the_smaller_angle(self):
         place = np.zeros((2, 2))
         found = motion.step_features(
             place, np.array([3.0, -3.0]), place, place, place, np.array([-3.0, 9.0]),
@@ -498,11 +498,11 @@ class StepsTest(parameterized.TestCase):
         ('previous', {'previous': np.full((2, 3), np.nan)}, 'previous: not finite'),
         ('features', {'features': [['a'] * 7] * 2}, 'features: an array of numbers'),
     )
-    def test_refuses(self, change, message):
+    def test_invalid_arguments_are_rejected(self, change, message):
         with self.assertRaisesRegex(ValueError, f"steps 'steps', {message}"):
             dataclasses.replace(steps(), **change)
 
-    def test_refuses_what_a_clip_refuses(self):
+    def test_values_that_clips_reject_are_rejected(self):
         with self.assertRaisesRegex(ValueError, r"clip 'steps\[0\]', sizes"):
             dataclasses.replace(steps(), sizes=(4, 1, 4, 2))
 
@@ -552,7 +552,7 @@ class ReaderTest(parameterized.TestCase):
 
     def test_a_file_of_the_original_form(self):
         # Tabs and blank lines; pitch +90 deg about z (up turns back), then past 180 with the
-        # quaternion's sign turned; hinge signs are kept.
+        # quaternion's sign inverted; hinge signs are kept.
         half = np.sqrt(0.5)
         self.path.write_text(
             '{\n\t"Loop": true,\n\n"Frames":\t[\n'
@@ -579,8 +579,8 @@ class ReaderTest(parameterized.TestCase):
         clip = motion.read_terrainrl(self.path, (), (), 'planar')
         np.testing.assert_allclose(clip.poses[:, 2], pitch, atol=1e-9)
 
-    def test_turns_the_frame(self):
-        # Up is y and right is z in the file: yaw about its y is yaw about our z, and so on.
+    def test_rotates_the_frame(self):
+        # Up is y and right is z in the file: yaw about its y is yaw about z here, and so on.
         turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
         frame = [0.1, 1, 2, 3, *wxyz(turn), *wxyz(turn)]
         self.write([frame, frame])
@@ -632,7 +632,7 @@ class ReaderTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'walk.txt: CycleSyncRootRot: true or false'):
             self.deepmimic(Loop='wrap', CycleSyncRootRot=1)
 
-    def test_deepmimic_refuses_other_cycles(self):
+    def test_deepmimic_rejects_other_cycles(self):
         message = 'walk.txt: CycleSyncRootPos: False is not supported'
         with self.assertRaisesRegex(ValueError, message):
             self.deepmimic(Loop='wrap', CycleSyncRootPos=False)

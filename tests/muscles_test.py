@@ -88,7 +88,7 @@ SETS = (  # a muscle of each set that was optimised for a motion
     ('dog', 'bound', 'back_toe1', 0.05, 0.15, 1000, {'toe': (0.037, 0.0708, -0.4492)}),
 )  # fmt: skip
 COUNTS = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
-# How many muscles span each joint; the last tail units are told apart by the joint they span.
+# How many muscles span each joint; the last tail units have the joint that they span in their names.
 SPANS = {
     'dog': {'shoulder': 4, 'elbow': 4, 'hip': 4, 'knee': 4, 'ankle': 3, 'toe': 2, 'tail3': 2},
     'raptor': {'right_hip': 4, 'left_knee': 4, 'left_ankle': 3, 'spine3': 2, 'tail4': 2},
@@ -156,7 +156,7 @@ class TableTest(parameterized.TestCase):
         self.assertLessEqual(spanned, set(characters.CHARACTERS[name].joints))
 
     @parameterized.parameters(*CASES)
-    def test_row(self, name, muscle):
+    def test_parameters_of_a_muscle(self, name, muscle):
         l_opt, l_slack, f_max, pennation, arms = SAMPLES[name][muscle]
         unit = next(unit for unit in muscles.MUSCLES[name]['plain'] if unit.name == muscle)
         self.assertEqual(unit[1:5], (l_opt, l_slack, f_max, pennation))
@@ -328,7 +328,7 @@ class MujocoTest(parameterized.TestCase):
         self.assertTrue((np.diff(found) > -1e-9).all())
         np.testing.assert_allclose(found[[0, 20, 40]], (0, 1, 1.5), atol=1e-9)
 
-    def test_more_exact_where_muscles_work(self):
+    def test_fit_is_better_in_the_working_range(self):
         """Root mean square error over the fitted range, isometric and by velocity."""
         rig = Rig('biped2d', 'right_GLU')
         lengths, velocities = np.linspace(0.5, 1.5, 41), np.linspace(-10, 10, 41)
@@ -369,7 +369,7 @@ class StrainTest(parameterized.TestCase):
                 )
                 self.assertAlmostEqual(strain[i], -pennation * change / l_opt, delta=1e-9)
 
-    def test_muscles_drive_in_the_order_of_the_action(self):
+    def test_muscles_are_in_the_order_of_the_action(self):
         environment = suite.make('MTU_Biped2D_LLC_Imitate_Flat-v0', {'random': 0})
         names = environment.action_map.names
         self.assertEqual(names, tuple(BIPED))

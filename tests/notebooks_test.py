@@ -75,7 +75,7 @@ class StoredTest(parameterized.TestCase):
             self.assertIn(f'({name}.ipynb)', readme)
 
     @parameterized.parameters(*NAMES)
-    def test_form(self, name):
+    def test_notebooks_have_the_expected_format(self, name):
         notebook = read(name)
         self.assertEqual((notebook['nbformat'], notebook['nbformat_minor']), (4, 5))
         self.assertEqual(notebook['metadata'], {
@@ -110,7 +110,7 @@ class StoredTest(parameterized.TestCase):
         self.assertGreaterEqual(pictures, 2)
 
     @parameterized.parameters(*NAMES)
-    def test_what_is_named_exists(self, name):
+    def test_names_in_notebooks_exist(self, name):
         notebook = read(name)
         tree, words = program(notebook), sources(notebook, 'markdown')
         for cell in (*words, *sources(notebook, 'code')):
@@ -137,7 +137,7 @@ class RunTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     @pytest.mark.slow
-    def test_run(self, name):
+    def test_notebooks_run(self, name):
         for module in ('nbclient', 'ipykernel', 'stable_baselines3'):
             if importlib.util.find_spec(module) is None:
                 self.skipTest(f"needs {module}: pip install -e '.[notebooks]'")

@@ -1,4 +1,4 @@
-"""Motions of the user's own: files in four formats, carried over, cut to a cycle, checked."""
+"""Users' own motions: files in four formats, retargeted, cut to a cycle, checked."""
 
 import contextlib
 import dataclasses
@@ -18,13 +18,15 @@ from trl_suite.motion import quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.retargeting import clip_check
 
-FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # ours from a file with y up, z forward
+FILE_AXES = np.array(
+    [[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]
+)  # to the suite's frame, from y up, z forward
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 FULL, PLAIN = 'biped3d_full_mocap', 'biped3d_mocap'
 
 
 def in_file(rotation):
-    """A rotation of ours in a file's frame."""
+    """Converts a rotation to a file's frame."""
     return Rotation.from_matrix(FILE_AXES.T @ rotation.as_matrix() @ FILE_AXES)
 
 
@@ -165,8 +167,8 @@ class FolderTest(parameterized.TestCase):
 
 class ReadingTest(FolderTest):
     @parameterized.parameters('ZXY', 'XYZ', 'ZYX')
-    def test_bvh_comes_back(self, order):
-        """A walk of ours, arms at rest sideways, in centimetres, y up."""
+    def test_bvh_round_trip(self, order):
+        """A shipped walk, arms at rest sideways, in centimetres, y up."""
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
         write_bvh(figure, self.folder / 'walk.bvh', order)
         capture = retargeting.read(self.folder / 'walk.bvh', FULL)
@@ -180,7 +182,7 @@ class ReadingTest(FolderTest):
         angles = [column for column in range(clip.poses.shape[1]) if column > 2]
         self.assertLess(np.abs(np.abs(clip.poses) - np.abs(figure.poses))[:, angles].max(), 1e-5)
 
-    def test_acclaim_comes_back(self):
+    def test_acclaim_round_trip(self):
         figure = Figure(PLAIN, motion.load('biped3d_mocap_walk'), 25)
         write_acclaim(figure, self.folder / 'a.asf', self.folder / 'walk.amc')
         capture = retargeting.read(
@@ -213,7 +215,12 @@ class ReadingTest(FolderTest):
         walk, angle = motion.load('biped3d_mocap_walk'), 0.3
         frame = [0.1, 0, 0.9, 0, 1, 0, 0, 0]
         for name, size in motion.HUMANOID3D.items():
-            bent = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # about their z, our -y
+            bent = [
+                np.cos(angle / 2),
+                0,
+                0,
+                np.sin(angle / 2),
+            ]  # about z of the file, -y of the suite
             value = [angle if name == 'left_knee' else 0] if size == 1 else [1, 0, 0, 0]
             frame += bent if name in ('chest', 'right_hip') else value
         ahead = [*frame[:1], 0.5, *frame[2:]]
@@ -232,11 +239,11 @@ class ReadingTest(FolderTest):
             np.testing.assert_allclose(
                 clip.poses[:, column : column + len(expected)], [expected] * 2, atol=1e-12
             )
-        # The root as high as ours stands, and what it travels in proportion.
+        # The height of the root is that of the character; displacements scale with it.
         size = KinematicViewer(PLAIN).standing()[2] / 0.9
         np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for name, text in (
             ('a.bvh', 'HIERARCHY\n'), ('a.json', '{'), ('a.asf', ':root\norder TX\n'),
             ('b.asf', ':bonedata\nbegin\nname x\nlength far\nend\n'), ('a.amc', '1\nroot 1\n'),
@@ -383,7 +390,7 @@ class ReadingTest(FolderTest):
 
 
 class RetargetTest(FolderTest):
-    def test_from_space_to_the_plane(self):
+    def test_a_spatial_motion_on_a_planar_character(self):
         """Hinges take the part of a rotation that is about their axis."""
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 31, spread_arms=True)
         write_bvh(figure, self.folder / 'walk.bvh')
@@ -398,7 +405,7 @@ class RetargetTest(FolderTest):
         own, _ = clip.layout.starts('left_shoulder')  # hangs, though it was sideways at rest
         np.testing.assert_allclose(clip.poses[:, own], 0, atol=0.2)
         self.assertGreater(clip.speed, 0.8 * source.speed)
-        # Who turns around on the way moves its joints all the same.
+        # A rotation of the whole motion does not change joint angles.
         ramp = Rotation.from_euler('z', np.linspace(0, 3, 31)[:, None])
         figure.local[0] = ramp * figure.local[0]
         write_bvh(figure, self.folder / 'turn.bvh')
@@ -426,13 +433,13 @@ class RetargetTest(FolderTest):
         self.assertEqual((found['left_knee'], found['right_elbow']), ('ltibia', 'rradius'))
         self.assertNotIn('right_hip', found)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         clip = motion.load('biped2d_walk')
         with self.assertRaisesRegex(ValueError, "unknown joint of the character 'left_nee'"):
             retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_nee': 'left_knee'})
         with self.assertRaisesRegex(ValueError, "joint of the motion 'knee'; did you mean"):
             retargeting.retarget(clip, 'raptor', {'root': 'root', 'left_knee': 'knee'})
-        with self.assertRaisesRegex(ValueError, 'no root, or nothing else'):
+        with self.assertRaisesRegex(ValueError, 'the root, or all other joints'):
             retargeting.retarget(clip, 'dog')
         with self.assertRaisesRegex(ValueError, 'scale is 0'):
             retargeting.retarget(clip, 'raptor', scale=0)
@@ -469,7 +476,7 @@ class CycleTest(absltest.TestCase):
             moved = clip.layout.change(clip.poses, loose.pose(0.12 + clip.times))[:, flat:]
             self.assertLessEqual(np.abs(moved).max(), gap + 1e-9)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         clip = self.unrolled('biped2d_walk')
         with self.assertRaisesRegex(ValueError, 'both or none'):
             retargeting.cycle(clip, start=0.1)
@@ -483,7 +490,7 @@ class CheckTest(parameterized.TestCase):
     @parameterized.parameters(
         ('biped2d_walk', 'biped2d'), ('dog_bound', 'dog'), ('biped3d_run', 'biped3d'),
     )  # fmt: skip
-    def test_our_own_have_no_faults(self, name, character):
+    def test_shipped_clips_have_no_faults(self, name, character):
         report = clip_check.check(motion.load(name), character)
         self.assertEmpty(report.faults)
         self.assertEndsWith(str(report), 'no faults')
@@ -534,13 +541,13 @@ class CheckTest(parameterized.TestCase):
         self.assertAlmostEqual(first.amount, 0.02, delta=0.02)  # not before it has travelled so far
         self.assertIn('foot slide', str(report))
 
-    def test_a_clip_of_another_character(self):
-        with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*is none of 'raptor'"):
+    def test_a_clip_of_another_character_is_rejected(self):
+        with self.assertRaisesRegex(ValueError, "'biped2d_walk'.*does not fit 'raptor'"):
             clip_check.check(motion.load('biped2d_walk'), 'raptor')
 
 
 class ImitationTest(FolderTest):
-    def test_it_can_be_imitated(self):
+    def test_a_cycle_can_be_imitated(self):
         """From a file to an environment."""
         walk = motion.load('biped2d_full_walk')
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 41)
@@ -555,7 +562,7 @@ class ImitationTest(FolderTest):
         time_step = environment.step(environment.task.clip_action(0))
         self.assertGreater(time_step.reward, 0.5)
 
-    def test_the_example(self):
+    def test_example_runs(self):
         figure = Figure(FULL, motion.load('biped3d_full_walk'), 61)
         write_bvh(figure, self.folder / 'walk.bvh')
         spec = importlib.util.spec_from_file_location('own_clip', EXAMPLES / 'own_clip.py')

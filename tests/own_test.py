@@ -97,7 +97,7 @@ class CharacterTest(Folder):
         foot = '<link name="foot"/><joint name="f" type="fixed"><parent link="leg"/><child link="foot"/><origin xyz="0 0 -.4"/></joint></robot>'
         path = self.write(URDF.replace('</robot>', foot), 'two.urdf')
         spec = characters.from_file(path, **{**TWO, 'end_effectors': ('foot',)})
-        self.assertEqual(spec.links, ('trunk', 'leg'))  # what has no mass is no link
+        self.assertEqual(spec.links, ('trunk', 'leg'))  # massless bodies are not links
         suite.build(spec, task='walk').reset()
 
     def test_actuators_key_frame_and_defaults(self):
@@ -127,7 +127,7 @@ class CharacterTest(Folder):
             'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', spec.notes
         )
 
-    def test_what_has_no_name_in_the_file(self):
+    def test_unnamed_elements_get_names(self):
         things = '<site pos="0 0 .4"/><camera pos="0 -2 0"/><light pos="0 0 3"/>'
         rules = (
             '<contact><exclude body1="trunk" body2="left_shin"/></contact>'
@@ -142,11 +142,11 @@ class CharacterTest(Folder):
         model = environment.physics.model
         self.assertEqual((model.neq, model.ntendon, model.nexclude), (1, 1, 1))
 
-    def test_own_figures_replace_those_found(self):
+    def test_given_joint_parameters_replace_those_of_the_file(self):
         mine = characters.Joint(kp=10, kd=1, weight=0.5)
         self.assertIs(self.planar(joints={'left_hip': mine}).joints['left_hip'], mine)
 
-    def test_meshes_travel_with_the_row(self):
+    def test_meshes_are_stored_in_the_spec(self):
         trimesh.creation.icosphere(radius=0.2).export(self.folder / 'ball.obj')
         text = MJCF.replace('<worldbody>', '<asset><mesh file="ball.obj"/></asset><worldbody>', 1)
         text = text.replace('<geom size=".15 .15 .2" type="box"', '<geom type="mesh" mesh="ball"')
@@ -222,13 +222,13 @@ class CharacterTest(Folder):
 
     @parameterized.named_parameters(
         ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
-        ('inner_root', {'root': 'left_shin'}, "hangs on another body; did you mean 'trunk'"),
+        ('inner_root', {'root': 'left_shin'}, "is a child of another body; did you mean 'trunk'"),
         ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
         ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
         ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
-        ('name', {'name': 'dog'}, "may not be named 'dog'"),
+        ('name', {'name': 'dog'}, "has a character named 'dog'"),
         ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
         ('spatial', {'spatial': 'x'}, "spatial is 'x'; expected True or False or None"),
         ('short_turn', {'turn': (0, 0, 90)}, r'turn is \(0, 0, 90\); expected a quaternion wxyz'),
@@ -236,7 +236,7 @@ class CharacterTest(Folder):
         ('word_turn', {'turn': 'left'}, "turn is 'left'; expected a quaternion"),
         ('nan_turn', {'turn': (1, 0, 0, math.nan)}, 'expected a quaternion wxyz'),
     )  # fmt: skip
-    def test_bad_names(self, options, message):
+    def test_invalid_names_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             self.planar(**options)
 
@@ -251,7 +251,7 @@ class CharacterTest(Folder):
         self.assertNotRegex('; '.join(self.planar().notes), message)
         self.assertRegex('; '.join(self.planar(MJCF.replace(before, after)).notes), message)
 
-    def test_what_is_no_joint_and_no_character(self):
+    def test_joints_and_characters_of_a_wrong_type_are_refused(self):
         with self.assertRaisesRegex(
             TypeError, r"joints\['left_hip'\] is 3; expected a characters.J"
         ):
@@ -259,7 +259,7 @@ class CharacterTest(Folder):
         with self.assertRaisesRegex(TypeError, 'character is 3; expected a name, or what'):
             characters.make(3)
 
-    def test_actuators_of_other_things_are_noted(self):
+    def test_actuators_of_tendons_are_noted(self):
         tendon = '<tendon><fixed name="both"><joint joint="left_hip" coef="1"/></fixed></tendon>'
         text = MJCF.replace('<actuator>', f'{tendon}<actuator><motor name="pull" tendon="both"/>')
         notes = '; '.join(self.planar(text).notes)
@@ -271,7 +271,7 @@ class CharacterTest(Folder):
             self.planar(MJCF.replace('<geom size=".15', f'<geom contype="{2**30}" size=".15'))
 
     @parameterized.parameters(True, False)
-    def test_a_turned_file_is_the_same_figure(self, in_file):
+    def test_a_turned_file_gives_the_same_model(self, in_file):
         turn = np.array([0.859, 1, 1, 0.859]) / np.linalg.norm([0.859, 1, 1, 0.859])
         back = turn * [1, -1, -1, -1]
         text = MJCF.replace('<geom size=".15', '<geom name="box" euler="0 20 0" size=".15')
@@ -318,7 +318,7 @@ class CharacterTest(Folder):
         self.assertEqual([model.light(i).name for i in range(model.nlight)], ['sun'])
         self.assertLess(np.abs(model.cam_pos[model.camera('side').id]).max(), 5)
 
-    def test_a_root_that_says_otherwise_is_noted(self):
+    def test_contradicting_root_joints_are_noted(self):
         spec = self.planar(spatial=True)
         self.assertTrue(spec.spatial)
         self.assertRegex(spec.notes[0], 'spatial=True was given, .* two slides and a hinge')
@@ -339,7 +339,7 @@ class CharacterTest(Folder):
         ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
         ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
     )  # fmt: skip
-    def test_bad_files(self, before, after, message):
+    def test_invalid_files_are_rejected(self, before, after, message):
         self.assertIn(before, MJCF)
         with self.assertRaisesRegex(ValueError, f'figure.xml: .*{message}'):
             self.planar(MJCF.replace(before, after))
@@ -375,11 +375,11 @@ class CharacterTest(Folder):
         ({'kp': -80}, 'kp of a joint is -80'), ({'kd': math.nan}, 'kd of a joint is nan'),
         ({'armature': math.inf}, 'armature'), ({'target': (0, math.nan, 0)}, 'target .* finite numbers'),
     )  # fmt: skip
-    def test_bad_figures(self, values, message):
+    def test_invalid_joint_parameters_are_rejected(self, values, message):
         with self.assertRaisesRegex(ValueError, message):
             characters.Joint(**{'kp': 10, 'kd': 1, 'weight': 1, **values})
 
-    def test_missing_file_and_what_a_urdf_does_not_tell(self):
+    def test_missing_files_and_incomplete_urdf_files(self):
         path = self.write(URDF, 'two.urdf')
         with self.assertRaisesRegex(FileNotFoundError, "did you mean 'two.urdf'"):
             characters.from_file(self.folder / 'tow.urdf', **TWO)
@@ -451,7 +451,7 @@ class TerrainTest(Folder):
         self.assertTrue((found >= np.min(near, 0) - 1e-3).all())
         self.assertTrue((found <= np.max(near, 0) + 1e-3).all())
 
-    def test_a_strip_written_and_read_as_a_line(self):
+    def test_planar_ground_written_and_read_as_a_line(self):
         strip = terrain.PlanarGround(terrain.load('slopes_mixed'), 4)
         terrain.save_mesh(strip, self.folder / 'strip.obj', -2, 12)
         mine = terrain.from_mesh(self.folder / 'strip.obj', terrain.SPACING, line=0.0)
@@ -474,7 +474,7 @@ class TerrainTest(Folder):
         ground = terrain.SpatialGround(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2), 0)
         self.assertAlmostEqual(float(ground.height(0.4, 0.4)), 2)
         self.assertAlmostEqual(float(ground.height(0.2, 0.4)), -1)
-        # Its rim goes on.
+        # The heights of its rim continue.
         self.assertAlmostEqual(float(ground.height(0.4, 9)), 2)
         line = terrain.PlanarGround(
             terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0
@@ -496,7 +496,7 @@ class TerrainTest(Folder):
             self.assertEqual(heights[7], at(ground))
             self.assertEqual(heights[7], at(draw.from_state(ground.state())))
 
-    def test_a_line_does_not_depend_on_when_it_is_asked(self):
+    def test_a_line_does_not_depend_on_the_order_of_queries(self):
         mine = terrain.from_function(vee)
         whole, piecewise = terrain.PlanarGround(mine, 0), terrain.PlanarGround(mine, 0)
         for x in (0, 30, -30, 90, -55):
@@ -505,7 +505,7 @@ class TerrainTest(Folder):
         np.testing.assert_array_equal(whole.height(x), piecewise.height(x))
         np.testing.assert_allclose(whole.height(x), vee(x), atol=0.2 * terrain.SPACING)
 
-    def test_terrain_crosses_processes(self):
+    def test_terrain_can_be_pickled(self):
         mine = terrain.from_heights(np.random.default_rng(0).random((9, 9)), 0.3, start_span=1)
         again = pickle.loads(pickle.dumps(mine))
         self.assertEqual(again, mine)
@@ -525,24 +525,24 @@ class TerrainTest(Folder):
             np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
 
     @parameterized.named_parameters(
-        ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name of its own'),
+        ('lambda', lambda _: terrain.from_function(lambda x: x), 'has no name; pass name='),
         ('taken', lambda _: terrain.from_function(np.abs, 'var2d_gaps'), 'exists; pass replace'),
-        ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'of shape .3,. with float64 of shape ..;'),
+        ('scalar', lambda _: terrain.from_function(lambda x: 0.0, 'f'), 'float64 of shape .. for an array of shape .3,.;'),
         ('arguments', lambda _: terrain.from_function(lambda x, y, z: x, 'f'), 'takes 3 arguments'),
         ('shape', lambda _: terrain.from_heights(np.zeros((2, 2, 2)), 1), r'\(2, 2, 2\); expected'),
-        ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; those at \[1\]'),
+        ('finite', lambda _: terrain.from_heights([0, np.nan], 1), r'must be finite; the one at \[1\]'),
         ('spacing', lambda _: terrain.from_heights([0, 0], 0), 'spacing is 0'),
         ('suffix', lambda _: terrain.from_mesh('hill.fbx'), "suffix '.fbx'; expected .obj or"),
         ('away', lambda f: terrain.from_mesh(f / 'away.stl'), 'not over the origin'),
         ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
         ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
-        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture'),
+        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'cannot be read as an image'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
     )  # fmt: skip
-    def test_bad_input(self, make, message):
+    def test_invalid_arguments_are_rejected(self, make, message):
         box = trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix((9, 0, 0)))
         box.export(self.folder / 'away.stl')
         self.write('nothing', 'broken.obj')
@@ -550,7 +550,7 @@ class TerrainTest(Folder):
         with self.assertRaisesRegex(ValueError, message):
             make(self.folder)
 
-    def test_a_cell_that_is_run_again(self):
+    def test_a_rerun_cell_replaces_its_terrain(self):
         def heights(factor):
             def wavelets(x):
                 return factor * np.sin(x)
@@ -561,7 +561,7 @@ class TerrainTest(Folder):
         again = terrain.PlanarGround(heights(0.5), 0)
         self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
 
-    def test_another_lambda_of_the_same_name(self):
+    def test_another_lambda_of_the_same_name_is_rejected(self):
         for factor in (1.0, 2.0):
             with (
                 self.assertRaisesRegex(ValueError, 'exists; pass')
@@ -571,10 +571,10 @@ class TerrainTest(Folder):
                 terrain.from_function(lambda x, factor=factor: factor * x, 'wedge')
 
     def test_heights_that_are_not_finite(self):
-        with self.assertRaisesRegex(TypeError, "function 'f' failed where .* np.sin"):
+        with self.assertRaisesRegex(TypeError, "function 'f' failed with .* np.sin"):
             terrain.from_function(lambda x: math.sin(x), 'f')
         with self.assertRaisesRegex(
-            TypeError, "function 'f' failed where .* np.where instead of if"
+            TypeError, "function 'f' failed with .* np.where instead of if"
         ):
             terrain.from_function(lambda x: x if x > 0 else 0.0, 'f')
         hole = terrain.from_function(lambda x: np.where(x > 3, np.nan, x), 'hole')
@@ -590,7 +590,7 @@ class TerrainTest(Folder):
 
 
 def tall(task):
-    """Rows whose root is high."""
+    """Simulations whose root is high."""
     return parts.height(task) > 0.5
 
 
@@ -613,7 +613,7 @@ class TaskTest(parameterized.TestCase):
     """Tasks from parts."""
 
     @parameterized.parameters('PD_Biped2D_Flat-v0', 'PD_Biped3D_Imitate-v0')
-    def test_parts_are_as_they_were_when_asked(self, id):
+    def test_parts_return_current_values(self, id):
         environment = suite.make(id, {'random': 1})
         environment.reset()
         names = ('height', 'root', 'speed', 'heading', 'upright', 'joint_angles', 'joint_rates')
@@ -626,7 +626,7 @@ class TaskTest(parameterized.TestCase):
     @parameterized.parameters(
         'PD_Biped2D_Gaps_Terrain-v0', 'FSM_Dog2D_Terrain_Gaps-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
     )
-    def test_parts_beside_a_task_of_the_suite(self, id):
+    def test_parts_added_to_a_task_of_the_suite(self, id):
         many = VectorEnvironment(id, 3, seed=2, task_kwargs=PARTS)
         plain = VectorEnvironment(id, 3, seed=2)
         count = 2 if id.startswith('FSM') else 20  # whole cycles
@@ -650,7 +650,7 @@ class TaskTest(parameterized.TestCase):
         np.testing.assert_array_equal(found, np.array(seen)[:, 1])
         np.testing.assert_array_equal([r or 0.0 for r in gained], np.array(rewards)[:, 1])
 
-    def test_values_are_what_they_say(self):
+    def test_values_of_parts_equal_their_definitions(self):
         environment = suite.make('PD_Biped2D_Flat-v0', {'random': 1, **PARTS})
         environment.reset()
         data = environment.physics.named.data
@@ -691,7 +691,7 @@ class TaskTest(parameterized.TestCase):
         self.assertEqual(reward.shape, (2,))
 
     @parameterized.parameters('biped2d', 'biped3d')
-    def test_a_task_of_the_users(self, character):
+    def test_a_users_own_task(self, character):
         spec = suite.combine(character, task=Rise)
         environment = suite.build(
             character, task=Rise, task_kwargs={'random': 1, 'action_scale': 1.0}
@@ -726,7 +726,7 @@ class TaskTest(parameterized.TestCase):
         ('dict', {'rewards': [1]}, 'expected a dict'),
         ('option', {'reward': {}}, "did you mean 'rewards'"),
     )
-    def test_bad_parts(self, options, message):
+    def test_invalid_parts_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             environment = suite.make('PD_Biped2D_Flat-v0', options)
             environment.reset()
@@ -740,14 +740,14 @@ class ExampleTest(Folder):
         super().setUp()
         self.enterContext(mock.patch.dict(generators._generators))  # they register types
 
-    def test_page(self):
+    def test_code_of_the_page_runs(self):
         page = (EXAMPLES.parent / 'docs' / 'make_your_own.md').read_text(encoding='utf-8')
         code = '\n'.join(re.findall('```python\n(.*?)```', page, re.DOTALL))
         with contextlib.chdir(self.folder):
             exec(compile(code, 'make_your_own.md', 'exec'), {'__name__': 'page'})
 
     @parameterized.parameters('own_character', 'own_terrain', 'own_task')
-    def test_example(self, name):
+    def test_example_runs(self, name):
         path, output = EXAMPLES / f'{name}.py', self.folder / 'picture.png'
         self.assertLess(len(path.read_text().splitlines()), 42)
         with (

@@ -31,7 +31,7 @@ def python(code, executable=sys.executable, cwd=None, **variables):
 class PinTest(absltest.TestCase):
     """Requirements of an installation."""
 
-    def test_engine_pair(self):
+    def test_versions_of_the_engine_are_pinned(self):
         setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
         required = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
         # dm_control 1.0.50 asks for mujoco>=3.17 but cannot make a Physics on MuJoCo 4.0.0
@@ -44,7 +44,10 @@ class DiscoveryTest(absltest.TestCase):
     """Python's own runner finds the tests."""
 
     def test_unittest_runs_what_is_not_slow(self):
-        fast, slow = 'test_engine_pair', 'test_long_random_rollout'
+        fast, slow = (
+            'test_versions_of_the_engine_are_pinned',
+            'test_long_random_rollout_is_finite_with_rewards_in_0_to_1',
+        )
         done = subprocess.run(
             [sys.executable, '-m', 'unittest', '-v', '-k', fast, '-k', slow],
             capture_output=True, text=True, cwd=CHECKOUT, timeout=300,
@@ -98,7 +101,7 @@ class ImportTest(absltest.TestCase):
         """
         self.assertEqual(python(code), ('', ''))
 
-    def test_without_a_display_egl_is_chosen(self):
+    def test_egl_is_the_default_without_a_display(self):
         code = """
             import os
             os.environ.pop('MUJOCO_GL', None)
@@ -111,7 +114,7 @@ class ImportTest(absltest.TestCase):
             self.skipTest('only on Linux')
         self.assertEqual(python(code)[0].strip(), 'egl')
 
-    def test_a_choice_of_the_user_is_kept(self):
+    def test_a_users_mujoco_gl_is_kept(self):
         code = """
             import os
             import trl_suite
@@ -123,7 +126,7 @@ class ImportTest(absltest.TestCase):
 class WheelTest(absltest.TestCase):
     """A wheel installed elsewhere works without the checkout."""
 
-    def test_wheel(self):
+    def test_wheel_contains_all_data(self):
         temporary = tempfile.TemporaryDirectory()
         self.addCleanup(temporary.cleanup)
         folder = pathlib.Path(temporary.name).resolve()
@@ -131,7 +134,7 @@ class WheelTest(absltest.TestCase):
             folder / name for name in ('source', 'wheels', 'venv', 'work')
         )
         work.mkdir()
-        # Built from a copy: building writes beside setup.py.
+        # Built from a copy: building writes to the folder of setup.py.
         source.mkdir()
         for name in ('trl_suite', 'xml', 'mocap', 'trained'):
             shutil.copytree(
@@ -154,7 +157,7 @@ class WheelTest(absltest.TestCase):
             sys.executable, '-m', 'pip', '--disable-pip-version-check', '-q', 'install',
             '--no-deps', '--no-index', '--target', target, wheel,
         )  # fmt: skip
-        # Third-party packages come from this interpreter; ours must not.
+        # Third-party packages come from this interpreter; the suite must not.
         others = [sysconfig.get_path('purelib'), sysconfig.get_path('platlib'),
                   *site.getsitepackages()]  # fmt: skip
         lines = [f'import sys; sys.path.append({path!r})' for path in dict.fromkeys(others)]

@@ -45,7 +45,7 @@ def make(seed=0, hidden=(6, 5), blocks=SIZES, actions=('hip', 'knee'), **changes
 
 
 def make_convolving(seed=0, size=0.6, **changes):
-    """A policy that sees 9 heights through convolutions, relative to the first of 4 other numbers."""
+    """A policy with convolutions over 9 heights, relative to the first of 4 other inputs."""
     rng = np.random.default_rng(seed)
     shapes = (3, 1, 4), (2, 4, 5)  # 9 heights -> 4 positions -> 3
     line = policies.Convolution(
@@ -117,7 +117,7 @@ class FolderTest(parameterized.TestCase):
 
 class ActTest(parameterized.TestCase):
     @parameterized.product(activation=tuple(policies.ACTIVATIONS), hidden=((), (6,), (6, 5)))
-    def test_computes_what_the_docstring_says(self, activation, hidden):
+    def test_output_equals_the_documented_formula(self, activation, hidden):
         policy = make(hidden=hidden, activation=activation)
         observations = np.random.default_rng(1).normal(0, 2, (50, 7))
         expected = [plain(policy, row) for row in observations]
@@ -128,13 +128,13 @@ class ActTest(parameterized.TestCase):
         self.assertGreater((np.abs(actions) < 1).mean(), 0.2)
 
     @parameterized.product(activation=tuple(policies.ACTIVATIONS), layer_norm=(False, True))
-    def test_it_may_convolve_a_line(self, activation, layer_norm):
+    def test_a_line_can_be_convolved(self, activation, layer_norm):
         policy = make_convolving(activation=activation, layer_norm=layer_norm)
         observations = np.random.default_rng(1).normal(0, 2, (50, 13))
         expected = [plain(policy, row) for row in observations]
         np.testing.assert_allclose(policy(observations), expected, atol=2e-6)
 
-    def test_a_row_that_convolves_does_not_depend_on_the_others(self):
+    def test_convolutions_do_not_depend_on_the_batch(self):
         policy = make_convolving(layer_norm=True)
         observations = np.random.default_rng(1).normal(0, 2, (67, 13))
         together = policy(observations)
@@ -153,7 +153,7 @@ class ActTest(parameterized.TestCase):
         )
 
     @parameterized.parameters((7, (6, 5)), (99, (33, 17)), (104, (64, 32)))
-    def test_a_row_does_not_depend_on_the_others(self, k, hidden):
+    def test_actions_do_not_depend_on_the_batch(self, k, hidden):
         policy = make(blocks=(('a', k),), hidden=hidden, actions=tuple('abcdefghijk'))
         observations = np.random.default_rng(2).normal(size=(64, k))
         batch = policy(observations)
@@ -163,7 +163,7 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_array_equal(policy(observations[::-3]), batch[::-3])
         np.testing.assert_array_equal(policy(np.asfortranarray(observations)), batch)
 
-    def test_blocks_are_as_good_as_the_flat_vector(self):
+    def test_blocks_and_flat_vector_give_equal_actions(self):
         policy = make()
         flat = np.random.default_rng(3).normal(size=(4, 7))
         for observation in (flat, flat[0]):
@@ -192,11 +192,11 @@ class ActTest(parameterized.TestCase):
         ({'terrain': np.zeros((2, 3)), 'pose': np.zeros(4)}, r"'pose' has shape \(4,\)"),
         ({'observations': np.zeros(6)}, r'shape \(6,\); expected \(7,\)'),
     )
-    def test_refuses_other_observations(self, observation, message):
+    def test_other_observations_are_rejected(self, observation, message):
         with self.assertRaisesRegex(ValueError, message):
             make()(observation)
 
-    def test_it_may_choose_instead_of_composing(self):
+    def test_a_policy_can_select_from_given_actions(self):
         choices = np.array([[0.5, -0.5], [1, 0], [-1, 0.25]])
         policy = make(
             hidden=(), blocks=(('a', 3),), weights=[np.eye(3)], biases=[np.zeros(3)],
@@ -206,14 +206,14 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_array_equal(policy(observations), choices[[0, 1, 2, 0]])
         np.testing.assert_array_equal(policy(observations[1]), choices[1])
 
-    def test_it_may_see_only_some_columns(self):
+    def test_a_policy_can_use_some_columns_only(self):
         policy = make(
             hidden=(), columns=np.array([4, 1]), mean=np.zeros(2), std=np.ones(2), clip=9,
             weights=[np.eye(2) / 10], biases=[np.zeros(2)],
         )  # fmt: skip
         np.testing.assert_allclose(policy(np.arange(7)), [0.4, 0.1], rtol=1e-6)
 
-    def test_it_may_see_places_in_a_straight_line(self):
+    def test_a_policy_can_have_cartesian_inputs(self):
         """Near ones where they are, far ones as a direction; columns count with them."""
         policy = make(
             hidden=(), places=np.array([[1, 2], [4, 3]]), columns=np.array([7, 8, 9, 10]),
@@ -269,7 +269,7 @@ class ActTest(parameterized.TestCase):
         ({'choices': np.zeros((2, 3))}, r'choices: has shape \(2, 3\); expected \(2, 2\)'),
         ({'choices': np.full((2, 2), 1.5)}, r'choices: expected at least one action, in \[-1, 1'),
     )
-    def test_refuses_malformed_fields(self, changes, message):
+    def test_malformed_fields_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, message):
             make(**changes)
 
@@ -284,13 +284,13 @@ class ActTest(parameterized.TestCase):
         ({'line': 14}, 'line: has 14 of 13 inputs'),
         ({'line': 8}, r'weight_0: has shape \(19, 6\); expected \(15, 6\)'),
     )
-    def test_refuses_malformed_convolutions(self, changes, message):
+    def test_malformed_convolutions_are_rejected(self, changes, message):
         policy = make_convolving()
         with self.assertRaisesRegex(ValueError, message):
             line = dataclasses.replace(policy.convolution, **changes)
             dataclasses.replace(policy, convolution=line)
 
-    def test_its_arrays_are_its_own(self):
+    def test_arrays_are_read_only_copies(self):
         mean = np.zeros(7)
         policy = make(mean=mean)
         mean[:] = 1
@@ -301,7 +301,7 @@ class ActTest(parameterized.TestCase):
 
 
 class CheckTest(absltest.TestCase):
-    def test_environments(self):
+    def test_environments_that_do_not_fit_are_rejected(self):
         environment = suite.make(GAPS, {'random': 0})
         blocks = [(name, part.stop - part.start) for name, part in environment.blocks.items()]
         names = environment.action_map.names
@@ -331,7 +331,7 @@ class CheckTest(absltest.TestCase):
 
 
 class FileTest(FolderTest):
-    def test_comes_back_bit_for_bit(self):
+    def test_round_trip_is_exact(self):
         policy = make(clip=0.1)
         path = self.folder / 'p.npz'
         policies.save(policy, path)
@@ -353,7 +353,7 @@ class FileTest(FolderTest):
         policies.save(policies.load(path), self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
 
-    def test_what_not_every_policy_has_comes_back(self):
+    def test_round_trip_of_optional_fields(self):
         policy = make(
             places=np.array([[3, 1]]), columns=np.array([0, 2, 8]), mean=np.zeros(3), std=np.ones(3),
             weights=[np.ones((3, 4))], biases=[np.arange(4)],
@@ -366,7 +366,7 @@ class FileTest(FolderTest):
             self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(9, None)
-    def test_convolutions_come_back(self, origin):
+    def test_round_trip_of_convolutions(self, origin):
         policy = make_convolving(layer_norm=True)
         line = dataclasses.replace(policy.convolution, origin=origin)
         policy = dataclasses.replace(policy, convolution=line)
@@ -392,7 +392,7 @@ class FileTest(FolderTest):
         ({'origin': 40}, 'origin: is 40; expected'),
         ({'layer_norm': 2}, "'layer_norm': is 2; expected 1"),
     )
-    def test_refuses_convolutions(self, changes, message):
+    def test_malformed_convolutions_are_rejected(self, changes, message):
         policies.save(make_convolving(layer_norm=True), self.folder / 'p.npz')
         with np.load(self.folder / 'p.npz') as data:
             fields = {**data, **changes}
@@ -420,7 +420,7 @@ class FileTest(FolderTest):
             if array.dtype.kind == 'f':
                 self.assertIn(array.dtype, (np.float32, np.float16))
 
-    def test_what_half_precision_holds_is_written_in_it(self):
+    def test_values_exact_in_half_precision_are_written_so(self):
         exact = [weight.astype(np.float16) for weight in make().weights]
         finer = np.full_like(make().biases[0], 1 + 2**-12)
         policy = make(weights=exact, biases=[finer, *make().biases[1:]])
@@ -436,7 +436,7 @@ class FileTest(FolderTest):
                 self.assertEqual(array.dtype, np.float32)
                 np.testing.assert_array_equal(array, expected)
 
-    def test_an_old_file_stays_until_the_new_one_is_whole(self):
+    def test_an_old_file_stays_until_the_new_one_is_complete(self):
         path = self.folder / 'p.npz'
         policies.save(make(0), path)
         before = path.read_bytes()
@@ -511,7 +511,7 @@ class FileTest(FolderTest):
         ({'info': '[]'}, 'info: expected a dict'),
         ({'info': '{"a": NaN}'}, 'info: JSON cannot hold it'),
     )
-    def test_refuses(self, changes, message):
+    def test_invalid_arguments_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
             self.load_with(**changes)
 
@@ -578,7 +578,7 @@ class ReferenceTest(FolderTest):
         with self.assertRaisesRegex(ValueError, "did you mean 'plaid/dog_gaps'"):
             suite.reference_policy('plaid/dog_gap')
 
-    def test_none_at_all(self):
+    def test_no_policies_at_all(self):
         with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; nor for any other"):
             policies.reference(GAPS)
 
@@ -608,10 +608,10 @@ class ShippedTest(parameterized.TestCase):
         self.assertTrue((folder / 'README.md').exists())
 
     @unittest.skip('until all are trained')
-    def test_every_row_has_one(self):
+    def test_every_environment_has_one(self):
         self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
 
-    def test_every_planar_row_that_tracks_a_clip_has_one(self):
+    def test_every_planar_environment_that_tracks_a_clip_has_one(self):
         specs = [
             spec
             for spec in catalogue.SPECS
@@ -627,8 +627,8 @@ class ShippedTest(parameterized.TestCase):
             if spec.domain == 'plaid' and spec.id in policies.available()
         )
     )
-    def test_who_does_not_fall_gets_on(self, id_):
-        """Standing in front of a wall until time is up is no way of crossing terrain."""
+    def test_walkers_that_do_not_fall_advance(self, id_):
+        """A policy that stands still in front of a wall until the time limit is not shipped."""
         entry = json.loads((resources.directory('trained') / f'{id_}.json').read_text())
         found = next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
         full = np.equal(found['lengths'], found['step_limit'])

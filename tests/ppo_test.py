@@ -1,4 +1,4 @@
-"""The trainer of examples/ppo.py: its parts, that it goes on where it was stopped, that it learns."""
+"""The trainer of examples/ppo.py: its parts, exact resumption, and learning."""
 
 import dataclasses
 import io
@@ -55,7 +55,9 @@ class PartsTest(parameterized.TestCase):
             scales.update(part)
         np.testing.assert_allclose(scales.mean[2:5], data[:, 2:5].mean(0))
         np.testing.assert_allclose(scales.std[2:4], data[:, 2:4].std(0))
-        self.assertEqual(scales.std[4], ppo.LEAST_STD)  # what hardly varies is not blown up
+        self.assertEqual(
+            scales.std[4], ppo.LEAST_STD
+        )  # the scale of almost constant inputs is bounded
         # All heights share one scale about the ground under the root, and the phase stays.
         np.testing.assert_allclose(scales.mean[:2], 0)
         np.testing.assert_allclose(scales.std[:2], np.sqrt((data[:, :2] ** 2).mean()))
@@ -98,7 +100,7 @@ class RunTest(parameterized.TestCase):
         settings = ppo_settings.Settings(**{**TINY, **changes})
         return ppo.train(FLAT, 3, settings, self.folder / name, threads=1, progress=False)
 
-    def test_a_stopped_run_goes_on_as_if_it_had_not_been(self):
+    def test_a_stopped_run_resumes_exactly(self):
         whole = self.train('whole')
         learn, calls = ppo.Trainer.learn, []
 
@@ -201,7 +203,7 @@ class RunTest(parameterized.TestCase):
         ('PD_Biped2D_Gaps_Terrain-v0',),  # the same observation
         ('PD_Biped2D_Flat-v0',),  # one without the terrain
     )
-    def test_a_run_may_begin_with_another_policy(self, id_):
+    def test_a_run_may_start_from_another_policy(self, id_):
         start = 'PD_Biped2D_Flat_Terrain-v0'
         other = policies.reference(start)
         settings = ppo_settings.Settings(**{**TINY, 'hidden': (256, 256)}, start=start)
@@ -215,7 +217,7 @@ class RunTest(parameterized.TestCase):
         policy = trainer.exported()
         # Nothing rises on flat ground: what rises here has no influence yet.
         np.testing.assert_allclose(policy(observation), other(as_flat), atol=1e-4)
-        # At first the value alone is learnt.
+        # At first only the value function is trained.
         before = [weight.copy() for weight in policy.weights]
         trainer.learn(trainer.collect())
         np.testing.assert_array_equal(trainer.exported().weights[0], before[0])
@@ -224,7 +226,7 @@ class RunTest(parameterized.TestCase):
         self.assertTrue((trainer.exported().weights[0] != before[0]).any())
 
     @parameterized.parameters((2e4, 100.0), (1e9, 1e6))
-    def test_scales_of_a_start_stay_as_long_as_asked(self, count, least):
+    def test_scales_of_an_initial_policy_are_kept_for_the_given_time(self, count, least):
         """After a hundredth as many observations, means have moved by less than the step."""
         start = 'PD_Biped2D_Flat_Terrain-v0'
         settings = ppo_settings.Settings(
@@ -240,7 +242,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(moved, 200 / (count + 200), rtol=1e-3)
         self.assertLess(moved.max(), 1 / least)
 
-    def test_places_are_seen_in_a_straight_line(self):
+    def test_policies_can_have_cartesian_inputs(self):
         """By the network in training as by what it exports; and a start that saw them fits."""
         id_, places = 'PD_Biped3D_HLC_Soccer-v0', ('goal', 'ball')
         settings = ppo_settings.Settings(**TINY, places=places, mirrored=True)
@@ -256,7 +258,7 @@ class RunTest(parameterized.TestCase):
             inside = trainer.policy(trainer.scales(observation)).numpy()
         inside = trainer.mirror.unmirror_action(inside, left)
         np.testing.assert_allclose(policy(trainer.observation), np.clip(inside, -1, 1), atol=1e-5)
-        # What has not varied would not be taken over.
+        # Inputs that have not varied would not be copied.
         policy = dataclasses.replace(policy, std=np.ones_like(policy.std))
         for names, same in ((places, True), (places[::-1], True), (places[1:], False)):
             other = ppo.Trainer(id_, 1, dataclasses.replace(settings, places=names), 1)
@@ -281,7 +283,7 @@ class RunTest(parameterized.TestCase):
         cut = observation.copy()
         cut[:, part] = np.clip(cut[:, part], -0.3, 0.3)
         np.testing.assert_allclose(policy(cut), policy(observation), atol=1e-6)
-        # What has not varied would not be taken over.
+        # Inputs that have not varied would not be copied.
         policy = dataclasses.replace(policy, std=np.maximum(policy.std, 0.02))
         for bound, same in ((0.3, True), (0.5, False)):
             other = ppo.Trainer(id_, 1, dataclasses.replace(settings, map_bound=bound), 1)
@@ -289,7 +291,7 @@ class RunTest(parameterized.TestCase):
             found = other.exported()(observation)
             self.assertEqual(np.allclose(found, policy(observation), atol=1e-4), same)
 
-    def test_a_run_may_begin_with_what_a_baseline_does(self):
+    def test_a_run_may_start_by_imitating_a_baseline(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
         trainer = ppo.Trainer(id_, 0, settings, 1)
@@ -318,7 +320,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
         self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
 
-    def test_it_is_evaluated_between_rounds(self):
+    def test_policies_are_evaluated_between_rounds(self):
         settings = ppo_settings.Settings(
             **TINY, start='scripted', cloned=160, clonings=2, averaged=100.0
         )
@@ -328,9 +330,9 @@ class RunTest(parameterized.TestCase):
             trainer.imitate('scripted', pathlib.Path(name))
             self.assertEqual([point['samples'] for point in trainer.curve], [80])
             labels = policies.load(pathlib.Path(name) / 'policy.npz')(trainer.observation)
-        self.assertGreater(np.abs(labels - before).mean(), 0.1)  # not the average, not yet begun
+        self.assertGreater(np.abs(labels - before).mean(), 0.1)  # not yet the average
 
-    def test_a_run_ends_when_it_has_learnt_enough(self):
+    def test_a_run_ends_at_its_target_return(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
         for fractions, expected in (
             ((), False), ((0.95,), False), ((0.95, 0.8), False), ((0.8, 0.95), False),
@@ -339,7 +341,7 @@ class RunTest(parameterized.TestCase):
             trainer.curve = [{'normalized_return': fraction} for fraction in fractions]
             self.assertEqual(trainer.has_learnt(), expected)
 
-    def test_lessons_on_ever_higher_walls(self):
+    def test_curriculum_of_rising_walls(self):
         stages = ppo_settings.rising(
             'mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5)
         )
@@ -356,7 +358,7 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(trainer.environments.spec.terrain, 'mixed_humanoid')
         self.assertEqual(first.spec.terrain, 'mixed_humanoid')  # where it is evaluated
 
-    def test_lessons_with_obstacles_close_together(self):
+    def test_curriculum_of_dense_obstacles(self):
         stages = ppo_settings.crowded('slopes_mixed_humanoid')
         settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, stages=stages)
         trainer = ppo.Trainer('PD_Biped2D_Slopes_Mixed_Terrain-v0', 0, settings, 1)
@@ -379,7 +381,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(np.concatenate(spacings), [8 / 3, 8 / 3, 8 / 3, 4, 4])
 
     def test_near_parts_of_maps(self):
-        """Both maps of velocities are cut as that of heights."""
+        """Both velocity maps are reduced as the height map."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
         two = {'surface': slice(0, 2048), 'pose': slice(2048, 2054)}
         near, both = (
@@ -392,7 +394,7 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_array_equal(both[-6:], np.arange(2048, 2054))
         self.assertIsNone(ppo.visible({'pose': slice(0, 6)}, 6, (2.5, 1.0)))
 
-    def test_a_policy_that_acts_otherwise_is_no_start(self):
+    def test_an_initial_policy_with_other_actions_is_rejected(self):
         settings = ppo_settings.Settings(
             **{**TINY, 'hidden': (256, 256)}, start='PD_Dog2D_LLC_Imitate_Flat-v0'
         )
@@ -401,14 +403,14 @@ class RunTest(parameterized.TestCase):
         ):
             ppo.Trainer('PD_Biped2D_Flat-v0', 0, settings, 1)
 
-    def test_an_update_ends_when_the_policy_has_moved_enough(self):
+    def test_an_update_ends_at_its_kl_limit(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, kl_per_action=-1.0), 1)
         before = [p.detach().clone() for p in trainer.parameters]
         trainer.learn(trainer.collect())
         for a, b in zip(before, trainer.parameters, strict=True):
             self.assertTrue(torch.equal(a, b))
 
-    def test_the_value_may_be_learnt_on(self):
+    def test_value_training_can_continue(self):
         trainer = ppo.Trainer(
             FLAT, 0, ppo_settings.Settings(**TINY, kl_per_action=-1.0, value_goes_on=True), 1
         )
@@ -420,7 +422,7 @@ class RunTest(parameterized.TestCase):
         for name, weight in trainer.value.state_dict().items():
             self.assertFalse(torch.equal(weight, value[name]), name)
 
-    def test_a_cut_episode_is_worth_what_would_follow(self):
+    def test_truncated_episodes_bootstrap_the_value(self):
         """Where nothing but the step limit ends episodes, targets do not dip before it."""
         settings = ppo_settings.Settings(**{**TINY, 'horizon': 4})
         trainer = ppo.Trainer(
@@ -434,7 +436,7 @@ class RunTest(parameterized.TestCase):
         # Episodes last two steps: no target lacks the 7 that follow, discounted.
         self.assertGreater(float(batch['target'].min()), 7 * settings.gamma**2)
 
-    def test_what_ships_may_be_the_mean_over_ends_of_stages(self):
+    def test_the_exported_policy_may_be_the_mean_over_ends_of_stages(self):
         samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a curriculum stage
         settings = ppo_settings.Settings(
             **{**TINY, 'samples': 3 * samples},
@@ -456,14 +458,14 @@ class RunTest(parameterized.TestCase):
                 np.testing.assert_allclose(found, (a + b) / 2, rtol=1e-6, atol=1e-7)
 
     @parameterized.parameters(0, 3)
-    def test_no_more_ends_of_lessons_than_there_are(self, number):
+    def test_mean_over_more_stages_than_exist_is_rejected(self, number):
         settings = ppo_settings.Settings(
             **TINY, stages=ppo_settings.evenly([{}] * 2), stages_averaged=number
         )
         with self.assertRaisesRegex(ValueError, f'stages_averaged: {number}; expected 1 to 2'):
             ppo.Trainer(FLAT, 0, settings, 1)
 
-    def test_it_learns(self):
+    def test_a_short_run_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
         settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)
         folder = self.folder / 'run'

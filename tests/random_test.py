@@ -62,14 +62,14 @@ class StreamsTest(parameterized.TestCase):
         self.assertGreater(found.max(), 3.66)
         self.assertLess(found.min(), -3.66)
 
-    def test_streams_do_not_touch_each_other(self):
+    def test_streams_are_independent(self):
         streams = seeded(3, 4, 3)
         before = streams.state.copy()
         fill_random(1, streams.state, np.empty(5))
         np.testing.assert_array_equal(streams.state[[0, 2]], before[[0, 2]])
         self.assertTrue((streams.state[1] != before[1]).any())
 
-    def test_python_and_compiled_functions_by_turns(self):
+    def test_python_and_compiled_functions_alternately(self):
         streams, expected = seeded(11), np.random.default_rng(11)
         found = np.empty(7)
         for _ in range(3):
@@ -85,7 +85,7 @@ class StreamsTest(parameterized.TestCase):
             with streams.generator(0) as generator:
                 self.assertEqual(generator.bit_generator.state, expected.bit_generator.state)
 
-    def test_a_stream_goes_on_from_a_copy_of_its_state(self):
+    def test_a_stream_continues_from_a_copy_of_its_state(self):
         streams, other = seeded(21), seeded(22)
         with streams.generator(0) as generator:
             generator.integers(3)
@@ -116,7 +116,7 @@ class DrawTest(parameterized.TestCase):
     """Draws from NumPy's generators by their addresses, whatever their bits come from."""
 
     @parameterized.parameters('PCG64', 'PCG64DXSM', 'MT19937', 'Philox', 'SFC64')
-    def test_draws_go_on_where_those_of_the_generator_end(self, name):
+    def test_draws_continue_those_of_the_generator(self, name):
         one, other = (np.random.Generator(getattr(np.random, name)(3)) for _ in range(2))
         bits = random.address(one)
         for _ in range(3):

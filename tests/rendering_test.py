@@ -1,4 +1,4 @@
-"""Pictures show what is there, files are whole or absent, and failures say what to do."""
+"""Frames show the current state, files are complete or absent, errors name remedies."""
 
 import itertools
 import os
@@ -42,7 +42,7 @@ def drawn_ground(environment):
 
 
 class FrameTest(parameterized.TestCase):
-    def test_is_what_physics_draws(self):
+    def test_frame_equals_physics_render(self):
         environment = make()
         image = rendering.frame(environment, **SMALL)
         self.assertEqual((image.shape, image.dtype), ((120, 160, 3), np.uint8))
@@ -79,7 +79,7 @@ class FrameTest(parameterized.TestCase):
         ({'height': 0}, 'height is 0; expected 1 to 1080'),
         ({'width': 1921}, 'width is 1921; expected 1 to 1920'),
     )
-    def test_bad_arguments(self, options, message):
+    def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             rendering.frame(make(), **{**SMALL, **options})
 
@@ -119,7 +119,7 @@ class GhostTest(parameterized.TestCase):
             np.testing.assert_allclose(position, character + beside, atol=1e-5)
             self.assertLess(colour[3], 1)
 
-    def test_walks_on_while_the_character_lags(self):
+    def test_ghost_advances_while_the_character_lags(self):
         environment = make(start_phase=0.0)
         plain = rendering.frame(environment, **SMALL)
         ghost = rendering.frame(environment, ghost=True, **SMALL)
@@ -170,7 +170,7 @@ class TerrainIsCurrentTest(parameterized.TestCase):
         self.assertFalse(np.array_equal(first[0], second[0]))
         self.assertFalse(np.array_equal(first[1], second[1]))
 
-    def test_after_the_strip_was_extended(self):
+    def test_after_the_ground_was_extended(self):
         environment = make()
         rendering.frame(environment, **SMALL)  # contexts exist before the ground changes
         world = environment.task.world
@@ -240,17 +240,17 @@ class VideoTest(FolderTest):
         ('a.gif', [np.zeros((8, 8), np.uint8)], ValueError, r'shape \(8, 8\)'),
         ('no/a.mp4', numbered(2), FileNotFoundError, 'the folder .* does not exist'),
     )
-    def test_refusals_leave_nothing_behind(self, name, frames, error, message):
+    def test_errors_leave_no_files(self, name, frames, error, message):
         with self.assertRaisesRegex(error, message):
             rendering.video(frames, self.folder / name)
         self.assert_only()
 
-    def test_bad_rate(self):
+    def test_invalid_rates_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'fps is 0'):
             rendering.video(numbered(2), self.folder / 'a.mp4', fps=0)
 
     @parameterized.parameters('a.mp4', 'a.gif')
-    def test_the_old_file_stays_if_it_goes_wrong(self, name):
+    def test_an_error_keeps_the_old_file(self, name):
         path = self.folder / name
         path.write_text('old')
 
@@ -334,7 +334,7 @@ class FilmStripTest(FolderTest):
         np.testing.assert_array_equal(iio.imread(path), strip)
         self.assert_only('strip.png')
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for frames, options, message in (
             ([], {}, 'at least one frame'),
             (numbered(2), {'columns': 0}, 'columns is 0'),
@@ -391,14 +391,14 @@ class SpatialTest(FolderTest):
         np.testing.assert_array_equal(again, image)
         np.testing.assert_array_equal(iio.imread(path), image)
 
-    def test_height_map_of_what_a_plan_is_made_from(self):
+    def test_height_map_of_a_planning_task(self):
         environment = suite.make('PD_Biped3D_HLC_Forest-v0', {'random': 1})
         environment.reset()
         image = rendering.height_map(environment, reach=1.0).astype(int)
         brown = (image[..., 0] - image[..., 2] > 100).mean()
         self.assertBetween(brown, 0.001, 0.3)  # some pillars on level ground
 
-    def test_height_map_refusals(self):
+    def test_invalid_height_maps_are_rejected(self):
         for make, options, message in (
             (lambda: suite.make(GAPS), {}, 'the task PlanarImitation.*no map'),
             (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, "terrain_observation='height'"),
@@ -456,7 +456,7 @@ class PlotTerrainTest(FolderTest):
         self.assertGreater(d.shape[0], a.shape[0])
         self.assert_only('a.png', 'b.png', 'c.png', 'd.png')
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         for terrain, options, message in (
             ('gasp', {}, "unknown terrain 'gasp'; did you mean 'gaps'"),
             ('gaps', {'draws': 0}, 'draws is 0'),

@@ -20,7 +20,7 @@ TINY = search_gaits.Settings(
 
 
 class SearchTest(absltest.TestCase):
-    def test_it_tells_what_each_choice_leads_to_and_touches_nothing(self):
+    def test_results_of_all_choices_without_changing_the_simulation(self):
         search = search_gaits.Search(HOPPER, TINY, 1)
         default = np.zeros(search.choices.shape[1])
         np.testing.assert_array_equal(search.choices[0], default)
@@ -47,7 +47,7 @@ class SearchTest(absltest.TestCase):
             self.assertFalse(steps[0].terminated.any())
         np.testing.assert_allclose(worth[:, choice], expected + TINY.alive)
 
-    def test_the_network_sees_the_ground_that_is_near(self):
+    def test_the_network_uses_the_near_ground(self):
         environments = VectorEnvironment(HOPPER, 1, 1, 0)
         terrain = environments.blocks['terrain']
         columns = search_gaits.visible(environments.blocks, 5.0)
@@ -57,7 +57,7 @@ class SearchTest(absltest.TestCase):
         rest = environments.task.observation.shape[1] - 200
         self.assertLen(columns, len(near) + rest)
 
-    def test_a_run_writes_its_policy_and_goes_on(self):
+    def test_a_run_writes_its_policy_and_resumes(self):
         with tempfile.TemporaryDirectory() as name:
             folder = pathlib.Path(name)
             curve = search_gaits.train(HOPPER, 1, TINY, folder, 1)

@@ -1,4 +1,4 @@
-"""Sequences of environments: what they hold, their seeds, the metrics, and runs that go on."""
+"""Sequences of environments: contents, seeds, metrics, and resumed runs."""
 
 import importlib.util
 import json
@@ -17,7 +17,7 @@ SHORT = sequences.Sequence('short', ('plaid/dog_flat', 'plaid/dog_steps', 'plaid
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 
 
-class RowsTest(parameterized.TestCase):
+class SequenceTest(parameterized.TestCase):
     @parameterized.parameters(
         *(n for n in sequences.SEQUENCES if n.startswith(('plaid_long', 'gaits')))
     )
@@ -39,7 +39,7 @@ class RowsTest(parameterized.TestCase):
         self.assertEqual(sequences.get(f'plaid_long_{figure}').ids[:5], ids)
         self.assertLen(sequences.get(f'plaid_long_{figure}'), 8)
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "'plaid_bog'; did you mean 'plaid_dog'"):
             sequences.get('plaid_bog')
         with self.assertRaisesRegex(ValueError, "unknown environment 'PD_Bog2D_Gaps_Terrain-v0'"):
@@ -49,7 +49,7 @@ class RowsTest(parameterized.TestCase):
 
 
 class SeedsTest(absltest.TestCase):
-    def test_train_and_test_seeds_never_meet(self):
+    def test_train_and_test_seeds_are_disjoint(self):
         train, test = sequences.train_seeds(2000, (1, 2)), sequences.test_seeds(2000, (1, 2))
         self.assertLess(max(train), 2**31)
         self.assertBetween(min(test), 2**31, max(test))
@@ -58,7 +58,7 @@ class SeedsTest(absltest.TestCase):
         self.assertEqual(train[:5], sequences.train_seeds(5, (1, 2)))
         self.assertNotEqual(train[:5], sequences.train_seeds(5, (1, 3)))
 
-    def test_environments_take_them(self):
+    def test_environments_accept_the_seeds(self):
         seeds = sequences.test_seeds(3)
         found = evaluation.evaluate('plaid/dog_gaps', evaluation.zero, 3, seeds, factory=True)
         self.assertEqual((found['seeds'], found['seed']), (seeds, None))
@@ -93,7 +93,7 @@ class MetricsTest(parameterized.TestCase):
         scores[2, :2] = 1.0
         self.assertLess(sequences.forgetting(scores), 0)
 
-    def test_what_is_not_needed_may_be_missing(self):
+    def test_values_that_are_not_needed_may_be_missing(self):
         scores = np.array(self.SCORES)
         scores[np.triu_indices(3, 1)] = np.nan
         self.assertAlmostEqual(sequences.backward_transfer(scores), -0.25)
@@ -101,7 +101,7 @@ class MetricsTest(parameterized.TestCase):
             sequences.forward_transfer(scores, self.INITIAL)
 
     @parameterized.parameters((((1, 2, 3), (4, 5, 6)),), (((1,),),), ((1, 2),))
-    def test_no_square(self, scores):
+    def test_a_matrix_that_is_not_square_is_rejected(self, scores):
         with self.assertRaisesRegex(ValueError, r'expected \(T, T\)'):
             sequences.average_performance(scores)
         with self.assertRaisesRegex(ValueError, 'initial: shape'):
@@ -161,7 +161,7 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(self.run_short(Counter(stop_at=0)), result)
 
     @parameterized.parameters(0, 1, 2)
-    def test_a_stopped_run_goes_on(self, stop_at):
+    def test_a_stopped_run_resumes(self, stop_at):
         whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Keeper(stop_at))
@@ -186,7 +186,7 @@ class RunTest(parameterized.TestCase):
             [path.name for path in self.folder.iterdir()], ['result.json', 'result.stage1']
         )
 
-    def test_refusals(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Counter(stop_at=1))
         with self.assertRaisesRegex(ValueError, '1 of 3 stages, and a Counter cannot resume'):
@@ -203,8 +203,8 @@ class RunTest(parameterized.TestCase):
 
 
 class ExampleTest(absltest.TestCase):
-    def test_a_small_learner(self):
-        """Stopped after the first stage, it goes on as if it had not been."""
+    def test_example_runs_with_a_small_learner(self):
+        """A run that was stopped after the first stage resumes exactly."""
         self.enterContext(mock.patch.object(sys, 'path', [str(EXAMPLES), *sys.path]))
         spec = importlib.util.spec_from_file_location(
             'continual_learning', EXAMPLES / 'continual_learning.py'

@@ -28,7 +28,7 @@ SMALL = {'height': 48, 'width': 64}
 
 
 class StableBaselinesTest(parameterized.TestCase):
-    """Rows against single environments, wrappers, and a learner."""
+    """Simulations against single environments, wrappers, and a learner."""
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_single_environments_pass_the_checker(self, id_):
@@ -37,7 +37,7 @@ class StableBaselinesTest(parameterized.TestCase):
             check_env(gymnasium.make(f'trl_suite/{id_}').unwrapped, skip_render_check=True)
 
     @parameterized.parameters(True, False)
-    def test_rows_are_those_of_dummy_vec_env(self, flat):
+    def test_simulations_equal_those_of_dummy_vec_env(self, flat):
         theirs = DummyVecEnv([
             lambda: SuiteEnv(GAPS, flat_observation=flat, task_kwargs={'step_limit': LIMIT})
         ] * 3)  # fmt: skip
@@ -91,7 +91,7 @@ class StableBaselinesTest(parameterized.TestCase):
     def test_seeds(self):
         envs = SuiteVecEnv(FLAT, 2, 1, seed=[4, 5])
         first = envs.reset()
-        self.assertTrue((envs.reset() != first).any(1).all())  # the streams go on
+        self.assertTrue((envs.reset() != first).any(1).all())  # the streams continue
         envs.seed(4)
         np.testing.assert_array_equal(envs.reset(), first)
         envs.seed(2**32 - 1)  # as SB3 may draw it
@@ -119,7 +119,7 @@ class StableBaselinesTest(parameterized.TestCase):
         with self.assertRaisesRegex(NotImplementedError, 'environment'):
             envs.env_method('reset')
 
-    def test_misuse(self):
+    def test_misuse_raises_errors(self):
         envs = SuiteVecEnv(FLAT, 2, 1)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
             envs.step(np.zeros((2, 6)))
@@ -133,7 +133,7 @@ class StableBaselinesTest(parameterized.TestCase):
             envs.step(np.zeros((2, 6)))
 
     @parameterized.parameters((True, 'MlpPolicy'), (False, 'MultiInputPolicy'))
-    def test_ppo(self, flat, policy):
+    def test_ppo_runs(self, flat, policy):
         envs = VecNormalize(VecMonitor(SuiteVecEnv(GAPS, 4, 1, flat_observation=flat)))
         model = PPO(policy, envs, n_steps=32, batch_size=64, n_epochs=1, seed=3, device='cpu')
         model.learn(512)

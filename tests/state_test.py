@@ -95,7 +95,7 @@ class DeterminismTest(parameterized.TestCase):
             digest.update(repr((step.reward, step.discount)).encode())
         self.assertEqual(digests[0][0], digest.hexdigest())
 
-    def test_other_environments_in_between_do_not_matter(self):
+    def test_episodes_do_not_depend_on_other_environments(self):
         alone = advance(suite.make(DOG, {'random': 3}), 60)
         mine, other = suite.make(DOG, {'random': 3}), suite.make(EXAMPLES[2], {'random': 9})
         found = []
@@ -109,7 +109,7 @@ class DeterminismTest(parameterized.TestCase):
         start = 3 + 50
         np.testing.assert_array_equal(alone[:, start : start + 43], np.array(found))
 
-    def test_an_episode_does_not_depend_on_how_the_last_one_went(self):
+    def test_an_episode_does_not_depend_on_the_previous_one(self):
         episodes = []
         for steps in (2, 6):
             environment = suite.make(DOG, {'random': 4})
@@ -121,7 +121,7 @@ class DeterminismTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """Save anywhere, go on bit for bit."""
+    """States saved at any step continue bit for bit."""
 
     def check(self, environment, restored_into):
         state = pickle.loads(pickle.dumps(environment.get_state()))
@@ -156,7 +156,7 @@ class SaveTest(parameterized.TestCase):
         self.check(environment, other)
 
     @parameterized.parameters(*EXAMPLES[:3])
-    def test_after_the_strip_was_extended(self, id_):
+    def test_after_the_ground_was_extended(self, id_):
         environment = suite.make(id_, {'random': 6, 'step_limit': None})
         environment.reset()
         walked(environment, 47)
@@ -180,7 +180,7 @@ class SaveTest(parameterized.TestCase):
         self.assertTrue(other.info['fell'])
         self.assertTrue(other.step(np.zeros(20)).first())
 
-    def test_observation_info_and_steps_come_back(self):
+    def test_observation_info_and_step_count_are_restored(self):
         environment = suite.make(DOG, {'random': 6, 'step_limit': 20})
         environment.reset()
         for _ in range(5):
@@ -219,7 +219,7 @@ class SaveTest(parameterized.TestCase):
         'PD_Raptor2D_Slopes_Mixed_Terrain-v0', 'PD_Biped2D_Gaps_Terrain-v0',
         'MTU_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Gaps_Terrain-v0',
     )  # fmt: skip
-    def test_a_wrong_state_is_refused(self, id_):
+    def test_a_wrong_state_is_rejected(self, id_):
         environment, other = suite.make(DOG, {'random': 0}), suite.make(id_, {'random': 0})
         environment.reset()
         other.reset()
@@ -229,7 +229,7 @@ class SaveTest(parameterized.TestCase):
             environment.set_state(other.get_state())
         self.assertEqual(pickle.dumps(environment.get_state()), before)  # nothing half done
 
-    def test_an_empty_state_is_refused(self):
+    def test_an_empty_state_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'state'):
             suite.make(DOG).set_state({})
 
@@ -289,7 +289,7 @@ class PickleTest(parameterized.TestCase):
         twin = pickle.loads(pickle.dumps(environment))
         np.testing.assert_array_equal(advance(twin, 30), advance(environment, 30))
 
-    def test_one_that_nothing_can_build_again(self):
+    def test_an_environment_that_cannot_be_rebuilt_is_not_pickled(self):
         task = PlanarImitation(
             make('biped2d'), PlanarArena(load('flat')), motion.load('biped2d_walk')
         )

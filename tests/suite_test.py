@@ -101,7 +101,7 @@ SPATIAL = {
         )
     },
 }
-# Above a controller: id -> terrain, which maps are seen, phases of the start, original.
+# Hierarchical: id -> terrain, observed maps, start phases, original.
 _EITHER, _ZERO = (0.1, 0.6), (0.0,)
 HARD = {  # id: terrain
     'PD_Biped3D_Terrain_Trail_Hard-v0': 'trail3d1',
@@ -126,17 +126,17 @@ HIGH_LEVEL = {
 
 
 def ids_of(rules):
-    """Rows of one task class."""
+    """Specs of one task class."""
     return [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == rules]
 
 
 def imitation_ids():
-    """Rows of the two planar families of tracking."""
+    """Specs of the two planar tracking families."""
     return ids_of('planar_imitation')
 
 
 class CatalogueTest(parameterized.TestCase):
-    """Every environment is a row."""
+    """Every environment is an `EnvSpec`."""
 
     def test_counts(self):
         specs = [suite.find(id_) for id_ in imitation_ids()]
@@ -167,7 +167,7 @@ class CatalogueTest(parameterized.TestCase):
             self.assertEqual((dict(spec.options), spec.step_limit), ({}, 256))
 
     @parameterized.parameters(*list(GAITS)[::4])
-    def test_what_an_id_of_a_gait_says(self, id_):
+    def test_parts_of_ids_of_gaits(self, id_):
         environment = suite.make(id_, {'random': 0})
         task = environment.task
         self.assertEqual(task.arena.terrain.name, GAITS[id_])
@@ -193,7 +193,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertLen([values for values in SPATIAL.values() if values[-1]], 10)
 
     @parameterized.parameters(*SPATIAL)
-    def test_what_an_id_in_three_dimensions_says(self, id_):
+    def test_parts_of_three_dimensional_ids(self, id_):
         _, ground, character, clip, _ = SPATIAL[id_]
         environment = suite.make(id_, {'random': 0})
         task = environment.task
@@ -226,7 +226,7 @@ class CatalogueTest(parameterized.TestCase):
             )
 
     @parameterized.parameters(*HIGH_LEVEL)
-    def test_what_an_id_above_a_controller_says(self, id_):
+    def test_parts_of_hierarchical_ids(self, id_):
         ground, sight, phases, _ = HIGH_LEVEL[id_]
         environment = suite.make(id_, {'random': 0})
         task = environment.task
@@ -263,7 +263,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
-    def test_other_names_of_rows_in_three_dimensions(self):
+    def test_aliases_of_three_dimensional_environments(self):
         for name, id_ in (
             ('PD_Biped3D_LLC_Symmetric_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'),
             ('PD_Biped3D_Full_LLC_Step-v0', 'PD_Biped3D_FULL_Imitate-Steps-v0'),
@@ -282,7 +282,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertLen(set(every), len(every))
 
     @parameterized.parameters(*suite.ALL_IDS)
-    def test_row(self, id_):
+    def test_fields_of_a_spec(self, id_):
         spec = suite.find(id_)
         self.assertEqual(spec.id, id_)
         self.assertRegex(id_, r'^\w+(-\w+)?-v\d$')  # what Gymnasium takes for a name
@@ -299,7 +299,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertLen(set(descriptions), len(descriptions))
 
     @parameterized.parameters(*imitation_ids())
-    def test_what_an_id_says(self, id_):
+    def test_parts_of_planar_ids(self, id_):
         spec, parts = suite.find(id_), id_.removesuffix('-v0').split('_')
         environment = suite.make(id_, {'random': 0})
         task = environment.task
@@ -340,7 +340,7 @@ class CatalogueTest(parameterized.TestCase):
         )
         self.assertLess(set(suite.BENCHMARKING), set(suite.ALL_TASKS))
 
-    def test_rows_cannot_be_changed(self):
+    def test_specs_are_immutable(self):
         spec = suite.find(GAPS)
         with self.assertRaises(AttributeError):
             spec.terrain = 'flat'
@@ -415,7 +415,7 @@ class OptionTest(parameterized.TestCase):
         environment = suite.make(GAPS, {'substeps': 20})
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 600)
 
-    def test_terrain_samples(self):
+    def test_terrain_observation(self):
         environment = suite.make(GAPS, {'random': 0, 'terrain_observation': 8})
         self.assertEqual(environment.observation_spec()['terrain'].shape, (8,))
         blind = suite.make(GAPS, {'random': 0, 'terrain_observation': 0})
@@ -438,7 +438,7 @@ class OptionTest(parameterized.TestCase):
         self.assertIsNone(suite.make(GAPS, {'step_limit': None}).step_limit)
 
     @parameterized.parameters(*ids_of('gait'))
-    def test_common_options_on_every_gait(self, id_):
+    def test_common_options_in_every_gait(self, id_):
         environment = suite.make(id_, {'random': 3, 'step_limit': 1, 'start_noise': 0.01})
         starts = [environment.reset().observation['pose'] for _ in range(2)]
         self.assertTrue((starts[0] != starts[1]).any())
@@ -447,7 +447,7 @@ class OptionTest(parameterized.TestCase):
         self.assertBetween(step.reward, 0, 1)
 
     @parameterized.parameters(*imitation_ids(), *SPATIAL)
-    def test_common_options_on_every_row(self, id_):
+    def test_common_options_in_every_environment(self, id_):
         environment = suite.make(id_, {'random': 3, 'step_limit': 2, 'start_phase': 0.5})
         step = environment.reset()
         if 'phase' in step.observation:
@@ -515,7 +515,7 @@ class BuildTest(parameterized.TestCase):
         ('biped3d_mocap_run', 'footsteps', 'biped3d_mocap_run', 17),
         ('biped3d_full_mocap', 'footsteps', 'biped3d_full_mocap', 35),
     )  # fmt: skip
-    def test_what_three_dimensions_mean(self, character, task, clip, actions):
+    def test_defaults_of_spatial_characters(self, character, task, clip, actions):
         environment = suite.build(character, task=task, task_kwargs={'random': 0})
         self.assertEqual(environment.task.motion.name, clip)
         self.assertEqual(environment.task.arena.terrain.name, 'plane')
@@ -568,11 +568,11 @@ class BuildTest(parameterized.TestCase):
         ({'character': 'biped3d', 'task': 'footsteps', 'clip': motion.load('biped3d_walk')},
          "'biped3d_walk' is a clip; for footsteps"),
     )  # fmt: skip
-    def test_dimensions_that_do_not_fit(self, arguments, message):
+    def test_dimensions_that_do_not_fit_are_rejected(self, arguments, message):
         with self.assertRaisesRegex(ValueError, message):
             suite.build(**arguments)
 
-    def test_a_row_on_other_ground(self):
+    def test_an_environment_on_other_ground(self):
         spec = dataclasses.replace(suite.find('PD_Biped3D_Imitate-v0'), terrain='gaps')
         with self.assertRaisesRegex(
             ValueError, "'biped3d' is three-dimensional and terrain 'gaps'"
@@ -607,7 +607,7 @@ class BuildTest(parameterized.TestCase):
         for pose in found[1:]:
             np.testing.assert_array_equal(pose, found[0])
 
-    def test_a_row_of_the_users_own(self):
+    def test_a_users_own_character(self):
         spec = dataclasses.replace(
             characters.CHARACTERS['biped2d'], name='mine', clip=None, fall_links=('root', 'left_knee'),
             path=str(resources.directory('xml') / 'biped2d.xml'),
@@ -618,7 +618,7 @@ class BuildTest(parameterized.TestCase):
         environment.reset()
         self.assertEqual(environment.step(np.zeros(6)).observation['pose'].shape, (15,))
 
-    def test_goat_takes_the_clip_of_the_dog(self):
+    def test_goat_uses_the_clip_of_the_dog(self):
         environment = suite.build('goat', 'position', 'cliffs_rugged', task_kwargs={'random': 0})
         self.assertEqual(environment.task.clip.name, 'dog_bound')
 

@@ -1,4 +1,4 @@
-"""Left for right: what is reflected, that physics agrees, and policies that see a mirror."""
+"""Reflection of left and right: observations, physics, and policies with a mirror."""
 
 import dataclasses
 import pathlib
@@ -77,7 +77,7 @@ class TaskTest(parameterized.TestCase):
     """The mirror of a task against the reflection of its state."""
 
     @parameterized.parameters(*CASES)
-    def test_twice_is_once_less(self, *case):
+    def test_reflecting_twice_is_the_identity(self, *case):
         environment, _ = build(case)
         mirror = environment.task.mirror
         mirror.check(environment.observation_spec()['observations'].shape[0],
@@ -101,7 +101,7 @@ class TaskTest(parameterized.TestCase):
         np.testing.assert_allclose(mirror.observation(first[None])[0], second, rtol=0, atol=1e-9)
 
     @parameterized.parameters(*CASES)
-    def test_any_reflected_state_is_seen_reflected(self, *case):
+    def test_reflected_states_have_reflected_observations(self, *case):
         environment, _ = build(case, start_phase=0.2)
         other, _ = build(case, start_phase=0.7)
         task, rng = environment.task, np.random.default_rng(5)
@@ -121,7 +121,7 @@ class TaskTest(parameterized.TestCase):
                 kept[environment.blocks['contact']] = False
             reflected = task.mirror.observation(second[None])[0]
             np.testing.assert_allclose(reflected[kept], first[kept], rtol=0, atol=1e-9)
-            # The reward does not see a difference either, but for the interpolation of its table.
+            # Rewards are equal, too, except for the interpolation of the table.
             np.testing.assert_allclose(
                 other.task.reward_terms, task.reward_terms, rtol=0, atol=1e-6
             )
@@ -152,7 +152,7 @@ class TaskTest(parameterized.TestCase):
             np.testing.assert_allclose(found[1], reflect.velocity(rate), rtol=0, atol=1e-4)
 
     @parameterized.parameters(*((case, phase) for case in CASES for phase in (0.05, 0.45)))
-    def test_a_mirrored_environment_is_the_plain_one_in_a_mirror(self, case, phase):
+    def test_a_mirrored_environment_is_the_reflection_of_the_plain_one(self, case, phase):
         plain, first = build(case, start_phase=phase)
         mirrored, seen = build(case, start_phase=phase, mirrored=True)
         mirror, rng = plain.task.mirror, np.random.default_rng(2)
@@ -193,7 +193,7 @@ class TaskTest(parameterized.TestCase):
             self.assertLen(build(case)[1], plain)
             self.assertLen(build(case, mirrored=True)[1], mirrored)
 
-    def test_rows_of_a_batch_are_reflected_each_by_its_own_phase(self):
+    def test_each_simulation_is_reflected_by_its_own_phase(self):
         plain = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0)
         mirrored = VectorEnvironment(
             'PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0, task_kwargs={'mirrored': True}
@@ -212,12 +212,12 @@ class TaskTest(parameterized.TestCase):
             np.testing.assert_array_equal(b.observation[:, :105], canonical[:, :105])
         self.assertGreater(both, 5)
 
-    def test_a_target_tells_no_phase(self):
+    def test_tasks_without_a_phase_have_no_mirror(self):
         self.assertIsNone(suite.make('PD_Biped3D_Imitate-Track-v0').task.mirror)
 
 
 class PlanTest(parameterized.TestCase):
-    """The mirror of tasks whose actions are plans: no phase is seen, the foot that is ahead stands."""
+    """The mirror of planning tasks: without a phase, the stance foot is the one ahead."""
 
     def soccer(self, phase):
         environment = suite.make(
@@ -228,7 +228,7 @@ class PlanTest(parameterized.TestCase):
         return environment
 
     def reflect(self, environment, other):
-        """Puts the state of an environment, seen in a mirror, into another."""
+        """Copies the reflected state of an environment to another."""
         pose, rate = state(environment)
         mirror = environment.task.motion.layout.mirror
         columns, dof = environment.task.ball.qpos, environment.task.ball.dof
@@ -258,7 +258,7 @@ class PlanTest(parameterized.TestCase):
         mine, theirs = environment.step(plan), other.step(mirror.action(plan[None])[0])
         self.assertAlmostEqual(mine.reward, theirs.reward, delta=0.02)
         again = mirror.observation(theirs.observation['observations'][None])[0]
-        turned = mine.observation['observations'][105] - first[105]  # where the goal is seen
+        turned = mine.observation['observations'][105] - first[105]  # bearing of the goal
         self.assertGreater(abs(turned), 0.2)
         shown = np.r_[environment.blocks['pose'], environment.blocks['goal'], 107:109]
         np.testing.assert_allclose(
@@ -291,7 +291,7 @@ class PlanTest(parameterized.TestCase):
             np.testing.assert_array_equal(left, specs.task.stance == 1)
             observation = specs.step(plan(observation)).observation
 
-    def test_who_acts_joints_too_has_none(self):
+    def test_tasks_that_also_control_joints_have_no_mirror(self):
         self.assertIsNone(suite.make(SOCCER, {'interface': 'frame'}).task.mirror)
 
     def test_saved_and_loaded(self):
@@ -359,14 +359,14 @@ class MirrorTest(parameterized.TestCase):
         ({'phase': None, 'feet': (4, 1)}, 'mirror_feet'),
         ({'phase': None, 'feet': (1,)}, 'mirror_feet'),
     )  # fmt: skip
-    def test_refused(self, changes, message):
+    def test_invalid_arguments_are_rejected(self, changes, message):
         self.make().check(4, 2)
         with self.assertRaisesRegex(ValueError, message):
             self.make(**changes).check(4, 2)
 
 
 def policy_for(environment, **changes):
-    """A random policy that sees what an environment observes, in the mirror of its task."""
+    """A random policy for an environment, with the mirror of its task."""
     rng = np.random.default_rng(7)
     task, k, a = environment.task, environment.observation_spec(), len(environment.action_map)
     k = k['observations'].shape[0]
@@ -383,7 +383,7 @@ def policy_for(environment, **changes):
 
 
 class PolicyTest(parameterized.TestCase):
-    """Policies that see left stance as right stance in a mirror."""
+    """Policies that reflect left stance to right stance."""
 
     def setUp(self):
         super().setUp()
@@ -441,7 +441,7 @@ class PolicyTest(parameterized.TestCase):
         ({'mirror_phase': np.array(125)}, 'mirror_phase'),
         ({'mirror_side': np.array(1)}, 'mirror_'),
     )
-    def test_broken_files_are_refused(self, changes, message):
+    def test_malformed_files_are_rejected(self, changes, message):
         policies.save(self.policy, self.path)
         with np.load(self.path) as data:
             fields = {**data, **changes}
@@ -449,7 +449,7 @@ class PolicyTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, f'{self.path.name}.*{message}'):
             policies.load(self.path)
 
-    def test_a_mirror_that_does_not_fit(self):
+    def test_a_mirror_that_does_not_fit_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'mirror_observation_index'):
             policy_for(self.environment, mirror=build(WALK)[0].task.mirror)
 

@@ -1,4 +1,4 @@
-"""Tests of the three-dimensional part of trl_suite.terrain: figures from the original's description."""
+"""Tests of the three-dimensional part of trl_suite.terrain: values from the original's description."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def vertices(low, high):
 
 class ParameterTest(parameterized.TestCase):
     @parameterized.parameters(sorted(terrain.IDLE))
-    def test_without_effect(self, type_name):
+    def test_parameters_without_effect(self, type_name):
         x, y = np.meshgrid(np.arange(-20, 20, 0.5) + 0.01, np.arange(-20, 20, 0.5) + 0.01)
         heights = []
         for factor in (1, 3):
@@ -138,7 +138,7 @@ class ShapeTest(parameterized.TestCase):
         self.assertLess(np.abs(noise_of).max(), 0.2)
         self.assertAlmostEqual(noise_of.std(), 0.2 / math.sqrt(3), delta=0.005)
         self.assertLess(abs(noise_of.mean()), 0.005)
-        # The same in every episode, and however it is asked for.
+        # The same in every episode, and for every order of queries.
         np.testing.assert_array_equal(heights, make('cliff3d', 9).layout.grid(i, j))
         np.testing.assert_array_equal(
             heights[50:70, 80:], make('cliff3d').layout.grid(i[50:70], j[80:])
@@ -189,7 +189,7 @@ class ShapeTest(parameterized.TestCase):
         self.assertAlmostEqual(ground.height(0.05, 0.05), 0.25 * 1 + 0.25 * 4)
         self.assertAlmostEqual(ground.height(0.15, 0.15), 2 + 0.25 * (1 - 2) + 0.25 * (4 - 2))
         self.assertAlmostEqual(ground.height(0.2, 0.2), 2)
-        self.assertAlmostEqual(ground.height(-7.0, 0.1), 0.5)  # the rim goes on
+        self.assertAlmostEqual(ground.height(-7.0, 0.1), 0.5)  # the rim continues
         self.assertEqual(ground.height(5.0, 500.0), 0)
 
 
@@ -217,7 +217,7 @@ class ObstaclesTest(parameterized.TestCase):
             covered.append((terrain.SpatialGround(ground, seed).height(x, y) > 0.03).mean())
         self.assertAlmostEqual(np.mean(covered), cover, delta=0.25 * cover)
 
-    def test_ground_does_not_depend_on_requests(self):
+    def test_ground_does_not_depend_on_queries(self):
         corner = np.array([30.0, -50.0])
         for source in ('blocks3d', 'pillars3d'):
             once = make(source, 4).layout.boxes(corner, corner + 30)
@@ -239,13 +239,13 @@ class ObstaclesTest(parameterized.TestCase):
         steps[1](vertices(-30, 0), j)
         np.testing.assert_array_equal(steps[0](i, j)[20:50, 30:], steps[1](i[20:50], j[30:]))
 
-    def test_density_goes_on_for_ever(self):
+    def test_density_is_constant(self):
         ground = make('pillars3d', 1)
         for corner in ((-300.0, 100.0), (1000.0, -1000.0)):
             low = np.array(corner)
             self.assertAlmostEqual(len(ground.layout.boxes(low, low + 80).top), 650, delta=40)
 
-    def test_later_rubble_wins(self):
+    def test_later_rubble_overwrites_earlier(self):
         drawn = spatial._Obstacles(terrain.load('steps3d').parameters(), np.random.default_rng(0))
         begin, end, tops = drawn._tile((0, 0))
         grid = spatial._rubble(drawn)
@@ -290,7 +290,7 @@ class TrailTest(parameterized.TestCase):
         self.assertAlmostEqual((turns > 0).mean(), 0.5, delta=0.03)
         self.assertLess(np.abs(headings).max(), 0.6 * np.pi + turn)
 
-    def test_led_back(self):
+    def test_trail_turns_back_to_straight_ahead(self):
         before, turns = [], []
         for trail in self.trails('trail3d'):
             before.append(trail.heading[1:-1])
@@ -350,7 +350,7 @@ class TrailTest(parameterized.TestCase):
             inside |= np.hypot(x - start[0] - t * way[0], y - start[1] - t * way[1]) <= width / 2
         np.testing.assert_array_equal(grid == 0, inside)
 
-    def test_does_not_depend_on_requests(self):
+    def test_trail_does_not_depend_on_queries(self):
         one, other = make('trail3d2', 8), make('trail3d2', 8)
         i, j = vertices(8, 16), vertices(-8, 8)
         other.layout.grid(vertices(60, 80), vertices(-10, 10))
@@ -377,7 +377,7 @@ class MovingTest(parameterized.TestCase):
         direction = np.concatenate([m.direction for m in movers])
         self.assertAlmostEqual((direction > 0).mean(), 0.5, delta=0.04)
 
-    def test_boxes_go_to_and_fro(self):
+    def test_boxes_move_back_and_forth(self):
         found = around('dynamic_obstacles3d', [3])
         movers = found.grounds[0].layout.movers
         far, dt = np.full((1, 2), 1000.0), 1 / 30
@@ -429,7 +429,7 @@ class MovingTest(parameterized.TestCase):
         np.testing.assert_allclose(wide.boxes.half_size, [(2.5, 7.5)])
         np.testing.assert_allclose(np.abs(wide.velocity[0, 1]), 0.6)
 
-    def test_velocity_of_what_is_on_top(self):
+    def test_velocity_is_that_of_the_highest_part(self):
         ground = make('conveyor3d_wide', 1)
         speed = ground.layout.belts.velocity[0, 1]
         velocity = ground.velocity([2.9, 3.1, 5.0, 5.0], [0, 0, 7.4, 7.6])
@@ -527,7 +527,7 @@ class GroundTest(parameterized.TestCase):
                 inside = place + rng.uniform(-room, room, (50, 2))
                 np.testing.assert_array_equal(ground.height(*inside.T), 0)
 
-    def test_goal_keeps_clear_of_boxes_as_they_stand(self):
+    def test_goals_are_clear_of_the_current_boxes(self):
         ground, rng = make('dynamic_obstacles3d', 2), np.random.default_rng(0)
         centres = rng.uniform(-3, 3, (50, 2))
         for _ in range(30):
@@ -588,12 +588,12 @@ class GroundTest(parameterized.TestCase):
                 self.assertEqual(heights[k], ground.height(x[k], y[k]))
                 np.testing.assert_array_equal(velocity[k], ground.velocity(x[k], y[k]))
 
-    def test_crowded_ground_does_not_hang(self):
+    def test_crowded_ground_terminates(self):
         crowd = {'Type': 'dynamic_obstacles3d', 'Params': [
             {'NumObstacles': 100, 'ObstacleWidth0': 30, 'ObstacleWidth1': 30}]}  # fmt: skip
         self.assertEqual(make(crowd).spawn(np.random.default_rng(0))[:2], (0, 0))
 
-    def test_refuses(self):
+    def test_invalid_arguments_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'hills3d.*three-dimensional'):
             terrain.PlanarGround(terrain.load('hills3d'), 0)
         with self.assertRaisesRegex(ValueError, 'gaps.*planar'):
@@ -648,7 +648,7 @@ class FileTest(parameterized.TestCase):
         ({'Type': 'trail3d', 'Params': [{'StepHeightMin': 3}]}, 'above StepHeightMax'),
         ({'Type': 'hills3d', 'VertSpacingX': 0.1}, 'VertSpacingX must be 0.2'),
     )  # fmt: skip
-    def test_refused(self, content, message):
+    def test_invalid_arguments_are_rejected(self, content, message):
         with self.assertRaisesRegex(ValueError, message):
             terrain.load(content)
 
@@ -656,7 +656,7 @@ class FileTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, "'pillars3d'"):
             terrain.load('pilars3d')
 
-    def test_blend(self):
+    def test_terrain_level_interpolates(self):
         mixed = {
             'Type': 'conveyor3d',
             'Params': [{'ConveyorNumStrips': 1}, {'ConveyorNumStrips': 4}],
@@ -706,7 +706,7 @@ class RegisterTest(parameterized.TestCase):
             np.array_equal(found.height(x[:1].repeat(4, 0), y[:1].repeat(4, 0))[0], heights[1])
         )
 
-    def test_taken_name(self):
+    def test_a_taken_name_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'hills3d'):
             terrain.register3d('hills3d')
 
@@ -719,7 +719,7 @@ class RegisterTest(parameterized.TestCase):
         (lambda: terrain.Layout(boxes=terrain.boxes([(0, math.inf)], 1, 1)), 'boxes.position'),
         (lambda: terrain.Layout(grid=terrain.Grid((0, 0), np.full((2, 2), np.nan))), 'grid'),
     )
-    def test_bad_generator(self, generate, message):
+    def test_invalid_generators_are_rejected(self, generate, message):
         terrain.register3d('mine3d')(lambda parameters, rng: generate())
         with self.assertRaisesRegex(ValueError, f"'mine3d'.*{message}"):
             make({'Type': 'mine3d'})
@@ -733,13 +733,13 @@ class RegisterTest(parameterized.TestCase):
         ({'boxes': lambda low, high: None}, 'finite Boxes'),
         ({'boxes': lambda low, high: terrain.boxes([(0, 0)], 1, math.nan)}, 'finite Boxes'),
     )
-    def test_bad_functions(self, parts, message):
+    def test_invalid_functions_are_rejected(self, parts, message):
         terrain.register3d('mine3d')(lambda parameters, rng: terrain.Layout(**parts))
         ground = make({'Type': 'mine3d'})
         with self.assertRaisesRegex(ValueError, message):
             ground.height(0, 0)
 
-    def test_kinds_that_come_and_go(self):
+    def test_varying_kinds_of_parts_are_rejected(self):
         @terrain.register3d('moody3d')
         def moody(parameters, rng):
             return terrain.Layout(level=None, grid=lambda i, j: np.zeros((len(i), len(j))))
@@ -856,7 +856,7 @@ class SurroundingsTest(parameterized.TestCase):
         on = (np.linspace(-1, 10, 32) + 2 >= 3) & (np.linspace(-1, 10, 32) + 2 <= 8)
         np.testing.assert_array_equal(velocities[0], 0)
         np.testing.assert_allclose(velocities[1], np.where(on, -speed, 0)[None].repeat(32, 0))
-        # Standing on the belt, the ground beside it runs the other way.
+        # Relative to the belt, the ground next to it moves in the opposite direction.
         found.follow(np.array([(4.0, 0.0)]))
         velocities = found.velocity_map(np.array([(4.0, 0.0)]), np.zeros(1))[0].reshape(2, 32, 32)
         on = (np.linspace(-1, 10, 32) + 4 >= 3) & (np.linspace(-1, 10, 32) + 4 <= 8)
@@ -889,13 +889,13 @@ class SurroundingsTest(parameterized.TestCase):
             found.height(np.array([[999.0]]), np.array([[-3.0]]), np.array([1])).shape, (1, 1)
         )
 
-    def test_nothing_to_follow_on_a_plane(self):
+    def test_a_plane_has_no_windows(self):
         found = around('plane', [0])
         self.assertFalse(found.windowed)
         self.assertEqual(found.follow(np.full((1, 2), 1e5)), [])
         self.assertEqual(found.height(np.full((1, 1), 1e5), np.zeros((1, 1))), 0)
 
-    def test_beyond_the_window_the_rim(self):
+    def test_queries_beyond_the_window_return_its_rim(self):
         for source in ('hills3d', 'pillars3d'):
             found = around(source, [0])
             heights = found.height(np.array([[1e12, -1e12, 1e300]]), np.zeros((1, 3)))
@@ -942,7 +942,7 @@ class SurroundingsTest(parameterized.TestCase):
                 found.height(x, y)[env_id], ground.height(x[env_id], y[env_id])
             )
 
-    def test_wrong_shapes_are_refused(self):
+    def test_wrong_shapes_are_rejected(self):
         found = around('plane', [0, 1])
         with self.assertRaisesRegex(ValueError, r'expected \(2, k\)'):
             found.height(np.zeros((3, 1)), np.zeros((3, 1)))
@@ -981,7 +981,7 @@ class SurroundingsTest(parameterized.TestCase):
         self.assertLessEqual(most, holds.boxes)
         self.assertLess(holds.boxes, 1.6 * most + 10)
 
-    def test_a_window_that_is_too_full_keeps_what_is_near(self):
+    def test_an_overfull_window_keeps_the_nearest_boxes(self):
         ground = terrain.load('pillars3d')
         holds = terrain.capacity(ground)._replace(boxes=40)
         found = terrain.Surroundings(1, holds)

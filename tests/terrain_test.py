@@ -1,4 +1,4 @@
-"""Tests of trl_suite.terrain: figures from the papers and from the original's description."""
+"""Tests of trl_suite.terrain: values from the papers and the original's description."""
 
 import copy
 import json
@@ -109,7 +109,7 @@ class ProcessTest(parameterized.TestCase):
 
     @parameterized.parameters(*sorted(terrain.GENERATORS))
     def test_length(self, kind):
-        # At least the length asked for, longer by less than a feature.
+        # At least the given length, longer by less than a feature.
         longest_feature = {'narrow_gaps': 10.0}
         name = kind.removeprefix('var2d_').removeprefix('slopes_')
         for seed in range(10):
@@ -168,7 +168,7 @@ class ProcessTest(parameterized.TestCase):
         ((-0.3, -0.2), (0.0, 0.0), 'down'),
         ((0.0, 0.2), (-0.2, 0.0), 'both'),  # one end at 0 does not switch a range off
     )
-    def test_rise_range(self, first, second, direction):
+    def test_range_of_rises(self, first, second, direction):
         step = planar('steps', StepSpacingMin=0, StepSpacingMax=0, StepH0Min=first[0],
                       StepH0Max=first[1], StepH1Min=second[0], StepH1Max=second[1])  # fmt: skip
         rises = np.diff(draw(step).heights)
@@ -258,7 +258,7 @@ class ProcessTest(parameterized.TestCase):
         self.assertAlmostEqual(g.reshape(-1, 40).mean(1).std(), deviation_over_1m, delta=0.006)
 
     def test_slopes_under_features(self):
-        # The walk alone: of features that have no height.
+        # Only the random walk: the features have no height.
         ground = json.loads(PAPER)
         for key in ('GapH', 'WallH', 'StepH0', 'StepH1'):
             ground['Params'][0].update({f'{key}Min': 0, f'{key}Max': 0})
@@ -334,7 +334,7 @@ class FileTest(parameterized.TestCase):
         gaps = terrain.load(planar('gaps', GapWMax=1)).parameters()
         self.assertEqual((gaps['GapWMin'], gaps['GapWMax'], gaps['GapSpacingMax']), (0.5, 1, 7))
 
-    def test_blend(self):
+    def test_terrain_level_interpolates(self):
         ground = terrain.load('gaps_curriculum')
         for terrain_level, low, high in (
             (0, 0.1, 0.25), (0.5, 0.3, 0.875), (1, 0.5, 1.5), (-3, 0.1, 0.25), (7, 0.5, 1.5),
@@ -348,14 +348,14 @@ class FileTest(parameterized.TestCase):
             with self.assertRaisesRegex(ValueError, 'terrain_level must be a number'):
                 ground.parameters(terrain_level)
 
-    def test_blend_of_three_sets_and_of_defaults(self):
+    def test_terrain_level_with_three_sets_and_defaults(self):
         sets = [{'GapWMin': 0.1, 'GapWMax': 0.1}, {}, {'GapWMin': 1, 'GapWMax': 1}]
         ground = terrain.load({'Type': 'var2d_gaps', 'Params': sets})
         self.assertAlmostEqual(ground.parameters(0.5)['GapWMin'], 0.3)
         self.assertAlmostEqual(ground.parameters(1.5)['GapWMin'], 0.75)
         self.assertAlmostEqual(ground.parameters(1.5)['GapWMax'], 1.5)
 
-    def test_blended_strip(self):
+    def test_ground_of_an_interpolated_terrain(self):
         easy, hard = (
             terrain.PlanarGround(
                 terrain.load('bumps_blend'), 0, terrain_level=terrain_level
@@ -430,14 +430,14 @@ class FileTest(parameterized.TestCase):
          ['NarrowGapCountMax', '100']),
         ('width', '{"Type": "var2d_gaps", "GroundWidth": "wide"}', ['GroundWidth', "'wide'"]),
     )  # fmt: skip
-    def test_refused(self, text, parts):
+    def test_invalid_arguments_are_rejected(self, text, parts):
         path = self.write(text)
         with self.assertRaises(ValueError) as caught:
             terrain.load(path)
         for part in [str(path), *parts]:
             self.assertIn(part, str(caught.exception))
 
-    def test_not_utf8(self):
+    def test_files_that_are_not_utf8_are_rejected(self):
         path = self.write('')
         path.write_bytes(b'\xff\xfe\x00')
         with self.assertRaisesRegex(ValueError, 'mine.json: not a terrain file'):
@@ -488,14 +488,14 @@ class RegisterTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'ToothHMin 0.5 is above ToothHMax 0.2'):
             terrain.load({'Type': 'var2d_saw', 'Params': [{'ToothHMin': 0.5}]})
 
-    def test_taken_name(self):
+    def test_a_taken_name_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'var2d_gaps'):
             terrain.register('var2d_gaps')
         function = lambda parameters, length, rng: terrain.Profile(np.ones(9), np.zeros(9, bool))  # noqa: E731
         terrain.register('var2d_gaps', replace=True)(function)
         self.assertIs(terrain.GENERATORS['var2d_gaps'].function, function)
 
-    def test_bad_defaults(self):
+    def test_invalid_defaults_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'mine.*HMin 2 .*above'):
             terrain.register('mine', {'HMin': 2, 'HMax': 1})
 
@@ -508,13 +508,13 @@ class RegisterTest(parameterized.TestCase):
         (lambda: terrain.Profile(np.zeros(3), np.zeros(3)), 'vertical'),
         (lambda: terrain.Profile(np.array([0, 1, np.nan]), np.zeros(3, bool)), 'vertex 2'),
     )
-    def test_bad_generator(self, make, message):
+    def test_invalid_generators_are_rejected(self, make, message):
         terrain.register('mine')(lambda parameters, length, rng: make())
         strip = terrain.PlanarGround(terrain.load({'Type': 'mine'}), 0)
         with self.assertRaisesRegex(ValueError, f"'mine'.*{message}"):
             strip.height(5.0)
 
-    def test_draw_refuses(self):
+    def test_invalid_draws_are_rejected(self):
         rng = np.random.default_rng(0)
         for length in (0, -1, math.nan, math.inf, 1e9):
             with self.assertRaisesRegex(ValueError, 'length'):
@@ -523,7 +523,7 @@ class RegisterTest(parameterized.TestCase):
             generators.draw('var2d_flt', {}, 1.0, rng)
 
 
-class StripTest(parameterized.TestCase):
+class PlanarGroundTest(parameterized.TestCase):
     """The endless ground."""
 
     def make(self, name='slopes_mixed', seed=0, **options):
@@ -552,7 +552,7 @@ class StripTest(parameterized.TestCase):
         heights, _ = self.make('gaps').window(-4000, 8000)
         self.assertEqual({-2.0, 0.0}, {*heights})
 
-    def test_request_order_does_not_matter(self):
+    def test_ground_does_not_depend_on_the_order_of_queries(self):
         for name in ('slopes_mixed', 'cliffs_rugged'):
             once = self.make(name)
             once.ensure(-100, 100)
@@ -604,7 +604,7 @@ class StripTest(parameterized.TestCase):
                 ground(seed)
 
     def test_streams_of_level_ground(self):
-        # They are made when they are asked for; a state has them all the same.
+        # They are created on demand; a state includes them.
         state = terrain.PlanarGround(terrain.load('flat'), 3).state()
         other = terrain.PlanarGround(terrain.load('slopes'), 3).state()
         self.assertEqual(state['right'], other['right'])
@@ -657,7 +657,7 @@ class StripTest(parameterized.TestCase):
         # The state is no part of the strip it was taken from.
         self.assertLess(state['heights'].size, 6000)
 
-    def test_broken_state_leaves_strip_alone(self):
+    def test_an_invalid_state_does_not_change_the_ground(self):
         strip = self.make()
         before = strip.height(5.0)
         state = strip.state()
@@ -679,7 +679,7 @@ class StripTest(parameterized.TestCase):
         self.assertEqual(np.shape(strip.height(0.3)), ())
         self.assertEqual(strip.height([]).shape, (0,))
 
-    def test_height_draws_as_needed(self):
+    def test_height_extends_the_ground(self):
         strip = self.make()
         self.assertTrue(np.isfinite(strip.height([-333.3, 444.4])).all())
         low, high = strip.extent
@@ -694,7 +694,7 @@ class StripTest(parameterized.TestCase):
         self.assertEqual(strip.slope(0.3), 0)
 
     @parameterized.parameters(math.nan, math.inf, -math.inf, 1.1e6, -1.1e6)
-    def test_refuses(self, x):
+    def test_invalid_arguments_are_rejected(self, x):
         strip = self.make()
         for request in (
             lambda: strip.height([0.0, x]),
@@ -707,13 +707,13 @@ class StripTest(parameterized.TestCase):
                 request()
         self.assertEqual(strip.extent, (-1, -1))  # nothing was drawn
 
-    def test_refuses_window_out_of_bounds(self):
+    def test_windows_out_of_bounds_are_rejected(self):
         with self.assertRaises(ValueError):
             self.make().window(10**9, 10)
         with self.assertRaises(ValueError):
             self.make().window(0, 10**9)
 
-    def test_refuses_spawn(self):
+    def test_invalid_spawns_are_rejected(self):
         with self.assertRaisesRegex(ValueError, "'upstrem'"):
             self.make(spawn='upstrem')
 

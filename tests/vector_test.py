@@ -24,7 +24,7 @@ class IdentityTest(parameterized.TestCase):
     """A simulation is the single environment with its seed."""
 
     @parameterized.parameters(*suite.ALL_IDS)
-    def test_every_row_is_a_single_environment(self, id_):
+    def test_every_simulation_equals_a_single_environment(self, id_):
         # A step of a gait is a whole cycle, one above a controller a footstep; gait_test and
         # high_level_test look closer.
         limit, steps, scale = LIMIT, 2 * LIMIT + 6, 1.0
@@ -36,7 +36,7 @@ class IdentityTest(parameterized.TestCase):
         self.assertGreaterEqual(ends, 6)
 
     @parameterized.parameters(1, 2, 3)
-    def test_threads_do_not_matter(self, threads):
+    def test_results_do_not_depend_on_threads(self, threads):
         found = []
         for number in (1, threads):
             environments = VectorEnvironment(GAPS, 5, num_threads=number, seed=1)
@@ -48,7 +48,7 @@ class IdentityTest(parameterized.TestCase):
         np.testing.assert_array_equal(*found)
 
     @parameterized.parameters('MTU_Biped2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Slopes_Terrain-v0')
-    def test_rows_are_reset_as_the_engine_does(self, id_):
+    def test_simulations_are_reset_as_by_the_engine(self, id_):
         specs = VectorEnvironment(id_, 4, 1, seed=1)
         specs.reset()
         specs.step(np.ones((4, len(specs.action_map))))
@@ -65,7 +65,7 @@ class IdentityTest(parameterized.TestCase):
         np.testing.assert_array_equal(world.qpos[which], [fresh.qpos] * 2)
         self.assertFalse(world.diverged()[which].any())
 
-    def test_the_number_of_rows_does_not_matter(self):
+    def test_results_do_not_depend_on_num_envs(self):
         few = VectorEnvironment(GAPS, 2, 1, seed=[7, 8])
         many = VectorEnvironment(GAPS, 9, 2, seed=[7, 8, *range(20, 27)])
         np.testing.assert_array_equal(few.reset(), many.reset()[:2])
@@ -76,8 +76,8 @@ class IdentityTest(parameterized.TestCase):
             np.testing.assert_array_equal(a.observation, b.observation[:2])
             np.testing.assert_array_equal(a.reward, b.reward[:2])
 
-    def test_long_runs_go_over_new_ground(self):
-        # 14 m at 4 m/s: the window of boxes is laid anew, at another time in every simulation.
+    def test_long_runs_extend_the_ground(self):
+        # 14 m at 4 m/s: the window of boxes moves, at another time in every simulation.
         environments = VectorEnvironment(
             'PD_Dog2D_Slopes_Terrain-v0', 3, 2, seed=2, autoreset='disabled'
         )
@@ -151,7 +151,7 @@ class IdentityTest(parameterized.TestCase):
 
 
 class LimitTest(parameterized.TestCase):
-    """Episodes are cut where those of a single environment are."""
+    """Episodes are truncated as those of a single environment."""
 
     @parameterized.parameters(
         ({}, 256), ({'step_limit': None, 'time_limit': 8.99}, 270), ({'time_limit': 0.5}, 15),
@@ -176,7 +176,7 @@ class LimitTest(parameterized.TestCase):
         self.assertEqual(ends[0], expected or ends[0])
         self.assertEqual(ends[1], 2 * ends[0] + 1)
 
-    def test_rows_are_cut_each_in_its_time(self):
+    def test_simulations_are_truncated_independently(self):
         options = {'time_limit': 0.3}
         environments = VectorEnvironment(
             FLAT, 3, 1, seed=0, autoreset='disabled', task_kwargs=options, step_limit=None
@@ -207,13 +207,13 @@ class LimitTest(parameterized.TestCase):
         ({'step_limit': -1}, 'step_limit is -1'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
         ({'random': 3}, "'random'.*`seed`"), ({'time_limt': 3}, 'time_limt'),
     )  # fmt: skip
-    def test_refused(self, options, message):
+    def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
             VectorEnvironment(FLAT, 2, 1, task_kwargs=options)
 
 
 class AutoresetTest(parameterized.TestCase):
-    """Gymnasium's three manners of beginning anew."""
+    """Gymnasium's three autoreset modes."""
 
     def run_to_the_end(self, autoreset):
         environments = VectorEnvironment(FLAT, 4, 1, seed=0, autoreset=autoreset, step_limit=3)
@@ -249,7 +249,7 @@ class AutoresetTest(parameterized.TestCase):
         self.assertEqual(step.reward.shape, (4,))
 
     @parameterized.parameters({'env_ids': [1, 3]}, {'env_ids': [False, True, False, True]})
-    def test_a_reset_of_some_rows_leaves_the_others(self, env_ids):
+    def test_a_reset_of_some_simulations_does_not_affect_others(self, env_ids):
         environments, untouched = (
             VectorEnvironment(FLAT, 4, 1, seed=4, autoreset='disabled') for _ in range(2)
         )
@@ -271,11 +271,11 @@ KINDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())  #
 ALONE = np.array([False, True, False])
 
 
-class SomeRowsTest(parameterized.TestCase):
+class PartialBatchTest(parameterized.TestCase):
     """Stepping some simulations, and going on where another environment is: what a search needs."""
 
     @parameterized.parameters(*KINDS)
-    def test_rows_that_rest_stay_as_they_are(self, id_):
+    def test_simulations_that_are_not_stepped_do_not_change(self, id_):
         """Simulation 1 rests every other step, and is no other for it than the simulation that never rests."""
         specs, other = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
         random = np.random.default_rng(0)
@@ -295,7 +295,7 @@ class SomeRowsTest(parameterized.TestCase):
             self.assertEqual(step.reward[1], expected.reward[1])
             self.assertEqual(step.terminated[1], expected.terminated[1])
 
-    def test_a_row_that_has_ended_rests_until_it_is_asked(self):
+    def test_an_ended_simulation_waits_for_its_reset(self):
         environments = VectorEnvironment(GAPS, 3, 1, 0, step_limit=2)
         environments.reset()
         action = np.zeros((3, len(environments.action_map)))
@@ -305,14 +305,14 @@ class SomeRowsTest(parameterized.TestCase):
         for _ in range(2):
             step = environments.step(action, [2])
         np.testing.assert_array_equal(step.truncated, [False, False, True])
-        step = environments.step(action)  # the first and the last begin anew, the other ends
+        step = environments.step(action)  # the first and the last are reset, the other ends
         np.testing.assert_array_equal(step.truncated, [False, True, False])
         np.testing.assert_array_equal(step.reward > 0, [False, True, False])
         with self.assertRaisesRegex(ValueError, r'env_ids are \[3\]; expected numbers in \[0, 3\)'):
             environments.step(action, [3])
 
     @parameterized.parameters(*KINDS)
-    def test_copies_go_on_where_the_other_is(self, id_):
+    def test_copies_continue_from_the_other_simulation(self, id_):
         environments = VectorEnvironment(id_, 2, 1, seed=4)
         copies = VectorEnvironment(id_, 3, 1, seed=9)
         action = np.random.default_rng(0).uniform(-0.1, 0.1, (2, len(environments.action_map)))
@@ -325,7 +325,7 @@ class SomeRowsTest(parameterized.TestCase):
         np.testing.assert_array_equal(step.reward, expected.reward[[1, 0, 1]])
 
     @parameterized.parameters(*KINDS)
-    def test_single_rows_go_back(self, id_):
+    def test_single_simulations_can_be_restored(self, id_):
         env_ids, twin = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
         action = np.random.default_rng(0).uniform(-0.1, 0.1, (3, len(env_ids.action_map)))
         for each in (env_ids, twin):
@@ -343,7 +343,7 @@ class SomeRowsTest(parameterized.TestCase):
             np.testing.assert_array_equal(step.reward, expected.reward)
         np.testing.assert_array_equal(env_ids.reset(), twin.reset())
 
-    def test_what_rows_cannot_go_back_to(self):
+    def test_invalid_states_are_rejected(self):
         environments = VectorEnvironment(GAPS, 3, 1, 0)
         state = environments.get_state([1])
         with self.assertRaisesRegex(RuntimeError, 'some simulations before the first reset'):
@@ -363,7 +363,7 @@ class SomeRowsTest(parameterized.TestCase):
             ):
                 call([3])
 
-    def test_what_cannot_be_copied(self):
+    def test_invalid_copies_are_rejected(self):
         environments, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
             environments.copy_from(environments, [0], [1])
@@ -378,14 +378,14 @@ class SomeRowsTest(parameterized.TestCase):
 
 
 class RobustnessTest(parameterized.TestCase):
-    """What goes wrong says so, and stays in its simulation."""
+    """Errors are reported, and do not affect other simulations."""
 
     def setUp(self):
         super().setUp()
         self.environments = VectorEnvironment(FLAT, 3, 1, seed=0)
         self.environments.reset()
 
-    def test_divergence_stays_in_its_row(self):
+    def test_divergence_does_not_affect_other_simulations(self):
         other = VectorEnvironment(FLAT, 3, 1, seed=0)
         other.reset()
         self.environments._task.world.qvel[1, 5] = 1e12
@@ -406,12 +406,12 @@ class RobustnessTest(parameterized.TestCase):
         (np.zeros(6), 'shape'),
         (np.full((3, 6), 'a'), 'array of numbers'),
     )
-    def test_wrong_actions(self, action, message):
+    def test_invalid_actions_are_rejected(self, action, message):
         with self.assertRaisesRegex(ValueError, message):
             self.environments.step(action)
 
     @parameterized.parameters(np.nan, np.inf, -np.inf)
-    def test_non_finite_actions_name_the_row(self, value):
+    def test_non_finite_actions_name_the_simulation(self, value):
         action = np.zeros((3, 6))
         action[2, 4] = value
         with self.assertRaisesRegex(ValueError, r'simulation 2, number 4 \(left_knee\)'):
@@ -431,17 +431,17 @@ class RobustnessTest(parameterized.TestCase):
         ({'environment': 'PD_Biped2D_Gap_Terrain-v0'}, 'PD_Biped2D_Gaps_Terrain-v0'),
         ({'task_kwargs': {'sub_steps': 3}}, "did you mean 'substeps'"),
     )
-    def test_wrong_arguments(self, arguments, message):
+    def test_invalid_arguments_are_rejected(self, arguments, message):
         with self.assertRaisesRegex(ValueError, message):
             VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
 
-    def test_closed(self):
+    def test_a_closed_environment_raises_errors(self):
         self.environments.close()
         self.environments.close()
         with self.assertRaisesRegex(RuntimeError, 'closed'):
             self.environments.step(np.zeros((3, 6)))
 
-    def test_step_before_reset(self):
+    def test_a_step_before_reset_raises_an_error(self):
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
             VectorEnvironment(FLAT, 2, 1).step(np.zeros((2, 6)))
 
@@ -471,7 +471,7 @@ class RobustnessTest(parameterized.TestCase):
         self.assertEqual(observation['terrain'].shape, (2, 50))
         self.assertEqual(environments.step(np.zeros((2, 11))).reward.dtype, np.float32)
 
-    def test_a_forked_child_is_refused_not_hung(self):
+    def test_a_forked_child_raises_an_error_instead_of_hanging(self):
         environments = VectorEnvironment(FLAT, 2, 2, seed=0)
         environments.reset()
         context = multiprocessing.get_context('fork')
@@ -483,7 +483,7 @@ class RobustnessTest(parameterized.TestCase):
         self.assertEqual(child.exitcode, 0)
         environments.step(np.zeros((2, 6)))
 
-    def test_spawned_workers_go_on_where_the_parent_is(self):
+    def test_spawned_workers_continue_from_the_parents_state(self):
         context = multiprocessing.get_context('spawn')
         spec = {'environment': FLAT, 'num_envs': 3, 'num_threads': 1, 'seed': 0}
         random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The command view: what reaches dm_control's viewer, and what that draws, in a window that is none."""
+"""The command view: inputs and frames of dm_control's viewer, with a fake window."""
 
 import importlib
 import types
@@ -25,7 +25,7 @@ with warnings.catch_warnings():  # GLFW's, where there is no screen
 
 class CommandTest(cli_test.CommandTest):
     def view(self, *arguments):
-        """Runs the command; returns the environment, the policy and the title that were shown."""
+        """Runs the command; returns environment, policy and title of the window."""
         with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
             self.assertEqual(self.output('view', *arguments), '')
         return shown.call_args.args
@@ -34,7 +34,7 @@ class CommandTest(cli_test.CommandTest):
         (GAPS, 'reference'), ('PD_Dog2D_Flat-v0', 'clip'), (DOG, 'zero'), (PLANS, 'scripted'),
         ('FSM_Hopper2D_Terrain_Gaps-v0', 'random'),
     )  # fmt: skip
-    def test_what_is_shown(self, id_, name):
+    def test_environment_policy_and_title(self, id_, name):
         environment, policy, title = self.view(id_, '--policy', name, '--seed', '3')
         self.assertEqual(title, f'{id_}: {name}')
         expected = suite.make(id_, {'random': 3}).reset().observation
@@ -43,14 +43,14 @@ class CommandTest(cli_test.CommandTest):
             np.testing.assert_array_equal(value, expected[block])
         self.assertEqual(policy(time_step).shape, environment.action_spec().shape)
 
-    def test_the_best_there_is(self):
+    def test_best_policy_that_exists_is_chosen(self):
         """Trying policies costs no episode: it is that of the seed."""
         environment, _, title = self.view('plaid/biped_gaps', '--seed', '3')
         self.assertEqual(title, f'{GAPS}: reference')
         expected = suite.make(GAPS, {'random': 3}).reset().observation['terrain']
         np.testing.assert_array_equal(environment.reset().observation['terrain'], expected)
 
-    def test_a_file(self):
+    def test_a_policy_file(self):
         policy = cli_test.save_policy('mine.npz', GAPS)
         environment, found, title = self.view(GAPS, '--policy', 'mine.npz')
         self.assertEqual(title, f'{GAPS}: mine.npz')
@@ -64,12 +64,12 @@ class CommandTest(cli_test.CommandTest):
         ('torque control cannot follow a clip', 'imitation/torque_dog', '--policy', 'clip'),
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
     )
-    def test_refusals(self, message, *arguments):
+    def test_invalid_arguments_are_rejected(self, message, *arguments):
         with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
             self.assert_refused(message, 'view', *arguments)
         shown.assert_not_called()
 
-    def test_no_screen(self):
+    def test_a_missing_screen_is_an_error(self):
         nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}
         with mock.patch.dict('os.environ', nothing), mock.patch('sys.platform', 'linux'):
             self.assert_refused(
@@ -134,7 +134,7 @@ class FramesTest(parameterized.TestCase):
 
 
 class NoWindow:
-    """What the viewer needs of a window; it is closed after some pictures, which it keeps."""
+    """A fake window for the viewer; it stores its frames, and closes after some of them."""
 
     def __init__(self, width, height, title):
         names = ('on_move', 'on_click', 'on_double_click', 'on_scroll', 'on_key')
@@ -162,10 +162,8 @@ class WindowTest(parameterized.TestCase):
     def window(self, environment):
         shown = window.Window(environment, 'a title')
         clock = types.SimpleNamespace(tick=lambda: FRAME, measured_time=FRAME)
-        shown._frame_timer = clock  # that of the machine may be slow
-        shown._viewer_layout = (
-            window.application.views.ViewportLayout()
-        )  # no figures over the picture
+        shown._frame_timer = clock  # the machine's clock may be slow
+        shown._viewer_layout = window.application.views.ViewportLayout()  # no text over the frame
         return shown, shown._window
 
     @parameterized.parameters(GAPS, DOG, PLANS)
@@ -187,7 +185,7 @@ class WindowTest(parameterized.TestCase):
         name = environment.physics.model.id2name(body, 'body')
         self.assertEqual(name, f'{environment.task.character.spec.name}/')
 
-    def test_ground_that_changes_is_drawn_as_it_is(self):
+    def test_changed_ground_is_drawn(self):
         environment = suite.make(HILLS, {'random': 1})
         shown, screen = self.window(environment)
         shown._pause_subject.toggle()
@@ -203,7 +201,7 @@ class WindowTest(parameterized.TestCase):
         self.assertGreater(np.abs(flat - first).mean(), 1)
         np.testing.assert_array_equal(flat, still)
 
-    def test_what_a_task_marks_is_drawn(self):
+    def test_markers_of_a_task_are_drawn(self):
         pictures = []
         for markers in (True, False):
             environment = suite.make(PLANS, {'random': 1})

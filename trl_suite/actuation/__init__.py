@@ -1,4 +1,4 @@
-"""How actions become forces: four actuation models, what an action means, and muscles."""
+"""From actions to forces: four actuation models, action maps, and muscles."""
 
 from trl_suite.actuation.models import (
     ACTUATIONS,

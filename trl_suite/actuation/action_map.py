@@ -1,4 +1,4 @@
-"""Maps from actions in [-1, 1] to controls in physical units, as arrays, and what an action may be."""
+"""Maps from actions in [-1, 1] to controls in physical units, as arrays, and checks of actions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from trl_suite.util.compiled import compiled, compiled_inline
 
-AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
-# The original's axis lies behind the angle: forward, up, right.
+AXIS_OFFSET = 0.2  # component to the right of the original's axis at action 0
+# The axis follows the angle, in the original's order: forward, up, right.
 _FORWARD_LEFT_UP, _SIGNS = np.array([1, 3, 2]), np.array([1.0, -1.0, 1.0])
 _TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
 
@@ -23,13 +23,13 @@ class ActionMap:
     """The map from an action in [-1, 1] to control: action_offset + action_scale * action.
 
     Attributes:
-      names: what each action drives, shape (k,).
-      quantity: what the controls are, e.g. 'target angle'.
-      unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
+      names: joint or muscle of each action, shape (k,).
+      quantity: quantity of the controls, e.g. 'target angle'.
+      unit: physical unit of the controls; exceptions by joint: 'rad (leg: m)'.
       action_offset: control at action 0, shape (k,).
       action_scale: change of control per unit action, shape (k,).
-      actuators: names of the actuators that take the controls, one after the other; those of ball
-        joints take three each. Empty where a controller stands between.
+      actuators: names of the actuators that get the controls, in order; those of ball joints get
+        three each. Empty if a controller converts the controls.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class ActionMap:
     def control(self, action: np.ndarray) -> np.ndarray:
         """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
         low, high, action_scale, action_offset = self._rows
-        control = np.maximum(action, low)  # packed rows: quicker than scalars
+        control = np.maximum(action, low)  # contiguous arrays: faster than scalars
         np.minimum(control, high, out=control)
         control *= action_scale
         control += action_offset
@@ -65,14 +65,14 @@ class ActionMap:
         return -ones, ones, self.action_scale[None], self.action_offset[None]
 
     def action(self, control: np.ndarray) -> np.ndarray:
-        """Maps controls (..., k) to the actions that cause them; not clipped."""
+        """Maps controls (..., k) to the actions that yield them; not clipped."""
         return (control - self.action_offset) / self.action_scale
 
     def checked(self, action: npt.ArrayLike, *env_ids: int) -> np.ndarray:
         """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k).
 
         Raises:
-          ValueError: another shape, or NaN or infinity; the simulation and what is driven are named.
+          ValueError: another shape, or NaN or infinity; the message names simulation and joint.
         """
         shape = (*env_ids, len(self))
         are, have = ('actions are', 'actions have') if env_ids else ('action is', 'action has')
@@ -82,7 +82,7 @@ class ActionMap:
             raise ValueError(f'{are} not an array of numbers: {error}') from None
         if action.shape != shape:
             raise ValueError(f'{have} shape {action.shape}; expected {shape}')
-        # The quick test first; huge numbers fail it and pass the other.
+        # A fast test first; huge numbers fail it, but pass the second one.
         if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
             *env_id, i = np.argwhere(~np.isfinite(action))[0]
             place = f'action of simulation {env_id[0]}, number {i}' if env_id else f'action[{i}]'
@@ -93,13 +93,13 @@ class ActionMap:
 
 
 class Drive(NamedTuple):
-    """An action map for compiled functions; its actuators lie one after the other.
+    """An action map for compiled functions; the addresses of its actuators are consecutive.
 
     Attributes:
-      offset: what action 0 means, (k,).
+      offset: control at action 0, (k,).
       scale: change per unit action, (k,).
       first: address of the first control.
-      torque_balls, torque_limits: of a `TorqueMap` where the torques of ball joints are, (B, 3), and
+      torque_balls, torque_limits: of a `TorqueMap` the indices of ball joints' torques, (B, 3), and
         the largest norm of each, (B,); otherwise empty.
       angles, angle_balls, hinges: of an `AngleAxisMap`, (B,), (B, 3) and (2, H); otherwise empty.
     """
@@ -116,13 +116,13 @@ class Drive(NamedTuple):
 
 @compiled_inline
 def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
-    """What number k of an action means, in physical units."""
+    """Control k of an action, in physical units, before any clamp of norms."""
     return min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
 
 
 @compiled
 def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
-    """Writes the controls of simulation i that its action (of (n, k), clipped) means."""
+    """Writes the controls of simulation i for its action, `action[i]`, clipped to [-1, 1]."""
     if len(by.angles):
         _drive_rotations(i, action, by, ctrl)
         return
@@ -140,7 +140,7 @@ def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
 
 @compiled
 def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
-    """Writes the rotation vectors of ball joints that angles and axes mean; see `AngleAxisMap`."""
+    """Writes the rotation vectors of ball joints from angles and axes; see `AngleAxisMap`."""
     for k in range(by.hinges.shape[1]):
         ctrl[i, by.first + by.hinges[1, k]] = _meant(i, by.hinges[0, k], action, by)
     for ball in range(len(by.angles)):
@@ -160,10 +160,10 @@ def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) ->
 
 @dataclasses.dataclass(frozen=True)
 class TorqueMap(ActionMap):
-    """Torques of joints, some of them spherical: their norm is clamped after the affine map.
+    """Torques of joints, some of them spherical: the norm of these is clamped after the affine map.
 
     Attributes:
-      balls: where the three torques of each ball joint are, shape (B, 3).
+      balls: indices of the three torques of each ball joint, shape (B, 3).
       limits: the largest norm of each, N m, shape (B,).
     """
 
@@ -185,14 +185,14 @@ class TorqueMap(ActionMap):
 class AngleAxisMap(ActionMap):
     """The position actions of the original: angle and axis of a rotation for every ball joint.
 
-    The affine map yields an angle, then an axis of any length, forward, up and right; the axis of
-    length 0 stands for the one to the right. `control` goes on to rotation vectors, so it returns
-    fewer numbers than it takes, and `action` gives back one of many equal actions.
+    The affine map yields an angle, then an axis of any length, forward, up and right; an axis of
+    length 0 is replaced by the one to the right. `control` converts these to rotation vectors, so
+    it returns fewer numbers than it takes, and `action` returns one of many equivalent actions.
 
     Attributes:
-      angles: where the angle of each ball joint is in an action, shape (B,); its axis follows.
-      balls: where its rotation vector is in the controls, shape (B, 3).
-      hinges: where the other joints are in an action and in the controls, shape (2, H).
+      angles: index of the angle of each ball joint in an action, shape (B,); its axis follows.
+      balls: indices of its rotation vector in the controls, shape (B, 3).
+      hinges: indices of the other joints in an action and in the controls, shape (2, H).
     """
 
     angles: np.ndarray = dataclasses.field(kw_only=True)
@@ -222,7 +222,7 @@ class AngleAxisMap(ActionMap):
 
     @functools.cached_property
     def _axes(self) -> np.ndarray:
-        """Where forward, left and up are in an action, shape (B, 3)."""
+        """Indices of forward, left and up in an action, shape (B, 3)."""
         return self.angles[:, None] + _FORWARD_LEFT_UP
 
     def action(self, control: np.ndarray) -> np.ndarray:
@@ -233,12 +233,12 @@ class AngleAxisMap(ActionMap):
         value = np.empty((*control.shape[:-1], len(self)))
         value[..., self.hinges[0]] = control[..., self.hinges[1]]
         value[..., self.angles] = angle
-        # Of such a length that actions in [-1, 1] reach every axis.
+        # Scaled so that every axis has an action in [-1, 1].
         value[..., self._axes] = axis * _SIGNS * (1 - AXIS_OFFSET)
         return super().action(value)
 
 
 def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Lengths of vectors (..., 3); in every simulation the same whatever the number of simulations."""
+    """Lengths of vectors (..., 3); bitwise independent of the number of simulations."""
     square = vectors * vectors
     return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])

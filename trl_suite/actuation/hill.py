@@ -1,12 +1,12 @@
-"""The Hill-type muscle of the original simulator as formulas, and its image in MuJoCo's muscle.
+"""The Hill-type muscle of the original simulator as formulas, and its fit by MuJoCo's muscle.
 
 The original integrates a contractile element in series with a tendon (after Geyer and Herr) at
-3000 Hz. Our muscle actuation uses MuJoCo's own muscle force curves instead, so that no Python runs
+3000 Hz. The muscle actuation here uses MuJoCo's muscle force curves instead, so that no Python runs
 between substeps: force-length and force-velocity are MuJoCo's functions with parameters fitted to
 the formulas below, the tendon is rigid, and a cosine moment arm is replaced by its value at the
-rest angle. Peak forces, optimal lengths, rest angles, grouping, and the signs and sizes of constant
-arms are the table's. The formulas here are what the tests hold MuJoCo's muscles against, and what
-a user may need to analyse a rollout; lengths `l` are in optimal fibre lengths.
+rest angle. Peak forces, optimal lengths, rest angles, grouping, and signs and sizes of constant
+arms are those of the table in `muscles.py`. The formulas here serve tests of MuJoCo's muscles and
+the analysis of rollouts; lengths `l` are in optimal fibre lengths.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from trl_suite.actuation.muscles import Arm, Muscle
 
 WIDTH = 0.56  # half width of the active force-length curve, optimal lengths
-RESIDUE = 0.05  # active force left at the end of that width
+RESIDUE = 0.05  # active force at the end of that width
 V_MAX = 10.0  # largest shortening speed, optimal lengths per second
 CURVATURE = 5.0  # of the shortening branch
 ECCENTRIC = 1.5  # plateau of the lengthening branch, peak forces
@@ -28,7 +28,7 @@ MIN_ACTIVATION = 0.01
 # |v| <= 10 optimal lengths per second. Largest errors in peak forces: 0.046 of active force by
 # length; 0.18 by velocity, at a slow stretch, where the original is steeper; of passive force 0.10
 # up to l = 1.6 and 0.5 at l = 1.8.
-MUJOCO_RANGE = (0.5, 1.5)  # of operating lengths; only fixes the scale of `lengthrange`
+MUJOCO_RANGE = (0.5, 1.5)  # of operating lengths; only determines the scale of `lengthrange`
 MUJOCO_LMIN, MUJOCO_LMAX = 0.30, 1.70
 MUJOCO_VMAX = 6.0
 MUJOCO_FPMAX = 0.86
@@ -46,7 +46,7 @@ def parallel_force(l: ArrayLike) -> np.ndarray:  # noqa: E741
 
 
 def buffer_force(l: ArrayLike) -> np.ndarray:  # noqa: E741
-    """Force of the spring that keeps the contractile element from collapsing, in peak forces."""
+    """Force of the spring that limits shortening of the contractile element, in peak forces."""
     return np.maximum(0, (1 - WIDTH - np.asarray(l)) / (WIDTH / 2)) ** 2
 
 
@@ -72,7 +72,7 @@ def velocity(force_velocity: ArrayLike) -> np.ndarray:
 
 
 def moment_arm(arm: Arm, angle: ArrayLike) -> np.ndarray:
-    """Moment arm in m at a joint angle in rad, as the original has it."""
+    """Moment arm in m at a joint angle in rad, as in the original."""
     angle = np.asarray(angle, dtype=float)
     if arm.peak is None:
         return np.full_like(angle, arm.arm)
@@ -80,7 +80,7 @@ def moment_arm(arm: Arm, angle: ArrayLike) -> np.ndarray:
 
 
 def constant_arm(arm: Arm) -> float:
-    """The arm in m that stands for `arm` in MuJoCo: its value at the rest angle."""
+    """The constant arm in m that replaces `arm` in MuJoCo: its value at the rest angle."""
     return float(moment_arm(arm, arm.rest))
 
 
@@ -90,12 +90,12 @@ def optimal_length(muscle: Muscle) -> float:
 
 
 def rest_length(muscle: Muscle) -> float:
-    """Length of the MuJoCo tendon in m where the fibre has its optimal length."""
+    """Length of the MuJoCo tendon in m at which the fibre has its optimal length."""
     return -sum(constant_arm(arm) * arm.rest for arm in muscle.arms)
 
 
 def mujoco_parameters(muscle: Muscle) -> dict[str, tuple[float, ...]]:
-    """Attributes of the `general` actuator of MuJoCo that stands for a muscle."""
+    """Attributes of the MuJoCo `general` actuator that represents a muscle."""
     scale = optimal_length(muscle)
     tendon = rest_length(muscle) - scale
     parameters = (

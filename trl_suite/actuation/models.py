@@ -4,15 +4,15 @@ Each adds actuators to a character's MJCF and returns an `ActionMap`: the affine
 agent's action in [-1, 1] to physical units. No model lets a joint exceed the torque limit of the
 character's MJCF (`actuatorfrcrange`).
 
-The servos follow the original's gains, with what explicit simulation needs added and documented:
-every actuated joint gets an armature, a joint limit of two physics steps stiffness, and some
-passive damping. All of a servo's damping inside its force clamp chatters, all of it outside caps
-the joint's speed below what a bound needs, so it is split.
+The servos have the original's gains, with additions for stability: every actuated joint gets an
+armature, a joint limit with a time constant of two physics steps, and some passive damping. A
+servo's damping is split: if all of it were inside the force clamp, the joint would chatter; if all
+of it were outside, the speed of the joint would be too low for a bound.
 
-Where a joint is prismatic, read m for rad, N for N m and kg for kg m^2. A spherical joint has three
+For a prismatic joint, read m for rad, N for N m and kg for kg m^2. A spherical joint has three
 actions, about the x (forward), y (left) and z (up) axes of its link in the zero pose; a limb swings
 forward by a rotation about -y. Its torque limit bounds the norm of the three torques; velocity
-servos, which MuJoCo clamps axis by axis, get that limit / sqrt(3) about each.
+servos, which MuJoCo clamps axis by axis, get that limit / sqrt(3) about each axis.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from trl_suite.characters.character import Character
 from trl_suite.util import errors
 
 DAMPING_DIVISOR = 50.0  # passive damping of torque and position joints: torque limit / this, in s
-MUSCLE_DAMPING_DIVISOR = 100.0  # the force-velocity curve damps as well
-TORQUE_SCALE = 0.75  # of the limit at full action
-FORCE_SCALE = 1.0  # the same of a prismatic joint
-VELOCITY_SCALE = 10 * np.pi  # rad/s at full action
-SLIDE_VELOCITY_SCALE = 10.0  # m/s; at rest the hopper's leg then meets its force limit
-POSITION_SCALE = 1.5  # rad at full action; of a prismatic joint half its range
-ORIGINAL_SPAN = 2.0  # of the range of a joint; how far the original's position targets go at most
+MUSCLE_DAMPING_DIVISOR = 100.0  # less damping, as the force-velocity curve also damps
+TORQUE_SCALE = 0.75  # of the limit at action 1
+FORCE_SCALE = 1.0  # the same for a prismatic joint
+VELOCITY_SCALE = 10 * np.pi  # rad/s at action 1
+SLIDE_VELOCITY_SCALE = 10.0  # m/s at action 1, where the resting hopper's leg has its force limit
+POSITION_SCALE = 1.5  # rad at action 1; for a prismatic joint half its range
+ORIGINAL_SPAN = 2.0  # ranges of a joint; largest distance of the original's position targets
 ROTATIONS = ('vector', 'angle_axis')  # how position actions describe the rotation of a ball joint
 EXCITATION_OFFSET, EXCITATION_SCALE = 0.505, 0.495  # [0.01, 1]
 
@@ -45,7 +45,7 @@ EXCITATION_OFFSET, EXCITATION_SCALE = 0.505, 0.495  # [0.01, 1]
 def _prepare(
     character: Character, timestep: float, damping: np.ndarray, least: np.ndarray | None = None
 ) -> None:
-    """Gives every joint its armature, at least `least` (J,), damping (J,) and a stiff limit."""
+    """Sets every joint's armature, at least `least` (J,), its damping (J,) and a stiff limit."""
     armature = np.array([joint.armature for joint in character.spec.joints.values()])
     armature = armature if least is None else np.maximum(armature, least)
     for joint, inertia, value in zip(character.joints, armature, damping, strict=True):
@@ -55,23 +55,23 @@ def _prepare(
 
 
 def _spread(character: Character, per_joint: np.ndarray) -> np.ndarray:
-    """Returns figures of joints (J, ...) for every degree of freedom, (D, ...)."""
+    """Repeats values per joint (J, ...) for every degree of freedom, (D, ...)."""
     return np.repeat(per_joint, character.dofs, axis=0)
 
 
 def _by_type(character: Character, revolute: float, prismatic: float) -> np.ndarray:
-    """Returns one of two figures for each degree of freedom, shape (D,)."""
+    """Returns one of two values for each degree of freedom, shape (D,)."""
     return _spread(character, np.where(character.prismatic, prismatic, revolute))
 
 
 def _unit(character: Character, revolute: str, prismatic: str) -> str:
-    """Returns the unit of controls that drive joints."""
+    """Returns the unit of controls of joints."""
     slides = np.array(list(character.spec.joints))[character.prismatic]
     return f'{revolute} ({", ".join(slides)}: {prismatic})' if len(slides) else revolute
 
 
 def _split(character: Character, parts: Sequence[str]) -> tuple[str, ...]:
-    """Returns the names of the joints, each ball joint's once for every part of it."""
+    """Returns names of actions: those of joints, for ball joints one for each of `parts`."""
     return tuple(
         f'{name}_{part}' if ball else name
         for name, ball in zip(character.spec.joints, character.spherical, strict=True)
@@ -80,14 +80,14 @@ def _split(character: Character, parts: Sequence[str]) -> tuple[str, ...]:
 
 
 def _balls(character: Character, size: int) -> np.ndarray:
-    """Returns where ball joints begin if each takes `size` numbers, shape (B,)."""
+    """Returns the first index of each ball joint if it takes `size` numbers, shape (B,)."""
     ball = character.spherical
     sizes = np.where(ball, size, 1)
     return (np.cumsum(sizes) - sizes)[ball]
 
 
 def _dofs(character: Character) -> Iterator[tuple[str, mjcf.Element, dict[str, Any]]]:
-    """Yields name and joint of every degree of freedom, and what its actuator needs to know."""
+    """Yields name and joint of every degree of freedom, and options of its actuator."""
     for name, joint, ball in zip(
         character.spec.joints, character.joints, character.spherical, strict=True
     ):
@@ -101,7 +101,7 @@ def _dofs(character: Character) -> Iterator[tuple[str, mjcf.Element, dict[str, A
 def original_ranges(character: Character) -> np.ndarray:
     """Limits by which the original scales position actions, rad or m, shape (J, 2).
 
-    Of a ball joint they are the extremes over its three axes.
+    For a ball joint they are the extremes over its three axes.
     """
     ranges = character.joint_ranges
     ranges[character.spherical, 0] = -ranges[character.spherical, 1]
@@ -136,11 +136,11 @@ def _add_velocity(character: Character, timestep: float, **_: object) -> ActionM
     kd = np.array([joint.kd for joint in character.spec.joints.values()])
     passive, least, clamps = np.zeros(len(limits)), None, limits
     if ball.any():
-        # Limbs on ball joints spin up without passive damping. The drive makes up for its pull
-        # towards rest: below the clamp the law is that of a servo with all of kd.
+        # Without passive damping, limbs on ball joints spin up. The actuator compensates for the
+        # passive damping: below the clamp the control law is that of a servo with the whole kd.
         passive = np.minimum(limits / DAMPING_DIVISOR, kd)
-        # With a clamp for every axis thin limbs would shiver for good: a force that changes sign at
-        # every step feeds itself unless 2 * inertia > gain * timestep.
+        # With a clamp for every axis, thin limbs would oscillate: a force that changes sign at
+        # every step sustains itself unless 2 * inertia > gain * timestep.
         least = (kd - passive) * timestep / 2
         clamps = np.where(ball, limits / np.sqrt(3), limits)
     _prepare(character, timestep, passive, least)
@@ -169,7 +169,7 @@ def _add_position(
     **_: object,
 ) -> ActionMap:
     if rotations not in ROTATIONS:
-        raise ValueError(errors.unknown('way to describe rotations', rotations, ROTATIONS))
+        raise ValueError(errors.unknown('description of rotations', rotations, ROTATIONS))
     limits = character.torque_limits
     joints = list(character.spec.joints.values())
     kd = np.array([joint.kd for joint in joints])
@@ -180,8 +180,8 @@ def _add_position(
         strict=True,
     ):  # fmt: skip
         if ball:
-            # Its control is a rotation vector, its force range bounds a norm. At the clamp MuJoCo
-            # 3.17 drops or keeps the implicit damping of a step as the norm's last bit has it.
+            # Its control is a rotation vector, its force range bounds a norm. At the clamp, the
+            # last bit of the norm decides whether MuJoCo 3.17 keeps the implicit damping of a step.
             character.mjcf_model.actuator.add(
                 'orientation', name=name, joint=element, kp=joint.kp, kv=servo,
                 forcelimited=True, forcerange=(0, limit),
@@ -194,7 +194,8 @@ def _add_position(
     if rotations == 'angle_axis':
         if action_offset is not None or action_scale is not None:
             raise ValueError(
-                'angles and axes are those of the original: no action_offset, no action_scale'
+                "rotations='angle_axis' has the original's scaling; do not pass action_offset or "
+                'action_scale'
             )
         return _angle_axis(character)
     names = _split(character, 'xyz')
@@ -207,7 +208,7 @@ def _add_position(
         middle = np.array(action_offset)
     if action_scale is None:
         slide = np.ptp(character.joint_ranges, axis=1) / 2
-        # Joints that hardly move get the original's reach.
+        # Joints with a small range get the original's scale.
         original = ORIGINAL_SPAN * np.ptp(original_ranges(character), axis=1)
         turn = np.minimum(POSITION_SCALE, original)
         action_scale = _spread(character, np.where(character.prismatic, slide, turn))
@@ -216,8 +217,8 @@ def _add_position(
         np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
     ):
         raise ValueError(
-            f'position control of {character.spec.name!r}: action_offset and action_scale must be finite, '
-            f'positive in range, and broadcast to ({len(names)},)'
+            f'position control of {character.spec.name!r}: action_offset and action_scale must be '
+            f'finite, action_scale positive, and both broadcast to ({len(names)},)'
         )
     quantity = 'target rotation vector' if character.spherical.any() else 'target angle'
     unit = _unit(character, 'rad', 'm')
@@ -254,7 +255,7 @@ def _add_muscle(
     for unit in units:
         tendon = character.mjcf_model.tendon.add('fixed', name=unit.name)
         for arm in unit.arms:
-            # MuJoCo's moment is d length / d angle and a muscle's force is negative.
+            # In MuJoCo the moment is d length / d angle, and a muscle's force is negative.
             tendon.add('joint', joint=joints[arm.joint], coef=-hill.constant_arm(arm))
         character.mjcf_model.actuator.add(
             'general', name=unit.name, tendon=tendon, ctrllimited=True,
@@ -289,7 +290,7 @@ def character_muscles(
     sets = muscle_tables.MUSCLES.get(name)
     if sets is None:
         raise ValueError(
-            f'character {name!r} has no muscles; those who have: {", ".join(muscle_tables.MUSCLES)}'
+            f'character {name!r} has no muscles; these have: {", ".join(muscle_tables.MUSCLES)}'
         )
     if muscle_set not in sets:
         raise ValueError(errors.unknown(f'muscle set of {name!r}', muscle_set, sets))
@@ -303,18 +304,18 @@ def add(character: Character, model: str, timestep: float, **options: object) ->
       character: a character without actuators.
       model: one of `ACTUATIONS`.
       timestep: physics time step, s; joint limits are as stiff as it allows.
-      **options: for 'position', `action_offset` and `action_scale` of every degree of freedom, (D,), rad (m
-        where prismatic); by default the working posture, and 1.5 rad, half the range of a prismatic
-        joint, or for joints that hardly move twice their range. `rotations`: how actions describe
-        the rotation of a ball joint: by a rotation vector, 'vector', or by an angle and an axis,
-        'angle_axis', in the manner and range of the original. For 'muscle', `muscle_set`: 'plain',
-        or the name of a motion that the muscles were optimised for.
+      **options: for 'position', `action_offset` and `action_scale` of every degree of freedom,
+        (D,), rad (m where prismatic); by default the working posture, and 1.5 rad, half the
+        range of a prismatic joint, or twice the range of joints with a small range.
+        `rotations`: description of a ball joint's rotation in actions: 'vector', a rotation vector,
+        or 'angle_axis', an angle and an axis, scaled as in the original. For 'muscle',
+        `muscle_set`: 'plain', or the name of a motion for which the muscles were optimised.
 
     Returns:
       The map from actions to controls, in the order of the actuators.
 
     Raises:
-      ValueError: unknown model, a character without muscles, or bad options.
+      ValueError: unknown model, a character without muscles, or invalid options.
     """
     if model not in _MODELS:
         raise ValueError(errors.unknown('actuation', model, ACTUATIONS))

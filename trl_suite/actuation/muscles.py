@@ -1,13 +1,13 @@
-"""Musculotendon units of three characters, as rows of data.
+"""Musculotendon units of three characters, as data.
 
-Source: the muscle lists of the original's character files. Its muscle environments load the hand-set
-ones, `PLAIN`; those optimised for a motion are what 'Learning locomotion skills using DeepRL: does the
-choice of action space matter?' (Peng, van de Panne 2017) evaluates. Two names that the original uses
-twice (the last tail units of dog and raptor) are told apart here by the joint that they span.
+Source: the muscle lists of the original's character files. Its muscle environments load the
+hand-tuned ones, `PLAIN`; 'Learning locomotion skills using DeepRL: does the choice of action space
+matter?' (Peng, van de Panne 2017) evaluates those optimised for a motion. Two names that the
+original uses twice (the last tail units of dog and raptor) have the spanned joint added here.
 
 Muscle(name, optimal fibre length m, tendon slack length m, peak force N, pennation factor, arms);
 Arm(joint, moment arm m, rest angle rad, angle of the largest arm rad or None for a constant arm).
-The sign of an arm is the sign of the torque that the muscle's pull makes.
+The sign of an arm is the sign of the torque of the contracting muscle.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ PLAIN = 'plain'
 
 
 class Arm(NamedTuple):
-    """How a muscle spans one joint."""
+    """The moment arm of a muscle at one joint."""
 
     joint: str
     arm: float
@@ -209,9 +209,9 @@ def _legs(right: tuple[Muscle, ...]) -> tuple[Muscle, ...]:
 _BIPED_SETS = {
     PLAIN: _legs(_BIPED_LEG), 'walk': _legs(_BIPED_WALK_LEG), 'run': _legs(_BIPED_RUN_LEG),
 }  # fmt: skip
-# Of each character, PLAIN first, then the sets by the motion that they were optimised for. The
-# 12-link biped carries the same leg muscles (its arms hang passively); the goat is given the dog's,
-# whose skeleton it shares.
+# For each character PLAIN, then the sets by the motion for which they were optimised. The 12-link
+# biped has the same leg muscles (its arms are passive); the goat has those of the dog, whose
+# skeleton it shares.
 MUSCLES: dict[str, dict[str, tuple[Muscle, ...]]] = {
     'biped2d': _BIPED_SETS,
     'biped2d_full': _BIPED_SETS,

@@ -1,1 +1,1 @@
-"""The interfaces of other libraries."""
+"""Adapters to the interfaces of other libraries."""

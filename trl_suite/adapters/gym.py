@@ -6,11 +6,12 @@
     env = gymnasium.make('trl_suite/PD_Biped2D_Gaps_Terrain-v0')
     envs = gymnasium.make_vec('trl_suite/PD_Biped2D_Gaps_Terrain-v0', num_envs=64)
 
-Gymnasium 1 has no plugins: without that import the id must name the module, as in
-'trl_suite.adapters.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. What has no id is wrapped by hand, as
-`SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the environment's
-own step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward), 'fell',
-'diverged', 'distance' (m).
+Gymnasium 1 does not register third-party environments automatically: without that import the id
+must name the module, as in 'trl_suite.adapters.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. An
+environment without an id is wrapped explicitly, e.g.
+`SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the
+environment's step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward),
+'fell', 'diverged', 'distance' (m).
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ except ImportError as error:
     )
     raise ImportError(message) from None
 
-METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most
-BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; the others have none
+METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most ids
+BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; others are unbounded
 Info = dict[str, Any]
 
 
 class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
-    """A single environment; `environment` is the `trl_suite.environments.environment.Environment` underneath.
+    """A single environment; `environment` is the wrapped `Environment` of `trl_suite.environments`.
 
-    `reset(seed=s)` begins the same episode as the first reset of
-    `suite.make(id, task_kwargs={'random': s})`; a reset without a seed draws the next one.
+    `reset(seed=s)` starts the same episode as the first reset of
+    `suite.make(id, task_kwargs={'random': s})`; a reset without a seed starts the next episode.
     """
 
     metadata = METADATA
@@ -62,13 +63,13 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         """Makes the environment.
 
         Args:
-          environment: id, alias, row of the catalogue, or an environment that nothing else uses.
-          flat_observation: give one vector of all blocks side by side, else a dict of blocks.
+          environment: id, alias, `EnvSpec`, or an environment that is not used elsewhere.
+          flat_observation: return all blocks concatenated as one vector, else a dict of blocks.
           task_kwargs: as for `suite.load`.
           dtype: of observations and actions, float32 or float64.
-          max_episode_steps: truncate after as many steps, if the environment's own limit does not
-            come first. `gymnasium.make` has a wrapper of its own for it.
-          render_mode: 'rgb_array', or None for no pictures.
+          max_episode_steps: truncate after this number of steps, if the environment's own limit is
+            not smaller. `gymnasium.make` uses its own wrapper for this.
+          render_mode: 'rgb_array', or None for no rendering.
           render_kwargs: options of `trl_suite.rendering.frame`.
 
         Raises:
@@ -94,7 +95,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         self._running, self._closed = False, False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Begins an episode, seeded anew by a `seed` in [0, 2**32); there are no options."""
+        """Starts an episode, seeded if `seed`, in [0, 2**32), is given; there are no options."""
         self._check_open()
         if seed is not None:
             seed = operator.index(seed)
@@ -107,7 +108,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         return self._observation(time_step.observation), self.environment.info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
-        """Takes one action, clipped to [-1, 1]; `ResetNeeded` is raised where no episode runs."""
+        """Applies one action, clipped to [-1, 1]; raises `ResetNeeded` if no episode is running."""
         self._check_open()
         if not self._running:
             raise gymnasium.error.ResetNeeded('no episode is running; call reset first')
@@ -142,12 +143,12 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
 
 
 class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
-    """A `trl_suite.environments.vector.VectorEnvironment`: what `gymnasium.make_vec` makes by default.
+    """A vector environment, the default of `gymnasium.make_vec`; wraps a `VectorEnvironment`.
 
-    With the same seeds, simulation i returns what simulation i of a `SyncVectorEnv` of `SuiteEnv` does.
-    `reset(seed=[s0, s1, ...])` gives every simulation its own. `reset(seed=s)` seeds the whole: simulation i gets
-    the i-th number of `numpy.random.SeedSequence(s).generate_state(n)`, not s + i, so that
-    neighbouring seeds have no episodes in common.
+    With the same seeds, simulation i equals environment i of a `SyncVectorEnv` of `SuiteEnv`.
+    `reset(seed=[s0, s1, ...])` seeds every simulation. With `reset(seed=s)` simulation i gets the
+    i-th number of `numpy.random.SeedSequence(s).generate_state(n)` as its seed, not s + i, so that
+    successive seeds have no episodes in common.
     """
 
     def __init__(
@@ -161,15 +162,15 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args:
           num_envs: number of simulations.
-          num_threads: threads that step the physics; 0 takes all cores.
-          autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's own constants.
+          num_threads: threads that step the physics; 0 for all cores.
+          autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's constants.
           dtype: of observations, actions and rewards.
         """
         modes = {mode.value: mode for mode in AutoresetMode}
         mode = getattr(autoreset_mode, 'value', autoreset_mode)
         if mode not in modes:
             raise ValueError(errors.unknown('autoreset_mode', mode, modes))
-        self.autoreset_mode = modes[mode]  # as Gymnasium's own have it; TorchRL looks for it
+        self.autoreset_mode = modes[mode]  # as in Gymnasium; TorchRL reads it
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
@@ -191,7 +192,10 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
     ) -> tuple[Any, Info]:
-        """Begins episodes, seeded anew if `seed` is given, in `options['reset_mask']` or all simulations."""
+        """Starts episodes in all simulations, or in those of `options['reset_mask']`.
+
+        They are seeded if `seed` is given.
+        """
         env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
         if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
             raise ValueError(
@@ -202,11 +206,11 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         return observation, masked(self.environment.info, env_ids)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Takes one step in every simulation; arguments and errors are those of `VectorEnvironment.step`."""
+        """Steps every simulation; arguments and errors are those of `VectorEnvironment.step`."""
         observation, reward, terminated, truncated, info = self.environment.step(actions)
         result: Info = {}
         ended = info.pop('ended', np.zeros(1, bool))
-        if ended.any():  # and begun anew in the same step
+        if ended.any():  # and reset in the same step
             finals = iterate(self.observation_space, info.pop('final_observation'))
             last = (each if end else None for each, end in zip(finals, ended, strict=True))
             result = masked({'final_info': info}, ended)
@@ -229,12 +233,12 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
 
 def metadata(task: Any) -> Info:
-    """What is said of pictures; one per step plays as fast as it happened, but for cycles of gaits."""
+    """Metadata of rendering; one frame per step plays in real time, except for gait cycles."""
     return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
 
 
 def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
-    """Options whose step limit is the smaller of a simulation's and Gymnasium's (None or -1 for none)."""
+    """Options whose step limit is the smaller of the spec's and Gymnasium's (None or -1: none)."""
     options = dict(task_kwargs or {})
     if max_episode_steps is None or max_episode_steps == -1:
         return options
@@ -248,25 +252,25 @@ def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | No
 def observation_space(
     shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any, n: tuple[int, ...] = ()
 ) -> spaces.Box | spaces.Dict:
-    """Returns the space of blocks of these shapes, flat or not; of n simulations if n is given."""
+    """Returns the space of blocks of these shapes, flat or not; `n` is (num_envs,) or ()."""
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f'dtype is {np.dtype(dtype)}; expected float32 or float64')
     bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
     boxes = [(key, spaces.Box(*bounds[key], (*n, *shapes[key]), dtype)) for key in shapes]
     if not flat:
-        return spaces.Dict(boxes)  # pairs: of a dict it would sort the keys
+        return spaces.Dict(boxes)  # pairs, as Dict would sort the keys of a dict
     low = np.concatenate([box.low.reshape(*n, -1) for _, box in boxes], -1)
     high = np.concatenate([box.high.reshape(*n, -1) for _, box in boxes], -1)
     return spaces.Box(low, high, dtype=dtype)
 
 
 def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
-    """Returns the space of actions, [-1, 1] for each number."""
+    """Returns the action space, [-1, 1] in every dimension."""
     return spaces.Box(-1.0, 1.0, shape, dtype)
 
 
 def masked(info: Info, env_ids: np.ndarray) -> Info:
-    """Info as Gymnasium has it: 0 in other simulations, and beside each key '_key', the mask of simulations."""
+    """Info in Gymnasium's format: 0 in other simulations, and for each key the mask '_key'."""
     result: Info = {}
     for name, value in info.items():
         result[name] = masked(value, env_ids) if isinstance(value, dict) else value.copy()

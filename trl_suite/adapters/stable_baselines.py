@@ -1,4 +1,4 @@
-"""Stable-Baselines3's interface: its `VecEnv` over our vector environment.
+"""Stable-Baselines3's interface: a `VecEnv` that wraps a `VectorEnvironment`.
 
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecMonitor
@@ -7,7 +7,7 @@
     envs = VecMonitor(SuiteVecEnv('PD_Biped2D_Flat-v0', num_envs=64))
     PPO('MlpPolicy', envs).learn(1_000_000)
 
-Single environments need no adapter: `gymnasium.make('trl_suite/ID')` is what Stable-Baselines3 takes.
+Single environments need no adapter: Stable-Baselines3 accepts `gymnasium.make('trl_suite/ID')`.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ Indices = None | int | Iterable[int]
 
 
 class SuiteVecEnv(VecEnv):
-    """Many simulations on threads; a simulation that ends begins anew in the same step.
+    """Many simulations on threads; a simulation whose episode ends is reset in the same step.
 
     The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_terms' (a dict) and
-    'TimeLimit.truncated'; that of a simulation which ended also has 'terminal_observation'. `seed(s)` gives
-    simulation i the seed s + i at the next reset, as everywhere in Stable-Baselines3.
+    'TimeLimit.truncated'; if its episode ended, also 'terminal_observation'. After `seed(s)`,
+    simulation i has the seed s + i at the next reset, as everywhere in Stable-Baselines3.
 
     Attributes:
-      environment: the `trl_suite.environments.vector.VectorEnvironment` underneath.
+      environment: the wrapped `trl_suite.environments.vector.VectorEnvironment`.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class SuiteVecEnv(VecEnv):
         """Makes the environment; arguments that are not listed are those of `VectorEnvironment`.
 
         Args:
-          environment: id, alias, or row of the catalogue.
+          environment: id, alias, or `EnvSpec`.
           num_envs: number of simulations.
-          num_threads: threads that step the physics; 0 takes all cores.
-          seed: of the whole: simulation i gets a child seed; or a sequence of n seeds.
-          flat_observation: give one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
-          render_mode: 'rgb_array', or None for no pictures.
+          num_threads: threads that step the physics; 0 for all cores.
+          seed: one seed, from which that of each simulation is derived, or a sequence of n seeds.
+          flat_observation: return one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
+          render_mode: 'rgb_array', or None for no rendering.
           render_kwargs: options of `trl_suite.rendering.frame`.
 
         Raises:
@@ -77,7 +77,7 @@ class SuiteVecEnv(VecEnv):
         )
 
     def reset(self) -> Any:
-        """Begins an episode in every simulation; options of `set_options` have no meaning here."""
+        """Starts an episode in every simulation; options of `set_options` are ignored."""
         seeds = None if None in self._seeds else [int(seed) % 2**32 for seed in self._seeds]  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()
@@ -86,11 +86,11 @@ class SuiteVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Takes the actions, (n, k) in [-1, 1], clipped there, of the step that `step_wait` makes."""
+        """Stores the actions, (n, k), clipped to [-1, 1], for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Makes the step; errors are those of `VectorEnvironment.step`."""
+        """Performs the step; errors are those of `VectorEnvironment.step`."""
         observation, reward, terminated, truncated, info = self.environment.step(self._actions)
         ended, final = info.pop('ended'), info.pop('final_observation', None)
         infos = rows_of({**info, 'TimeLimit.truncated': truncated})
@@ -115,7 +115,7 @@ class SuiteVecEnv(VecEnv):
         ]
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns an attribute of this object or of `environment`, once for each simulation asked for."""
+        """Returns an attribute of this object or of `environment`, once for each index."""
         owner = self if attr_name in ('render_mode', 'observation_space', 'action_space') else None
         value = getattr(owner or self.environment, attr_name)
         return [value for _ in self._get_indices(indices)]
@@ -133,12 +133,12 @@ class SuiteVecEnv(VecEnv):
         )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
-        """No simulation has a Gymnasium wrapper."""
+        """Returns False for every simulation: none has a Gymnasium wrapper."""
         return [False for _ in self._get_indices(indices)]
 
 
 def rows_of(info: dict[str, Any]) -> list[dict[str, Any]]:
-    """Turns a dict of arrays of n simulations into n dicts of plain values."""
+    """Converts a dict of arrays of n simulations to n dicts of Python values."""
     columns = (
         rows_of(value) if isinstance(value, dict) else value.tolist() for value in info.values()
     )

@@ -2,7 +2,7 @@
 
 A profile is cut into pieces: level runs become one box each, sloped stretches become tilted boxes
 as long as the profile stays within a tolerance of them. Cuts depend on absolute vertex numbers
-only, so the surface under a character does not change when the window of boxes moves on.
+only, so the surface under a character does not change when the window of boxes moves.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from trl_suite.util.compiled import compiled, compiled_inline
 
 PIECE = 4  # cells of the shortest tilted piece: 0.1 m
 DOUBLINGS = 3  # tilted pieces grow to at most PIECE * 2**DOUBLINGS cells: 0.8 m
-TOLERANCE = 0.004  # m; how far the profile may stray from a piece that is doubled
-LEVEL_THICKNESS = 4.0  # m; level boxes face the sides of the deepest gaps (2.5 m)
+TOLERANCE = 0.004  # m; largest deviation of the profile from a piece that is doubled
+LEVEL_THICKNESS = 4.0  # m; level boxes form the sides of the deepest gaps (2.5 m)
 TILTED_THICKNESS = 1.0  # m
-OVERLAP = 0.05  # m; how far tilted pieces run on below each other at valleys
-LEAN = 0.9  # of the way to the next face; how far the lower end of a tilted box may lean out
+OVERLAP = 0.05  # m; by which tilted pieces are extended below each other at valleys
+LEAN = 0.9  # of the distance to the next face; limit of the overhang of a tilted box's lower end
 HALF_WIDTH = 1.0  # m; the strip is 2 m wide
 EPSILON = 1e-9
 
@@ -35,12 +35,12 @@ class Boxes(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """What a profile of m vertices is cut into; `number` of them, in order of x.
+    """The pieces of a profile of m vertices, in order of x; the first `number` entries are used.
 
     Attributes:
-      number: how many there are.
+      number: number of pieces.
       level: whether all of them are level.
-      ends: numbers of the first and the last vertex of each, (2, m).
+      ends: indices of the first and the last vertex of each, (2, m).
       edges: x and z of the left and of the right edge of upper faces, m, then their slopes, (5, m).
     """
 
@@ -56,13 +56,13 @@ def from_profile(
     """Cuts a window of a profile into boxes.
 
     Args:
-      start: number of the first vertex; vertex i stands at x = i * SPACING.
+      start: number of the first vertex; vertex i is at x = i * SPACING.
       heights: heights of the vertices, m, shape (m,).
       vertical: True where the cell before a vertex is a vertical face, shape (m,).
       tolerance: largest deviation of the profile from a tilted box longer than 0.1 m, m.
 
     Returns:
-      Boxes whose upper faces follow the profile; their sides stand in the middle of the vertical
+      Boxes whose upper faces follow the profile; their sides are in the middle of the vertical
       cells.
     """
     pieces = cut(start, heights, vertical, tolerance)
@@ -83,9 +83,9 @@ def cut(
 
 
 def angles(pieces: Pieces) -> np.ndarray:
-    """Returns by how much upper faces of pieces are tilted, (number,) rad."""
+    """Returns the tilt angles of the upper faces of pieces, (number,) rad."""
     slope = pieces.edges[4, : pieces.number]
-    # NumPy's own: the compiled one may differ in the last bit.
+    # By NumPy: the compiled function may differ in the last bit.
     return slope if pieces.level else np.arctan(slope)
 
 
@@ -107,7 +107,7 @@ def _is_level(cell: int, heights: np.ndarray, vertical: np.ndarray) -> bool:
 def _mark(
     start: int, heights: np.ndarray, vertical: np.ndarray, tolerance: float, marks: np.ndarray
 ) -> None:
-    """Marks the vertices where a piece ends and the next begins: the first of the marks, (3, m)."""
+    """Marks the vertices between pieces in marks[0]; other rows of marks, (3, m), are scratch."""
     cuts, mandatory, whole = marks[0], marks[1], marks[2]
     count, any_sloped = len(heights), False
     for i in range(count):
@@ -117,7 +117,7 @@ def _mark(
         any_sloped |= i > 0 and not (left or before)
     if not any_sloped:
         return
-    # The cell beside a vertical face is split off: a level post with an exactly vertical side.
+    # The cell next to a vertical face becomes a separate piece: a level post with a vertical side.
     for i in range(1, count):
         if not (_is_level(i, heights, vertical) or vertical[i]):
             cuts[i] |= _is_face(i - 1, vertical)
@@ -128,7 +128,7 @@ def _mark(
     for i in range(offset, count, PIECE):
         level = _is_level(i, heights, vertical) and _is_level(i + 1, heights, vertical)
         cuts[i] |= not level
-    # Of the spans of one length: whether nothing is cut inside.
+    # For each span of the current length, whether it contains no cut.
     for k in range((count - 1 - offset) // PIECE):
         whole[k] = True
         for i in range(offset + k * PIECE + 1, offset + (k + 1) * PIECE):
@@ -138,8 +138,8 @@ def _mark(
         first_half, offset = offset, -start % span
         skipped = (offset - first_half) // half
         for k in range((count - 1 - offset) // span):
-            # A span may be one piece if its halves are, nothing must be cut between them, and the
-            # profile stays close to the chord.
+            # A span may be one piece if both halves are pieces, no cut between them is mandatory,
+            # and the profile stays close to the chord.
             first = offset + k * span
             middle = first + half
             whole[k] = whole[skipped + 2 * k] and whole[skipped + 2 * k + 1]
@@ -150,7 +150,7 @@ def _mark(
 
 @compiled_inline
 def _stray(first: int, span: int, heights: np.ndarray) -> float:
-    """How far a profile strays from the chord of a span, m."""
+    """Largest deviation of a profile from the chord of a span, m."""
     most, rise = 0.0, heights[first + span] - heights[first]
     for k in range(span):
         most = max(most, abs(heights[first + k] - (heights[first] + rise * (k / span))))
@@ -166,7 +166,7 @@ def _join(
     ends: np.ndarray,
     edges: np.ndarray,
 ) -> tuple[int, bool]:
-    """Finds the pieces between the marks; returns how many there are, and whether all are level."""
+    """Finds the pieces between the marks; returns their number, and whether all are level."""
     count, begin, steepest = 0, 0, 0.0
     for end in range(1, len(heights)):
         if not marks[0, end]:
@@ -174,8 +174,8 @@ def _join(
         a, b = begin, end
         begin = end
         if b - a == 1 and _is_face(b, vertical):
-            # A vertical cell is no piece, but its left vertex is one if the cell before is vertical
-            # too.
+            # A vertical cell is not a piece, but its left vertex is one if the previous cell is
+            # also vertical.
             if not _is_face(a, vertical):
                 continue
             b = a
@@ -208,19 +208,19 @@ def pose(
     angle: np.ndarray,
     boxes: Boxes,
 ) -> None:
-    """Writes the boxes of pieces over the first of some boxes; their edges are changed.
+    """Writes the boxes of pieces to the first `count` boxes; changes `edges`.
 
     Args:
       count: number of pieces.
       level, ends, edges: of the pieces.
       vertical: of the profile.
       angle: of the pieces, see `angles`.
-      boxes: `count` of them or more.
+      boxes: at least `count` boxes.
     """
     if not level:
         _run_on(count, vertical, ends, edges)
     right_face = math.inf
-    for k in range(count - 1, -1, -1):  # room to the right, kept in the half size for now
+    for k in range(count - 1, -1, -1):  # distance to the face on the right, in half_size
         if _is_face(ends[1, k] + 1, vertical):
             right_face = min(right_face, edges[2, k])
         boxes.half_size[k, 2] = right_face - edges[2, k]
@@ -239,8 +239,8 @@ def pose(
         slope, sine, cosine = edges[4, k], math.sin(angle[k]), math.cos(angle[k])
         thickness = LEVEL_THICKNESS
         if abs(slope) > EPSILON:
-            # The lower end of a tilted box leans out: to the right where the ground rises, else to
-            # the left. It must not come out of the next face on that side.
+            # The lower end of a tilted box overhangs: to the right where the ground rises, else to
+            # the left. It must not protrude from the next face on that side.
             room = boxes.half_size[k, 2] if slope > 0 else x0 - left_face
             thickness = min(TILTED_THICKNESS, LEAN * room / max(abs(sine), EPSILON))
         boxes.position[k, 0] = 0.5 * (x0 + x1) + 0.5 * thickness * sine
@@ -253,8 +253,8 @@ def pose(
 
 @compiled
 def _run_on(count: int, vertical: np.ndarray, ends: np.ndarray, edges: np.ndarray) -> None:
-    """Has pieces run on below each other at valleys, so that a sliding foot meets no end face."""
-    length = edges[2, 0] - edges[0, 0]  # of a piece as it was cut
+    """Extends pieces below each other at valleys, so that a sliding foot hits no end face."""
+    length = edges[2, 0] - edges[0, 0]  # of the current piece, before it is extended
     for k in range(count - 1):
         following = edges[2, k + 1] - edges[0, k + 1]
         joined = ends[1, k] == ends[0, k + 1] and not _is_face(ends[1, k] + 1, vertical)

@@ -1,4 +1,4 @@
-"""An arena whose planar terrain is drawn anew every episode and never ends."""
+"""An arena with unbounded planar terrain, which is generated in every episode."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from trl_suite.terrain.planar import windows as planar_ground
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
-BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
-ADVANCE = 6.0  # m; travel after which the window is laid anew
-PROBES = 6  # draws by which the pool of boxes is sized
-LINE_PROBES = 10  # windows to each side, 240 m, by which it is where ground is a function of x
-SPARE = 1.3  # times the most boxes of any probe
-COARSEST = 0.1  # m; tolerance up to which pieces are merged if the pool should not suffice
+BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes around its centre
+ADVANCE = 6.0  # m; window centres are multiples of it
+PROBES = 6  # random windows from which the size of the pool of boxes is estimated
+LINE_PROBES = 10  # windows to each side, 240 m, for that estimate if ground is a function of x
+SPARE = 1.3  # factor on the largest number of boxes in these windows
+COARSEST = 0.1  # m; largest tolerance for merging pieces if the pool is too small
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
 _WINDOW = _BEHIND + _AHEAD + 1  # vertices
 _CELLS_PER_METRE = 1 / SPACING
-_REACH = 0.5 * ADVANCE + SPACING  # m; from the centre of a window to where it is laid anew
+_REACH = 0.5 * ADVANCE + SPACING  # m; distance from the centre beyond which a window is moved
 
 
 class Pool(NamedTuple):
-    """The boxes of one simulation, and what the engine knows of them."""
+    """The boxes of one simulation, and their data in the engine."""
 
     boxes: Boxes
     geoms: bounds.Geoms
 
 
 class PlanarArena(composer.Arena):
-    """Planar terrain realised by a pool of static boxes that are posed anew, never recompiled.
+    """Planar terrain as a pool of static boxes, which are moved and resized without recompiling.
 
-    After compiling, `bind` ties the arena to a world of n simulations. Each has its own strip;
-    height and slope queries answer from the strips' arrays, never from the collision geometry.
+    After compiling, `bind` connects the arena to a world of n simulations. Each has its own
+    `PlanarGround`; height and slope queries use its arrays, not the collision geometry.
     """
 
     def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
@@ -52,10 +52,10 @@ class PlanarArena(composer.Arena):
         stage.prepare(root)
         _paint(root)
         self.boxes = [
-            # In the world's own body: of any other body all geoms are gone through in every substep.
+            # In the world body: the engine tests all geoms of any other body in every substep.
             root.worldbody.add(
                 'geom', name=f'terrain_{i}', type='box', size=(0.1, boxes.HALF_WIDTH, 0.1),
-                # Laid out along x, so that the bounding volumes made by the compiler fit.
+                # Spread along x, so that the compiler's bounding volumes are useful.
                 pos=(0.1 * i, 0, PARKED), friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
                 condim=3, material='ground',
             )
@@ -64,13 +64,13 @@ class PlanarArena(composer.Arena):
 
     @property
     def ground_body(self) -> str:
-        """Name of the body that carries the ground, for contact sensors."""
+        """Name of the body that contains the ground, for contact sensors."""
         return 'world'
 
     def bind(self, world: World) -> None:
-        """Resolves the arena's geoms in a world and makes room for its n strips."""
+        """Resolves the arena's geoms in a world and allocates the windows of its n grounds."""
         self._world = world
-        # Geoms of one body are neighbours in the model.
+        # Geoms of one body are adjacent in the model.
         first = int(world.geom_ids([self.boxes[0].full_identifier])[0])
         pool = slice(first, first + len(self.boxes))
         self._pools = [
@@ -93,10 +93,10 @@ class PlanarArena(composer.Arena):
         self._lay(env_id, 0)
 
     def follow(self, x: np.ndarray, env_ids: np.ndarray | None = None) -> None:
-        """Keeps ground under and ahead of characters.
+        """Moves windows where necessary, so that there is ground under and ahead of characters.
 
         Args:
-          x: where their roots are, m, (n, 1), or of the given simulations only, (m, 1).
+          x: positions of their roots, m, (n, 1), or of the given simulations only, (m, 1).
           env_ids: sorted numbers of simulations; None for all.
         """
         env_ids = self._numbers if env_ids is None else env_ids
@@ -105,27 +105,27 @@ class PlanarArena(composer.Arena):
             self.follow_all(env_ids[far], x[far, 0])
 
     def follow_all(self, env_ids: np.ndarray, x: np.ndarray) -> None:
-        """Lays the windows of some simulations anew, whose roots are at x, m, (m,)."""
+        """Moves the windows of some simulations, whose roots are at x, m, (m,)."""
         for env_id, root in zip(env_ids.tolist(), x.tolist(), strict=True):
-            # The window starts at multiples of the advance, however far a character has jumped.
+            # Window centres are multiples of ADVANCE, however far a character has moved.
             self._lay(env_id, round(root / ADVANCE) * _ADVANCE)
-        # Contacts of the open step name boxes that now lie elsewhere.
+        # Existing contacts refer to boxes that have moved.
         self._world.forward(env_ids)
 
     def height(self, x: np.ndarray, env_ids: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """Heights of the ground in m at x (simulations, k) m, exact between the strip's vertices.
+        """Heights of the ground in m at x (simulations, k) m, linear between the vertices.
 
-        `follow` keeps characters inside their windows; of what lies beyond see `look_far`.
+        `follow` keeps characters inside their windows; for points beyond these see `look_far`.
         """
         return self._ask(_heights, x, env_ids)
 
     def look_far(self, x: np.ndarray, heights: np.ndarray) -> None:
-        """Puts right what `height` gave where simulations ask beyond their boxes.
+        """Corrects results of `height` for simulations with points beyond their windows.
 
         Args:
-          x: as given to `height` for all simulations, m, (n, k).
-          heights: what it returned, (n, k). True up to the length of a window beyond the boxes;
-            further away is only who has broken down.
+          x: the argument of `height` for all simulations, m, (n, k).
+          heights: its result, (n, k); corrected in place. Exact up to one window length beyond the
+            window; only diverged simulations have points farther away.
         """
         u = x * _CELLS_PER_METRE
         u -= self.ground.start[:, None]
@@ -137,7 +137,7 @@ class PlanarArena(composer.Arena):
         heights[far] = self._ask(_far_heights, x[far], far)
 
     def widen(self, env_id: int) -> None:
-        """Draws ground up to the length of a window beyond the window of one simulation."""
+        """Fills the wide window of one simulation: one window length more to each side."""
         strip, ground = self.grounds[env_id], self.ground
         if strip is None or ground.is_wide[env_id]:
             return
@@ -152,7 +152,7 @@ class PlanarArena(composer.Arena):
     def _ask(
         self, query: Callable[..., None], x: np.ndarray, env_ids: slice | np.ndarray
     ) -> np.ndarray:
-        """Asks a compiled loop about points (simulations, k)."""
+        """Calls a compiled loop over points (simulations, k)."""
         env_ids, x = self._numbers[env_ids], np.ascontiguousarray(x, float)
         if x.ndim != 2 or len(x) != len(env_ids):
             raise ValueError(f'x has shape {x.shape}; expected ({len(env_ids)}, k)')
@@ -161,7 +161,7 @@ class PlanarArena(composer.Arena):
         return found
 
     def state(self, env_id: int) -> dict[str, Any]:
-        """What is needed to restore the ground of one simulation exactly."""
+        """Returns the state from which `restore` restores the ground of one simulation exactly."""
         strip = self.grounds[env_id]
         if strip is None:
             return {'strip': None}
@@ -174,22 +174,22 @@ class PlanarArena(composer.Arena):
             self._lay(env_id, state['centre'])
 
     def _lay(self, env_id: int, centre: int) -> None:
-        """Realises the strip around a vertex as boxes."""
+        """Fills a window around vertex number `centre`, and poses its boxes."""
         strip = self.grounds[env_id]
         assert strip is not None
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
         if is_laid(env_id, centre, heights, vertical, self._ground):
-            return  # as on flat ground: the boxes lie already
+            return  # the window has equal vertices, as on flat ground: boxes need not move
         tolerance = boxes.TOLERANCE
         pieces = boxes.cut(start, heights, vertical, tolerance)
-        while pieces.number > len(self.boxes):  # coarser, rather than with holes
+        while pieces.number > len(self.boxes):  # rather coarser than with holes
             tolerance *= 2
             if tolerance > COARSEST:
                 raise ValueError(
                     f'terrain {self.terrain.name!r} needs {pieces.number} boxes for '
-                    f'{BEHIND + AHEAD:g} m, where {PROBES} draws led to expect no more than '
-                    f'{len(self.boxes)}: its features must be spread more evenly'
+                    f'{BEHIND + AHEAD:g} m; expected at most {len(self.boxes)}, by {PROBES} random '
+                    'windows: its features must be spread more evenly'
                 )
             pieces = boxes.cut(start, heights, vertical, tolerance)
         lay(
@@ -202,7 +202,7 @@ class PlanarArena(composer.Arena):
 def is_laid(
     i: int, centre: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarWindows
 ) -> bool:
-    """Moves the window of a simulation; returns whether it holds these vertices already."""
+    """Moves the centre of a window; returns whether it contains these vertices already."""
     ground.centre[i] = centre * SPACING
     ground.is_wide[i] = False
     if ground.start[i] != centre - _BEHIND:
@@ -227,7 +227,7 @@ def lay(
     ground: PlanarWindows,
     pool: Pool,
 ) -> None:
-    """Puts vertices into the window of a simulation, and poses the boxes of their pieces."""
+    """Writes vertices to the window of a simulation, and poses the boxes of their pieces."""
     ground.start[i] = centre - _BEHIND
     for k in range(len(heights)):
         ground.heights[i, k], ground.vertical[i, k] = heights[k], vertical[k]
@@ -235,7 +235,7 @@ def lay(
             ground.rises[i, k - 1] = heights[k] - heights[k - 1]
     boxes.pose(count, level, vertical, ends, edges, angle, pool.boxes)
     position, half_size = pool.boxes.position, pool.boxes.half_size
-    for k in range(count, len(position)):  # those that are not needed
+    for k in range(count, len(position)):  # unused boxes
         position[k, 0], position[k, 1], position[k, 2] = (centre + _AHEAD) * SPACING, 0.0, PARKED
         half_size[k, 0] = half_size[k, 1] = half_size[k, 2] = 0.1
     bounds.refresh(0, pool.geoms)
@@ -265,10 +265,10 @@ def _slopes(env_ids: np.ndarray, x: np.ndarray, ground: PlanarWindows, out: np.n
 
 
 def _pool_size(terrain: Terrain) -> int:
-    """How many boxes a window of a terrain may take, from a few fixed draws."""
+    """Estimates the number of boxes that a window of a terrain needs, from a few fixed seeds."""
     generator, windows = GENERATORS.get(terrain.type), range(PROBES)
     if generator is not None and generator.line is not None:
-        windows = range(-LINE_PROBES, LINE_PROBES)  # it is always the same, and nowhere alike
+        windows = range(-LINE_PROBES, LINE_PROBES)  # every episode is the same; places differ
     most = 0
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for k in windows:
@@ -280,9 +280,9 @@ def _pool_size(terrain: Terrain) -> int:
 
 
 def _paint(root: mjcf.RootElement) -> None:
-    """What the ground looks like."""
-    # The checker spans the width of the strip once and its edge has the colour of the sides: where
-    # tilted boxes overlap, their sides look like one.
+    """Adds the texture and the material of the ground."""
+    # The checker spans the width of the ground once, and its edge has the colour of the sides, so
+    # that sides of overlapping tilted boxes cannot be told apart.
     root.asset.add(
         'texture', name='ground', type='2d', builtin='checker', mark='edge', width=256, height=256,
         rgb1=(0.47, 0.52, 0.44), rgb2=(0.42, 0.47, 0.40), markrgb=(0.36, 0.38, 0.33),

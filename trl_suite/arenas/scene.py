@@ -1,4 +1,4 @@
-"""What all arenas have in common: solver options, contact of the ground, sky and light."""
+"""Common settings of all arenas: solver options, contacts of the ground, sky and light."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dm_control import mjcf
 FRICTION = (0.81, 0.005, 0.0001)  # 0.9 * 0.9: the original multiplies, MuJoCo takes the larger
 SOLREF = (0.005, 1)
 SOLIMP = (0.95, 0.99, 0.001)
-PARKED = -60.0  # m; depth at which unused boxes lie
+PARKED = -60.0  # m; z of unused boxes
 
 
 def prepare(root: mjcf.RootElement) -> None:
-    """Sets the options of the physics and decorates the stage."""
-    # composer's arena brings an elliptic cone and noslip iterations; neither is wanted.
+    """Sets the options of the physics, and adds sky and light."""
+    # composer's arena sets an elliptic cone and noslip iterations; neither is wanted.
     root.option.cone = 'pyramidal'
     root.option.noslip_iterations = 0
     root.option.integrator = 'implicitfast'
@@ -23,13 +23,16 @@ def prepare(root: mjcf.RootElement) -> None:
 
 
 def _decorate(root: mjcf.RootElement) -> None:
-    """Sky and ground (the sun follows each character), cheap enough that one model serves pictures and physics."""
+    """Adds sky and light (the sun follows each character).
+
+    They cost so little that one model is used for both physics and rendering.
+    """
     root.visual.quality.shadowsize = 2048
     root.visual.quality.offsamples = 0
     getattr(root.visual, 'global').offwidth = 1920
     getattr(root.visual, 'global').offheight = 1080
-    root.statistic.extent = 3  # m; of what is looked at, not of the ground: shadows stay sharp
-    # In extents. Ground farther off than shadows reach is speckled; the horizon is drawn to.
+    root.statistic.extent = 3  # m; of the character, not of the ground, so that shadows are sharp
+    # In units of the extent. Ground beyond the range of shadows is speckled; zfar is the horizon.
     root.visual.map.shadowclip = 8
     root.visual.map.znear, root.visual.map.zfar = 0.01, 400
     root.visual.headlight.set_attributes(

@@ -1,4 +1,4 @@
-"""An arena whose three-dimensional terrain is drawn anew every episode and never ends."""
+"""An arena with unbounded three-dimensional terrain, which is generated in every episode."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from trl_suite.terrain.spatial.surroundings import ALL, Rows
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
-ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
-BASE = 1.0  # m; of height fields, below their lowest point
-FOOT = 0.5  # m; how deep boxes are let into a plane
+ELEVATION = 40.0  # m; largest difference of heights of a grid within a window
+BASE = 1.0  # m; thickness of height fields below their lowest point
+FOOT = 0.5  # m; depth to which boxes extend below a plane
 THICKNESS = 2.0  # m; of boxes without a plane under them
-DRIVE = 1e6  # kg; inertia of moving boxes along their way: nothing that they meet stops them
+DRIVE = 1e6  # kg; inertia of moving boxes along their path, so large that no contact stops them
 SIZE = 0.1  # m; half sides of unused boxes
 SHADES = np.array(
     [[1, 1, 1, 1], [0.74, 0.74, 0.74, 1]], np.float32
-)  # of boxes, by turns of 0.5 m along x
+)  # of boxes, alternating every 0.5 m along x
 
 
 class SpatialArena(composer.Arena):
-    """Three-dimensional terrain realised by geoms that are posed anew, never recompiled.
+    """Three-dimensional terrain as geoms, which are moved and resized without recompiling.
 
-    A plane, a height field of 32 m x 32 m, pools of static boxes and of belts, and boxes that slide
-    along straight ways: those of them that the terrain calls for. After compiling, `bind` ties the
-    arena to a world of n simulations, each with a ground of its own. Queries answer from the
-    `Surroundings`, never from the collision geometry.
+    The geoms are a plane, a height field of 32 m x 32 m, pools of static boxes and of belts, and
+    boxes that slide along straight paths, as far as the terrain needs them. After compiling, `bind`
+    connects the arena to a world of n simulations, each with its own ground. Queries use the
+    `Surroundings`, not the collision geometry.
 
-    Moving boxes are on sliding joints with a huge inertia, so that they move in every substep and push
-    and carry with the velocity they have. They are children of the body that has plane and height
-    field. Static boxes are the world's own: collision detection goes through all geoms of any other
-    body in every substep, and through most of them where a plane without end is among them.
+    Moving boxes have slide joints with a huge inertia, so that they move in every substep, and push
+    and carry with their actual velocity. They are children of the body with the plane and the
+    height field. Static boxes belong to the world body: collision detection tests all geoms of any
+    other body in every substep, or most of them if that body also has an infinite plane.
     """
 
     def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
@@ -52,7 +52,7 @@ class SpatialArena(composer.Arena):
         root = self._mjcf_root
         stage.prepare(root)
         _paint(root)
-        # The ground may be hit but hits nothing itself: moving boxes pass through it and each other.
+        # Parts of the ground do not collide with each other: moving boxes pass through them.
         common = {
             'friction': FRICTION, 'solref': SOLREF, 'solimp': SOLIMP, 'condim': 3, 'contype': 1,
             'conaffinity': 0,
@@ -69,12 +69,12 @@ class SpatialArena(composer.Arena):
                 size=(HALF, HALF, ELEVATION, BASE),
             )  # fmt: skip
             self.field = ground.add(
-                # Turned by a right angle, so that cells are cut into triangles from the back left to
-                # the front right, as in the queries; a row then runs along y, the first one ahead.
+                # Rotated by 90 degrees, so that cells are split into triangles from back left to
+                # front right, as in queries; a row of data is then along y, the first one ahead.
                 'geom', name='field', type='hfield', hfield='field', material='ground',
                 quat=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)), **common,
             )  # fmt: skip
-        # Laid out along x, so that the bounding volumes made by the compiler fit.
+        # Spread along x, so that the compiler's bounding volumes are useful.
         self.boxes = [
             root.worldbody.add(
                 'geom', name=f'box_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 0, PARKED),
@@ -84,7 +84,7 @@ class SpatialArena(composer.Arena):
         ]  # fmt: skip
         self.belts = [
             root.worldbody.add(
-                # Unless one belt runs when it is compiled, none ever will.
+                # The compiler enables surface velocities only if one is not 0.
                 'geom', name=f'belt_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 1, PARKED),
                 surfacevel=(1, 0, 0, 0, 0, 0), material='belt', **common,
             )
@@ -106,18 +106,18 @@ class SpatialArena(composer.Arena):
 
     @property
     def touched(self) -> tuple[dict[str, str], ...]:
-        """Attributes of the contact sensors that notice the ground: one of these sensors, or more."""
+        """Attributes of contact sensors for the ground: one or more sensors are necessary."""
         static = ({'body2': 'world'},) if self.boxes or self.belts else ()
         return ({'subtree2': 'terrain'}, *static)
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        self._physics = physics  # to show new height fields to whoever draws
+        self._physics = physics  # for updates of height fields in its rendering contexts
 
     def bind(self, world: World) -> None:
-        """Resolves the arena's geoms in a world and makes room for its n grounds."""
+        """Resolves the arena's geoms in a world and allocates the windows of its n grounds."""
         self._world = world
         self.surroundings = Surroundings(world.n, self.capacity)
-        # Geoms of one body are neighbours in the model.
+        # Geoms of one body are adjacent in the model.
         self._pool = _range(world, self.boxes)
         self._belts = _range(world, self.belts)
         self._plane, self._field = (
@@ -131,7 +131,7 @@ class SpatialArena(composer.Arena):
         ground.mover_qpos[:], ground.mover_dof[:] = self._qpos, self._dof
         self._begin = ground.mover_begin
         self._joints = world.models[0].body_jntadr[self._bodies]
-        # The solver's tolerance is relative to the mean inertia, that of the drives left out.
+        # The solver's tolerance is relative to the mean inertia, here without that of moving boxes.
         own = np.ones(world.models[0].nv, bool)
         own[self._dof] = False
         self._own = np.flatnonzero(own)
@@ -154,9 +154,9 @@ class SpatialArena(composer.Arena):
         """Replaces the ground of one simulation; the caller forwards the world afterwards.
 
         Args:
-          env_id: which simulation; it may be reset before or after.
+          env_id: number of the simulation, which may be reset before or after this call.
           ground: the new ground.
-          xy: where its character is put, m.
+          xy: start position of its character, m.
         """
         self.surroundings.begin(env_id, ground, xy)
         self._begin[env_id] = self.surroundings.way[env_id]
@@ -165,10 +165,12 @@ class SpatialArena(composer.Arena):
         self._realise(env_id)
 
     def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> None:
-        """Keeps ground around characters and boxes moving; called before every control step.
+        """Moves windows with their characters, and keeps boxes moving.
+
+        Called before every control step.
 
         Args:
-          xy: where their roots are, m, (n, 2), or of the given simulations only, (m, 2).
+          xy: positions of their roots, m, (n, 2), or of the given simulations only, (m, 2).
           env_ids: sorted numbers of simulations; None for all.
         """
         changed = self.surroundings.follow(xy, env_ids)
@@ -182,7 +184,7 @@ class SpatialArena(composer.Arena):
                 self.surroundings.arrays, sped,
             )  # fmt: skip
             changed = sorted({*changed, *env_ids[sped].tolist()})
-        if changed:  # contacts of the open step name boxes that now lie elsewhere
+        if changed:  # existing contacts refer to boxes that have moved
             self._world.forward(np.array(changed))
 
     def height(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
@@ -191,7 +193,7 @@ class SpatialArena(composer.Arena):
         return self.surroundings.height(x, y, env_ids)
 
     def surface_velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
-        """Horizontal velocities of the surface in m/s at points (simulations, k) m, (simulations, k, 2)."""
+        """Horizontal surface velocities at points (simulations, k) m, (simulations, k, 2) m/s."""
         self._look(env_ids)
         return self.surroundings.velocity(x, y, env_ids)
 
@@ -225,7 +227,7 @@ class SpatialArena(composer.Arena):
         rule: str = 'far',
         distance: float = 1.0,
     ) -> np.ndarray:
-        """Draws a goal for one simulation, clear of boxes as they now stand; see `SpatialGround.goal`."""
+        """Draws a goal for one simulation, clear of boxes at present; see `SpatialGround.goal`."""
         self._look(env_id)
         ground = self.grounds[env_id]
         assert ground is not None
@@ -237,7 +239,7 @@ class SpatialArena(composer.Arena):
         return ground.goal(random, root, rule, distance=distance, movers=movers)
 
     def state(self, env_id: int) -> dict[str, Any]:
-        """What is needed to restore the ground of one simulation exactly."""
+        """Returns the state from which `restore` restores the ground of one simulation exactly."""
         self._look(env_id)
         return {**self.surroundings.state(env_id), 'begin': self._begin[env_id].copy()}
 
@@ -251,13 +253,13 @@ class SpatialArena(composer.Arena):
             self._realise(env_id)
 
     def _look(self, env_ids: Rows | int) -> None:
-        """Sees where the physics has taken moving boxes of some simulations."""
+        """Reads the positions of moving boxes of some simulations from the physics."""
         if len(self._qpos):
             moved = self._world.qpos[env_ids][..., self._qpos]
             self.surroundings.way[env_ids] = self._begin[env_ids] + moved
 
     def _realise(self, env_id: int) -> None:
-        """Poses geoms as the window says."""
+        """Poses the geoms of a simulation as in its window."""
         model, around = self._world.models[env_id], self.surroundings
         ground, (x, y) = around.grounds[env_id], around.centre[env_id]
         assert ground is not None
@@ -268,7 +270,7 @@ class SpatialArena(composer.Arena):
             if not (around.windowed or len(self._bodies)) and np.array_equal(
                 model.geom_pos[self._plane], place
             ):
-                return  # nothing but a plane, which lies there already
+                return  # only a plane, which is in place already
             model.geom_pos[self._plane] = place
         if self._field >= 0:
             heights = around.grid(env_id)
@@ -276,7 +278,7 @@ class SpatialArena(composer.Arena):
             if not highest - lowest <= ELEVATION:
                 raise ValueError(
                     f'terrain {self.terrain.name!r} rises from {lowest:g} to {highest:g} m within '
-                    f'{2 * HALF:g} m; a height grid may rise by {ELEVATION:g} m'
+                    f'{2 * HALF:g} m; expected a difference of at most {ELEVATION:g} m'
                 )
             floor = min(floor, lowest)
             model.geom_pos[self._field] = x, y, lowest
@@ -304,7 +306,7 @@ class SpatialArena(composer.Arena):
             self._show(model)
 
     def _place(self, env_id: int) -> None:
-        """Puts moving boxes where their ways begin for the physics."""
+        """Sets the places of moving boxes at joint position 0, their axes, sizes and speeds."""
         if not len(self._bodies):
             return
         model, around, ground = self._world.models[env_id], self.surroundings, self.grounds[env_id]
@@ -327,7 +329,7 @@ class SpatialArena(composer.Arena):
             model.stat.meaninertia = model.dof_M0[self._own].mean()
 
     def _show(self, model: mujoco.MjModel) -> None:
-        """Gives a new height field to the pictures of a physics that has drawn before."""
+        """Uploads a new height field to the rendering contexts of the physics, if there are any."""
         try:
             contexts = self._physics and self._physics._contexts
             if not contexts or self._physics.model.ptr is not model:
@@ -355,8 +357,8 @@ def _range(world: World, geoms: list[mjcf.Element]) -> slice:
 
 
 def _pose(model: mujoco.MjModel, first: int, boxes: Boxes, level: float | None) -> None:
-    """Gives geoms the upper faces of boxes, and sides that reach below them."""
-    # NumPy's own: the compiled one may differ in the last bit.
+    """Poses geoms so that their upper faces are those of boxes."""
+    # By NumPy: the compiled function may differ in the last bit.
     angle = np.arctan(boxes.slope) if boxes.slope.any() else boxes.slope
     _write_boxes(
         *boxes[:4], angle, np.nan if level is None else level, first, SHADES, model.geom_pos,
@@ -379,21 +381,21 @@ def _write_boxes(
     geom_quat: np.ndarray,
     geom_rgba: np.ndarray,
 ) -> None:
-    """Poses geoms from the first on; the level is NaN if there is none."""
+    """Poses geoms from index `first` on; the level is NaN if there is none."""
     for k in range(len(top)):
         geom, half_yaw, half_angle = first + k, 0.5 * yaw[k], 0.5 * angle[k]
         cosine, sine = math.cos(angle[k]), math.sin(angle[k])
         thickness = THICKNESS
         if not math.isnan(level):
             thickness = max((top[k] - level + FOOT) / cosine, FOOT)
-        # A tilted box lies below its upper face along the normal of it.
+        # The centre of a tilted box is below its upper face, along the normal of that face.
         aside = 0.5 * thickness * sine
         geom_pos[geom, 0] = middle[k, 0] + aside * math.cos(yaw[k])
         geom_pos[geom, 1] = middle[k, 1] + aside * math.sin(yaw[k])
         geom_pos[geom, 2] = top[k] - 0.5 * thickness * cosine
         geom_size[geom, 0], geom_size[geom, 1] = half_size[k, 0] / cosine, half_size[k, 1]
         geom_size[geom, 2] = 0.5 * thickness
-        # Turned about z by the yaw after it was turned about y by minus the angle.
+        # Rotated about y by minus the angle, then about z by the yaw.
         geom_quat[geom, 0] = math.cos(half_yaw) * math.cos(half_angle)
         geom_quat[geom, 1] = math.sin(half_yaw) * math.sin(half_angle)
         geom_quat[geom, 2] = -math.cos(half_yaw) * math.sin(half_angle)
@@ -404,7 +406,7 @@ def _write_boxes(
 
 
 def _paint(root: mjcf.RootElement) -> None:
-    """What the ground looks like."""
+    """Adds the textures and materials of the ground."""
     colours = {
         'ground': ((0.47, 0.52, 0.44), (0.42, 0.47, 0.40)),
         'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),

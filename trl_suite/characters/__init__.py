@@ -29,11 +29,11 @@ def make(character: str | CharacterSpec) -> Character:
     """Builds a character entity.
 
     Args:
-      character: a name in `CHARACTERS`, or a user's own row.
+      character: a name in `CHARACTERS`, or a user's own `CharacterSpec`.
 
     Raises:
-      ValueError: an unknown name, or an MJCF file that lacks a link or joint of the row.
-      TypeError: neither a name nor a row.
+      ValueError: an unknown name, or an MJCF file that lacks a link or joint of the spec.
+      TypeError: neither a name nor a `CharacterSpec`.
     """
     if isinstance(character, str):
         if character not in CHARACTERS:

@@ -1,4 +1,4 @@
-"""A character: its links and joints from an MJCF file, and the figures that no MJCF file holds."""
+"""A character: links and joints from an MJCF file, and parameters that MJCF cannot express."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from dm_control.composer.observation import observable
 
 from trl_suite.util import resources
 
-GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is drawn
-DIGITS = 6  # to which a fingerprint looks
+GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
+DIGITS = 6  # decimals of the values in a fingerprint
 
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """Figures of one actuated joint that its MJCF element does not hold.
+    """Parameters of one actuated joint that its MJCF element does not contain.
 
-    Units are those of a revolute joint (hinge). A prismatic joint (slide) has m for rad and N for
-    N m throughout; a spherical joint (ball) has the same gains about every axis. Which of the three
-    a joint is, its MJCF element says.
+    Units are those of a revolute joint (hinge). For a prismatic joint (slide) read m for rad and N
+    for N m throughout; a spherical joint (ball) has the same gains about every axis. The type of a
+    joint is that of its MJCF element.
 
     Attributes:
       kp: position gain, N m/rad.
       kd: damping gain, N m s/rad.
       weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
-      target: working posture of position control, rad; of a spherical joint a rotation vector, or 0.
-      original_range: limits in rad by which the original scales position actions, where they are
-        not the limits that act; of a spherical joint the extremes over its three axes.
-      armature: inertia in kg m^2 that is added to keep stiff servos of light links steady.
+      target: working posture of position control, rad; of a ball joint a rotation vector, or 0.
+      original_range: limits in rad by which the original scales position actions, where they differ
+        from the joint's limits; of a spherical joint the extremes over its three axes.
+      armature: inertia in kg m^2 that is added so that stiff servos of light links are stable.
 
     Raises:
-      ValueError: a gain, a weight or an armature that is negative, or what is not finite.
+      ValueError: a gain, a weight or an armature is negative, or a value is not finite.
     """
 
     kp: float
@@ -57,24 +57,24 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class CharacterSpec:
-    """One character as a row of data.
+    """One character as data.
 
     Attributes:
       name: name of the character and of its MJCF file under xml/.
-      joints: joints by name in link order; link i+1 hangs on joint i and has its name.
+      joints: joints by name in link order; link i+1 is the child of joint i and has its name.
       fall_links: links whose contact with the ground is a fall.
-      end_effectors: links whose joints the imitation reward follows.
+      end_effectors: links whose joint positions are compared by the imitation reward.
       stumble_exempt: links that may touch the ground without a stumble.
       description: one line.
       root_weight: weight of the root in the imitation reward.
       path: MJCF file of a user's own character; by default xml/<name>.xml of the suite.
       spatial: whether its root is free in three dimensions, instead of moving in the x-z plane.
       xml, assets: MJCF text instead of a file, and its meshes and pictures by name.
-      bodies: names of the links, root first, where they are not 'root' and those of the joints.
-      collision_geoms: names of the geoms that can touch the ground; by default one for each link, of its
-        name, unless its default class is group0.
-      notes: what was assumed about the character, for people.
-      clip: the clip that it tracks where none is given, of those in mocap/.
+      bodies: names of the links, root first, if they are not 'root' and those of the joints.
+      collision_geoms: names of the geoms that can touch the ground; by default one for each link,
+        with its name, unless its default class is group0.
+      notes: assumptions that were made about the character, as sentences.
+      clip: the clip of those in mocap/ that it tracks by default.
       differences: sentences on what differs from the original, by actuation model or 'gait'.
     """
 
@@ -97,12 +97,12 @@ class CharacterSpec:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """Names of all links, root first, in the order of every per-link block."""
+        """Names of all links, root first, in the order of all arrays per link."""
         return ('root', *self.joints) if self.bodies is None else self.bodies
 
     @property
     def mirror(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of right and left joints, which are links too; none of a character with `bodies`."""
+        """Pairs of right and left joints (and links); none for characters with `bodies`."""
         if self.bodies is not None:
             return ()
         return tuple(
@@ -148,7 +148,7 @@ class Character(composer.Entity):
         return self._mjcf_root
 
     def create_root_joints(self, frame: mjcf.Element) -> tuple[mjcf.Element, ...]:
-        """Lets an attached character move: in three dimensions if it is spatial, else in x and z.
+        """Adds the root joints of an attached character: in three dimensions, or in the x-z plane.
 
         Args:
           frame: the attachment frame that `arena.attach(character)` returned.
@@ -186,7 +186,7 @@ class Character(composer.Entity):
 
     @property
     def collision_geoms(self) -> list[mjcf.Element]:
-        """The geoms that can touch the ground; of the suite's own, one per link that has any."""
+        """The geoms that can touch the ground; shipped characters have at most one per link."""
         if self.spec.collision_geoms is not None:
             return [self._find('geom', name) for name in self.spec.collision_geoms]
         geoms = [self._find('geom', name) for name in self.spec.links]
@@ -194,7 +194,7 @@ class Character(composer.Entity):
 
     @property
     def prismatic(self) -> np.ndarray:
-        """Which joints slide instead of turning, shape (number of joints,) bool."""
+        """Which joints are prismatic, shape (number of joints,) bool."""
         return np.array([joint.type == 'slide' for joint in self.joints])
 
     @property
@@ -211,7 +211,7 @@ class Character(composer.Entity):
     def torque_limits(self) -> np.ndarray:
         """Largest joint torques in N m, forces in N where prismatic, shape (number of joints,).
 
-        Of a ball joint the largest norm.
+        For a ball joint the largest norm.
         """
         return np.array([joint.actuatorfrcrange[1] for joint in self.joints])
 
@@ -219,7 +219,7 @@ class Character(composer.Entity):
     def joint_ranges(self) -> np.ndarray:
         """Joint limits in rad, in m where prismatic, shape (number of joints, 2); infinite if free.
 
-        Of a ball joint 0 and the largest angle of its rotation.
+        For a ball joint 0 and the largest angle of its rotation.
         """
         free = (-np.inf, np.inf)
         return np.array([free if joint.range is None else joint.range for joint in self.joints])
@@ -235,21 +235,21 @@ class Character(composer.Entity):
 
 
 class CharacterObservables(composer.Observables):
-    """What a task or a user may observe of a character; all disabled until asked for."""
+    """Observables of a character, all of them disabled by default."""
 
     @composer.observable
     def joints_pos(self) -> observable.MJCFFeature:
         """Joint angles in rad, lengths in m where prismatic, unit quaternions of ball joints.
 
-        Side by side in the order of `joints`, shape (number of joints + 3 per ball joint,).
+        Concatenated in the order of `joints`, shape (number of joints + 3 per ball joint,).
         """
         return observable.MJCFFeature('qpos', self._entity.joints)
 
     @composer.observable
     def joints_vel(self) -> observable.MJCFFeature:
-        """Joint rates in rad/s, in m/s where prismatic; three per ball joint, axes of the link.
+        """Joint velocities in rad/s, in m/s where prismatic; three per ball joint, link axes.
 
-        Side by side in the order of `joints`, shape (number of joints + 2 per ball joint,).
+        Concatenated in the order of `joints`, shape (number of joints + 2 per ball joint,).
         """
         return observable.MJCFFeature('qvel', self._entity.joints)
 
@@ -275,7 +275,7 @@ class CharacterObservables(composer.Observables):
 
     @composer.observable
     def end_effectors_pos(self) -> observable.Generic:
-        """End effectors' joints relative to the root, world axes, m, shape (effectors, 3)."""
+        """End effectors' joint positions relative to the root, world axes, m, (effectors, 3)."""
 
         def relative(physics: mjcf.Physics) -> np.ndarray:
             effectors = np.asarray(physics.bind(self._entity.end_effectors).xpos)
@@ -285,9 +285,9 @@ class CharacterObservables(composer.Observables):
 
 
 def fingerprint(spec: CharacterSpec) -> str:
-    """Returns name and digest of all that makes a body move as it does, gains included.
+    """Returns name and digest of all physical properties of a character, gains included.
 
-    Looks do not count, nor does how the MJCF is written. Found once for every row.
+    Independent of visual properties and of the formatting of the MJCF. Cached per spec.
     """
     return spec.digest
 
@@ -308,7 +308,7 @@ def _digest(spec: CharacterSpec) -> str:
 
 
 def body_figures(character: Character) -> dict[str, Any]:
-    """Compiles a character alone and returns its whole-body figures in the zero pose.
+    """Compiles a character alone and returns its whole-body properties in the zero pose.
 
     Returns:
       A dict of total `mass` (kg), `com` relative to the root (m, (3,)), `inertia` about the centre
@@ -338,7 +338,7 @@ def body_figures(character: Character) -> dict[str, Any]:
 
 
 def _solid(spec: CharacterSpec, model: Any) -> np.ndarray:
-    """Which geoms of a character compiled alone make its body, (geoms,) bool."""
+    """Which geoms of a character compiled alone are physical, not only visual, (geoms,) bool."""
     if spec.collision_geoms is None:
         return model.geom_group == GROUP_COLLISION
     return np.isin([model.id2name(i, 'geom') for i in range(model.ngeom)], spec.collision_geoms)

@@ -1,23 +1,24 @@
-"""A character of the user's, from an MJCF or URDF file.
+"""A user's own character, from an MJCF or URDF file.
 
     spec = characters.from_file('walker.urdf', fall_links=('trunk',),
-                               end_effectors=('left_foot', 'right_foot'), spatial=True)
+                                end_effectors=('left_foot', 'right_foot'), spatial=True)
     environment = suite.build(spec, terrain='hills3d', task='walk')
 
-MuJoCo reads the file. Frames are MuJoCo's: the character looks along +x, z points up. What the file
-says about masses, limits, damping of joints, servos and torques is kept; where it is silent,
+MuJoCo reads the file. Frames are MuJoCo's: the character faces +x, z points up. Masses, limits,
+damping of joints, servos and torques in the file are kept; values that it does not contain are
+chosen as follows:
 
-* the torque limit of a joint holds the weight of the whole character at the far end of what hangs
-  on the joint; the force limit of a slide is twice that weight;
-* kp asks for all of that torque at an error of 1 rad (of a slide, at a tenth of its range), and a
-  servo damps by a tenth of kp, as in the suite's own characters; so is the armature, 0.01 kg m^2 per
-  300 N m/rad;
-* a joint works about its first key frame, or else its zero, if that is within its limits.
+* the torque limit of a joint is the torque of the whole character's weight at the farthest end of
+  the links that the joint carries; the force limit of a slide is twice that weight;
+* kp yields that torque at an error of 1 rad (for a slide, at a tenth of its range), kd is a tenth
+  of kp, and the armature 0.01 kg m^2 per 300 N m/rad, as for the shipped characters;
+* the working posture of a joint is its angle in the first key frame, or else 0, moved into its
+  limits.
 
-`spec.notes` tells what of it was assumed, and which actuators were left out: those that act on a tendon,
-a site or a body, since every joint gets an actuator of its own. The passive damping of joints is added
-to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons stay; sensors, lights and
-what is not part of the character go.
+`spec.notes` lists these assumptions, and the actuators that were left out: those that act on a tendon, a
+site or a body, because every joint gets an actuator of its own. The passive damping of joints is added
+to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept; sensors, lights
+and everything outside the character are removed.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ from trl_suite.util.files import existing
 
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
-CAMERA_AWAY = 3.2  # reaches of the character; how far off a camera stands
+CAMERA_AWAY = 3.2  # distance of cameras, in reaches of the character
 
-_CAMERAS = {  # place in reaches, and the axes of the picture
+_CAMERAS = {  # position in units of the distance, and the axes of the picture
     'side': ((0.15, -1, 0.09), (1, 0, 0, 0, 0.09, 1)),
     'front': ((0.85, -0.53, 0.2), (0.53, 0.85, 0, -0.17, 0.11, 1)),
     'back': ((-1, 0, 0.27), (0, -1, 0, 0.27, 0, 1)),
@@ -71,30 +72,32 @@ def from_file(
     name: str | None = None,
     description: str = "A user's own character.",
 ) -> CharacterSpec:
-    """Reads a character, for `suite.build`, `characters.make` and what else takes a spec.
+    """Reads a character, for `suite.build`, `characters.make` and others that take a CharacterSpec.
 
     Links are all bodies with mass, in the order of the file; joints keep their names.
 
     Args:
-      path: MJCF (.xml, .mjcf) or .urdf; meshes lie where the file says, those of a package:// in a
-        folder about the file. Of a URDF file what is only looked at is left out, as MuJoCo does.
-      end_effectors: bodies whose frames imitation follows and whose contacts are seen, e.g. feet.
+      path: MJCF (.xml, .mjcf) or .urdf; meshes are at the paths in the file, those of a package://
+        in a folder that contains the file. Visual geoms of a URDF file are discarded, as by MuJoCo.
+      end_effectors: bodies whose positions imitation tracks and whose contacts are observed, e.g.
+        feet.
       fall_links: bodies whose contact with the ground ends the episode.
-      root: body that carries all others, a child of the world; by default the only one there is.
-      spatial: whether it is to move in three dimensions, instead of in the x-z plane; by default as
-        the root's own joints say: a free joint, or two slides and a hinge.
-      turn: rotation, as a quaternion wxyz, that makes the character of the file look along +x with z
-        up; by default none. (0.7071, 0.7071, 0, 0) raises one whose up is y.
-      joints: figures of joints by name, in place of those found.
-      stumble_exempt: bodies that may touch the ground without a stumble; by default the end effectors.
+      root: body that carries all others, a child of the world; by default the only one.
+      spatial: whether the character moves in three dimensions, instead of in the x-z plane; by
+        default derived from the root's joints: a free joint, or two slides and a hinge.
+      turn: rotation, as a quaternion wxyz, that makes the character face +x with z up; by default
+        none. (0.7071, 0.7071, 0, 0) raises a character whose up is y.
+      joints: parameters of joints by name, which replace those derived from the file.
+      stumble_exempt: bodies that may touch the ground without a stumble; by default the end
+        effectors.
       name: of the character; by default the file's.
       description: one line.
 
     Raises:
       FileNotFoundError: there is no such file; the message has similar names.
-      ValueError: the file, or an argument, does not make a character; the message has what is wrong,
-        what was expected, and the closest matches of an unknown name.
-      TypeError: figures of a joint that are no `Joint`.
+      ValueError: the file or an argument is invalid; the message names the problem, the expected
+        value, and the closest matches of an unknown name.
+      TypeError: parameters of a joint that are not a `Joint`.
     """
     for option, value, kind in (
         ('root', root, str | None), ('spatial', spatial, bool | None), ('name', name, str | None),
@@ -108,7 +111,7 @@ def from_file(
     check_numbers(file)
     name = file.stem if name is None else name
     if name in CHARACTERS or '/' in name:
-        raise ValueError(f'a character may not be named {name!r}, as one of the suite; give name=')
+        raise ValueError(f'the suite has a character named {name!r}; pass another name=')
     spec = named(file)
     model = compiled(file, spec)
     number = find_root(file, model, root)
@@ -172,12 +175,12 @@ def _rotation(turn: Sequence[float] | None) -> np.ndarray:
 
 
 def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjcf.RootElement:
-    """Returns the character alone: no world, root joints, actuators or options; figures explicit."""
+    """Returns the character alone: no world, root joints, actuators, options; explicit values."""
     model = found.model
     try:
         tree = mjcf.from_xml_string(flat(spec.to_xml()), model_dir=str(file.parent))
     except (ValueError, KeyError, AttributeError, OSError) as error:
-        raise problem(file, f'cannot be taken over: {error}') from None
+        raise problem(file, f'cannot be converted: {error}') from None
     root = tree.find('body', found.bodies[0])
     outside = [child for child in tree.worldbody.all_children() if child is not root]
     joints = [child for child in root.all_children() if child.tag in ('joint', 'freejoint')]
@@ -198,10 +201,10 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         if attribute != 'angle':
             delattr(tree.compiler, attribute)
     if tree.default.dclass is None:
-        tree.default.dclass = 'own'  # what is written could not be read without a name
+        tree.default.dclass = 'own'  # MJCF without this name could not be read back
     root.pos, root.quat = (0, 0, 0), None
     for i, name in zip(found.ids, found.bodies, strict=True):
-        if model.body_mass[i] > 0:  # as compiled by the file's rules
+        if model.body_mass[i] > 0:  # as compiled with the file's options
             body = tree.find('body', name)
             if body.inertial is not None:
                 body.inertial.remove()
@@ -226,7 +229,7 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
         geom.contype = int(model.geom_contype[i]) << 1
         geom.conaffinity = int(model.geom_conaffinity[i]) << 1 | 1
         if file.suffix.lower() == '.urdf':
-            geom.rgba = COLOUR  # what is only looked at, and has colours, was left out
+            geom.rgba = COLOUR  # visual geoms, which have colours, were discarded
     _stage(tree, root, found.reach(found.data.xpos[found.root], found.root))
     return tree
 

@@ -1,6 +1,6 @@
-"""What an MJCF or URDF file holds of a character: names, links, joints and their figures.
+"""Extracts a character from an MJCF or URDF file: names, links, joints and their parameters.
 
-`from_file.py` says what is assumed where a file is silent, and makes a character of what is found here.
+`from_file.py` lists the assumptions about missing values, and makes a CharacterSpec of the results.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ GRAVITY = 9.8  # m/s^2, of the arenas
 SLIDE_WEIGHTS = 2.0  # force limit of a slide, in weights of the character
 KD_SHARE = 0.1  # s; kd per kp
 ARMATURE_SHARE = 0.01 / 300  # s^2; armature per kp
-# What a figure in the wrong unit goes beyond.
+# Values outside these bounds are probably in another unit.
 LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
 MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
 SIZES = (0.05, 10.0)  # m, from the root to the farthest end
 MASSES = (0.1, 2000.0)  # kg
-LYING = 0.2  # share of the way to the end effectors that goes down; what has less may lie
-FACING = 0.7  # cosine of an angle; what looks farther aside than that may look elsewhere
-LATERAL = 1e-3  # how far an axis of a planar character may be from its plane or normal, rad
+LYING = 0.2  # least share of the distance to the end effectors that points down, unless it may lie
+FACING = 0.7  # cosine of the angle beyond which a character may face elsewhere
+LATERAL = 1e-3  # rad; largest deviation of a planar character's joint axis from plane or normal
 
 _FREE, _BALL, _SLIDE, _HINGE = (
     int(kind)
@@ -68,7 +68,7 @@ def _right(left: str) -> list[str]:
 
 
 class ModelInspector:
-    """What a compiled file holds of a character."""
+    """The properties of a character in a compiled file."""
 
     def __init__(
         self, file: pathlib.Path, model: mujoco.MjModel, root: int, spatial: bool | None
@@ -112,7 +112,7 @@ class ModelInspector:
         if spatial is not None:
             if says is not None and says is not spatial:
                 self.notes.append(
-                    f'spatial={spatial} was given, and counts: the root of the file '
+                    f'spatial={spatial} was given and is used, although the root of the file '
                     f'{"has a free joint" if says else "moves in a plane, by two slides and a hinge"}'
                 )
             return spatial
@@ -120,13 +120,13 @@ class ModelInspector:
             return says
         raise problem(
             self.file, f'the root {self.bodies[0]!r} has {", ".join(kinds) or "no joints"}; expected '
-            'a free joint, or two slides and a hinge, or that you say spatial=True or spatial=False',
+            'a free joint, or two slides and a hinge; or pass spatial=True or spatial=False',
         )  # fmt: skip
 
     def _check_joints(self) -> None:
         model = self.model
         if not len(self.joints):
-            raise problem(self.file, f'nothing hangs on the root {self.bodies[0]!r} by a joint')
+            raise problem(self.file, f'no joint attaches a body to the root {self.bodies[0]!r}')
         for i in self.joints:
             name, kind, axis = model.joint(i).name, int(model.jnt_type[i]), self.data.xaxis[i]
             aside = abs(axis[1])
@@ -143,7 +143,7 @@ class ModelInspector:
                 )  # fmt: skip
 
     def _doubt(self) -> None:
-        """Notes what looks as if it were in another unit."""
+        """Adds notes on values that are probably in another unit."""
         model = self.model
         hinges = [i for i in self.joints if model.jnt_type[i] == _HINGE and model.jnt_limited[i]]
         found = {model.joint(i).name: model.jnt_range[i] for i in hinges}
@@ -218,7 +218,7 @@ class ModelInspector:
                 )  # fmt: skip
 
     def figures(self) -> dict[str, Joint]:
-        """The figures of all joints; sets `limits`, their largest torques or forces."""
+        """The parameters of all joints; sets `limits`, their largest torques or forces."""
         model, figures = self.model, {}
         self.limits: dict[str, float] = {}
         assumed: dict[str, list[str]] = {
@@ -254,7 +254,7 @@ class ModelInspector:
                 ('limit', 'no torque limits in the file; N m (slides: N)'),
                 ('gains', 'no servos in the file; kp, N m/rad (slides: N/m)'),
                 ('damping', 'servos without damping; kd, N m s/rad (slides: N s/m)'),
-                ('posture', 'zero is beyond the limits; working about'),
+                ('posture', 'zero is beyond the limits; working posture'),
                 ('free', 'no limits of the angle'),
             )
             if assumed[key]
@@ -262,7 +262,7 @@ class ModelInspector:
         return figures
 
     def _actuators(self, joint: int) -> tuple[float | None, float, float | None]:
-        """Returns kp, kv and torque limit of a joint as the file's actuators have them."""
+        """Returns kp, kv and torque limit of a joint from the file's actuators."""
         model = self.model
         kp, kv, limits = 0.0, 0.0, []
         at = np.isin(model.actuator_trntype, [*map(int, _OF_JOINTS)]) & (
@@ -289,9 +289,9 @@ class ModelInspector:
         return self.weight * self.reach(self.data.xanchor[joint], body)
 
     def reach(self, point: np.ndarray, body: int) -> float:
-        """Distance from a point to the farthest end of what a body and all on it can touch, m."""
+        """Distance from a point to the farthest end of a body and its descendants, m."""
         below = {body}
-        for i in range(body + 1, self.model.nbody):  # parents come before their children
+        for i in range(body + 1, self.model.nbody):  # parents precede their children
             if self.model.body_parentid[i] in below:
                 below.add(i)
         geoms = [g for g in self.geoms if self.model.geom_bodyid[g] in below]

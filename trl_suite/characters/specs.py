@@ -1,4 +1,4 @@
-"""The characters as rows of data. Source: the character files of the original simulator."""
+"""The characters as data. Source: the character files of the original simulator."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import dataclasses
 
 from trl_suite.characters.character import CharacterSpec, Joint
 
-# The dog's pelvis box is rotated; the original measures these two limits against it (they act 0.61
-# rad higher), but scales actions by the file's numbers.
+# The dog's pelvis box is rotated; the original measures these two limits relative to it (so they
+# are effectively 0.61 rad higher), but scales actions by the numbers in the file.
 _FILE_RANGE = (-1.57, 1.57)
 
-# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; a prismatic
-# joint has m for rad and N for N m. Which joints are spherical, the MJCF files say.
+# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; for a
+# prismatic joint read m for rad and N for N m. The MJCF files define which joints are spherical.
 _DOG_JOINTS = {
     'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
     'spine1': Joint(200, 20, 0.5),
@@ -104,8 +104,8 @@ _BIPED3D_JOINTS = {
     'left_ankle': Joint(100, 10, 0.2),
 }
 
-# Five times the gain on half the foot: with an armature of 0.01 an ankle that has met its torque
-# limit may go on shivering there.
+# Five times the gain with half the foot: with an armature of 0.01 an ankle at its torque limit may
+# oscillate.
 _BIPED3D_MOCAP_RUN_JOINTS = {
     'torso': Joint(1000, 100, 0.5),
     'right_hip': Joint(500, 50, 0.5),
@@ -116,7 +116,7 @@ _BIPED3D_MOCAP_RUN_JOINTS = {
     'left_ankle': Joint(500, 50, 0.2, armature=0.03),
 }
 
-# The original spells sholder. Arms and head move by a hundredth of a radian.
+# The original's spelling is sholder. Arms and head move by a hundredth of a radian.
 _BIPED3D_FULL_MOCAP_JOINTS = {
     **_BIPED3D_JOINTS,
     'right_shoulder': Joint(100, 10, 0.001),
@@ -129,7 +129,7 @@ _BIPED3D_FULL_MOCAP_JOINTS = {
     'head': Joint(100, 10, 0.001),
 }
 
-# The only spherical joints whose limits are not the same to both sides.
+# The only spherical joints whose limits are not symmetric.
 _BIPED3D_SIMBICON_JOINTS = {
     'right_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
     'right_knee': Joint(200, 20, 0.3),
@@ -140,7 +140,7 @@ _BIPED3D_SIMBICON_JOINTS = {
 }
 
 _TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
-_BORROWED = ('the original has no muscles for this character; they are borrowed',)
+_BORROWED = ('the original has no muscles for this character; they are those of another one',)
 
 DOG = CharacterSpec(
     name='dog',
@@ -170,8 +170,8 @@ GOAT = CharacterSpec(
         'position': _TO_PARENT,
         'muscle': _BORROWED,
         'gait': (
-            "action 0 is a gait tuned anew: the original's fall here on flat ground; the original has the "
-            'gait and no environment for it',
+            "action 0 is a re-tuned gait: with the original's gaits the goat falls here on flat "
+            'ground; the original has the gait, but no environment for it',
         ),
     },
 )
@@ -211,7 +211,8 @@ BIPED2D_SIMBICON = CharacterSpec(
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
     differences={
         'gait': (
-            "action 0 is a gait tuned anew: the original's falls here; torque is not rewarded",
+            "action 0 is a re-tuned gait: with the original's gait the character falls here; "
+            'torque is not rewarded',
         ),
     },
 )
@@ -239,7 +240,7 @@ HOPPER = CharacterSpec(
     description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
     differences={
         'gait': (
-            '9 parameters, taken at touch-down; the original announces 8 and takes them in mid-air',
+            '9 parameters, applied at touch-down; the original declares 8, applied in mid-air',
         ),
     },
 )
@@ -250,7 +251,7 @@ BIPED3D = CharacterSpec(
     fall_links=('root', 'torso'),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
-    description='Biped in 3D, 8 links: a pelvis, a torso and two legs; waist, hips and ankles are balls.',
+    description='Biped in 3D, 8 links; waist, hips and ankles are ball joints.',
     spatial=True,
     clip='biped3d_walk',
 )
@@ -278,7 +279,7 @@ BIPED3D_FULL_MOCAP = dataclasses.replace(
     fall_links=tuple(
         link for link in ('root', *_BIPED3D_FULL_MOCAP_JOINTS) if not link.endswith('ankle')
     ),
-    description='Biped in 3D with arms and head, 16 links; these are all but rigid.',
+    description='Biped in 3D with arms and head, 16 links; arms and head are almost rigid.',
     clip='biped3d_full_walk',
 )
 

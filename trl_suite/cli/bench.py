@@ -1,10 +1,10 @@
-"""How fast this machine runs an environment: ratios to raw MuJoCo within one run.
+"""The speed of an environment on this machine, compared to raw MuJoCo in the same run.
 
     trl-suite bench PD_Dog2D_Slopes_Terrain-v0
 
-Rates count physics steps, so that environments whose steps last differently compare; actions are
-random, resets with new terrain included. `benchmarks/vector_environment.py` measures more with the same
-parts: many sizes, memory, and other suites.
+Ratios are of physics steps, so that environments with different control steps can be compared;
+actions are random, and resets with new terrain are included. `benchmarks/vector_environment.py`
+measures more with the same functions: many sizes, memory, and other suites.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from trl_suite.util import files
 
 ID = 'PD_Biped2D_Gaps_Terrain-v0'
 NUM_ENVS = 64
-CONTROL_TIMESTEP = 1 / 30  # s; longer steps have controllers inside
+CONTROL_TIMESTEP = 1 / 30  # s; tasks with longer steps contain controllers
 SECONDS = 2.0  # per measurement
-WARM = 4 / 3  # s of simulated time; most simulations have fallen once by then
-RESET = 30  # calls between two resets of what is stepped raw, a second of simulated time
-ROUNDS = 8  # in which environment and raw batch take turns: machines are now faster, now slower
+WARM = 4 / 3  # s of simulated time, in which most simulations fall once
+RESET = 30  # calls between two resets of a raw simulation, a second of simulated time
+ROUNDS = 8  # alternations of environment and raw batch, as the speed of machines varies
 PROJECTED = (16, 64)  # cores
-DRAWN = 100  # random actions, which are repeated
+DRAWN = 100  # number of random actions, which are repeated
 
 
 class Stopwatch:
-    """Adds up the time that calls of a function take, and what they do.
+    """Measures the total time and the number of processed items of a function's calls.
 
     Attributes:
-      seconds: spent in the function.
-      items: the sum of what `count` made of the arguments.
+      seconds: time spent in the function.
+      items: sum of `count` of the arguments over all calls.
     """
 
     def __init__(self, function: Callable[..., Any], count: Callable[..., int]) -> None:
@@ -64,14 +64,14 @@ def rate(step: Callable[[], object], seconds: float, per_call: int = 1) -> float
 
 
 def actions(low: Any, high: Any, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-    """Yields random actions for ever, drawn beforehand with seed 0."""
+    """Yields random actions without end, drawn beforehand with seed 0."""
     drawn = np.random.default_rng(0).uniform(low, high, (DRAWN, *shape))
     while True:
         yield from drawn
 
 
 def warmed(id: str, num_envs: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
-    """Makes a vector environment whose simulations are over their first episodes, and random actions."""
+    """Makes a vector environment, runs it beyond most first episodes, and makes random actions."""
     environments = VectorEnvironment(id, num_envs, threads, seed=0)
     environments.reset()
     drawn = actions(-1, 1, (num_envs, len(environments.action_map)))
@@ -81,7 +81,7 @@ def warmed(id: str, num_envs: int, threads: int) -> tuple[VectorEnvironment, Ite
 
 
 def physics_steps(environments: VectorEnvironment) -> int:
-    """Returns how many physics steps the simulations have taken, in all."""
+    """Returns the total number of physics steps of the simulations."""
     return int(environments.task.world.engine.steps.sum())
 
 
@@ -91,14 +91,14 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     Args:
       id: of the environment.
       num_envs: number of simulations.
-      threads: that step them; 0 takes all cores.
-      seconds: for the environment, and as many for the raw batch.
+      threads: number of threads; 0 for all cores.
+      seconds: duration for the environment, and the same for the raw batch.
 
     Returns:
-      'control' and 'physics': steps per second of all simulations; 'engine': physics steps per second of
-      MuJoCo alone, terrains included, whose bodies are never reset; 'serial': us per simulation and control
-      step in which one thread works; 'resets': share of the threads' time that resets take; 'reset': ms
-      per simulation.
+      'control' and 'physics': steps per second of all simulations; 'engine': physics steps per
+      second of MuJoCo alone with terrain, never reset; 'serial': us per simulation and control
+      step in which only one thread works; 'resets': fraction of the threads' time spent in resets;
+      'reset': ms per simulation.
     """
     threads = threads or machine.cores()
     environments, drawn = warmed(id, num_envs, threads)
@@ -110,7 +110,7 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     environments.share = parallel  # type: ignore[method-assign]
     before = physics_steps(environments)
     substeps, controls = control_substeps(others), world.ctrl
-    directly = acts_directly(others, world.models[0])  # else raw bodies are limp
+    directly = acts_directly(others, world.models[0])  # else controls are 0
 
     def step() -> None:
         controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
@@ -135,15 +135,15 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
 
 
 def projection(found: dict[str, float], threads: int) -> dict[str, float]:
-    """Returns the speed-up over one core that more cores would give, by Amdahl's law.
+    """Returns the projected speed-up by more cores over one core, by Amdahl's law.
 
     Args:
-      found: what `vector` measured.
-      threads: with how many.
+      found: result of `vector`.
+      threads: number of threads of that measurement.
 
     Returns:
-      Number of cores -> how many times as many control steps per second as one core. Only what one
-      thread does is counted against it, not caches and memory that the cores share.
+      Number of cores -> ratio of control steps per second to those of one core. It includes the
+      limit by work of a single thread, not that by shared caches and memory.
     """
     total = 1e6 / found['control']  # us per simulation and control step
     serial = found['serial']
@@ -155,7 +155,7 @@ def projection(found: dict[str, float], threads: int) -> dict[str, float]:
 
 
 def control_substeps(environment: Any) -> int:
-    """How many physics steps there are between two controls of an environment."""
+    """Number of physics steps between two controls of an environment."""
     task = environment.task
     return max(1, round(min(task.control_timestep, CONTROL_TIMESTEP) / task.physics_timestep))
 
@@ -176,14 +176,14 @@ def raw(
     """Measures `mj_step` of a model under random controls, reset each second of simulated time.
 
     Args:
-      model: whose it is.
+      model: the model.
       substeps: physics steps per control.
-      seconds: how long.
-      state: mjSTATE_INTEGRATION that it is reset to; its own by default.
-      limp: controls are 0.
+      seconds: duration.
+      state: mjSTATE_INTEGRATION to reset to; by default the model's initial state.
+      limp: whether controls are 0.
 
     Returns:
-      Controls per second, of `substeps` each.
+      Controls per second, with `substeps` physics steps each.
     """
     data = mujoco.MjData(model)
     low, high = model.actuator_ctrlrange.T.copy()
@@ -206,7 +206,7 @@ def raw(
 
 
 def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
-    """Measures raw `mj_step` from the start of an environment, and the environment itself.
+    """Measures raw `mj_step` from the initial state of an environment, and the environment itself.
 
     Returns:
       'mj_step': physics steps per second; 'environment': control steps per second, resets included.
@@ -230,17 +230,18 @@ def bench(
     """Measures an environment on this machine.
 
     Args:
-      id: of the environment, or an alias.
-      num_envs: of the vector environment.
-      threads: that step them; 0 takes all cores that may be used.
-      seconds: per measurement, of which there are four.
+      id: id or alias of the environment.
+      num_envs: number of simulations of the vector environment.
+      threads: number of threads; 0 for all usable cores.
+      seconds: duration of each of four measurements.
 
     Returns:
-      What JSON can hold: 'machine', 'id', 'simulations', 'threads'; 'control steps per second' of all simulations,
-      and of a 'single environment'; 'ratio to the engine' (MuJoCo alone on as many
-      threads) and 'ratio to mj_step' (on one thread) of the physics steps per second; 'serial' (us per
-      simulation and control step); 'reset' (ms per simulation); and 'projection': the speed-up that 16 and 64 cores
-      would give, by Amdahl's law from the part that one thread does.
+      A dict that can be written as JSON: 'machine', 'id', 'num_envs', 'threads'; 'control steps per
+      second' of all simulations, and those of a 'single environment'; ratios of physics steps per
+      second, 'ratio to the engine' (MuJoCo alone on the same number of threads) and 'ratio to
+      mj_step' (on one thread); 'serial' (us per simulation and control step); 'reset' (ms per
+      simulation); and 'projection': the speed-up by 16 and 64 cores, by Amdahl's law from the work
+      of a single thread.
 
     Raises:
       ValueError: unknown id, or numbers out of range.
@@ -261,7 +262,7 @@ def bench(
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Measures, and prints what was found."""
+    """Measures, and prints the results."""
     if arguments.json is not None:
         files.check_path(arguments.json, ('.json',))
     result = bench(arguments.id, arguments.num_envs, arguments.threads, arguments.seconds)

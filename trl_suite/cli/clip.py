@@ -1,4 +1,4 @@
-"""`trl-suite clip`: carries a motion file over to a character, and checks it."""
+"""`trl-suite clip`: retargets a motion file to a character, and checks it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trl_suite.util import files
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Carries a motion file over to a character, and prints what is wrong with the clip."""
+    """Retargets a motion file to a character, and prints the faults of the clip."""
     for path, suffixes in (
         (arguments.output, ('.npz',)),
         (arguments.strip, rendering.IMAGE_SUFFIXES),
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _joint_map(path: pathlib.Path) -> dict[str, str]:
-    """Reads which joint of the motion each joint of the character follows."""
+    """Reads the map from joints of the character to joints of the motion."""
     content = files.read_json(files.existing(path))
     if not isinstance(content, dict) or not all(isinstance(v, str) for v in content.values()):
         raise ValueError(

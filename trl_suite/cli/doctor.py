@@ -1,9 +1,9 @@
-"""Looks at an installation: versions, OpenGL, cores, a short run; says what is wrong and what to do.
+"""Checks an installation: versions, OpenGL, cores, a short run; prints problems and remedies.
 
     trl-suite doctor
 
-Whatever may crash is tried in a process of its own, so that this module needs neither the engine nor
-OpenGL to be in order.
+Checks that may crash run in separate processes, so that this module needs neither a working engine
+nor OpenGL.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from trl_suite.util import compiled
 BACKENDS = ('egl', 'osmesa', 'glfw')
 OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
 TIMEOUT = 120.0  # s, for every process that is started
-# What an extra brings, by the name under which it is imported.
+# Packages of the extras, by the name under which they are imported.
 EXTRAS = {
     'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'gymnasium': ('gymnasium',),
     'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',), 'rllib': ('ray',), 'shimmy': ('shimmy',),
@@ -38,7 +38,7 @@ LIBRARIES = {
     'glfw': 'a screen',
 }
 
-# One line says why, and no library complains at exit.
+# Prints one line with the error, without messages of libraries at exit.
 _GUARD = """
 import os, sys
 def fail(kind, error, trace):
@@ -86,9 +86,9 @@ class Finding:
     """One line of the report.
 
     Attributes:
-      state: `OK`, `NOTE` (worth knowing, nothing essential) or `FAILED`.
-      text: what was found.
-      remedy: what to do, if anything.
+      state: `OK`, `NOTE` (informative, not essential) or `FAILED`.
+      text: the finding.
+      remedy: what to do about it; may be empty.
     """
 
     state: str
@@ -97,7 +97,7 @@ class Finding:
 
 
 def findings() -> Iterator[Finding]:
-    """Yields what is found, in order; takes about ten seconds."""
+    """Yields all findings, in order; takes about ten seconds."""
     yield from versions()
     yield from extras()
     yield cores()
@@ -110,17 +110,17 @@ def findings() -> Iterator[Finding]:
 
 
 def versions() -> Iterator[Finding]:
-    """Python and every package that the suite requires, against what it asks for."""
+    """Installed versions of Python and of all required packages, compared to those required."""
     yield Finding(OK, f'Python {platform.python_version()}, {sys.executable}')
     try:
         from packaging.requirements import Requirement
 
         required = importlib.metadata.requires('trl_suite') or []
-    except ImportError as error:  # or the suite was not installed, only put on the path
+    except ImportError as error:  # or the suite is on the path without being installed
         yield Finding(NOTE, f'required versions are unknown ({error})', 'pip install trl_suite')
         return
     for requirement in map(Requirement, required):
-        if requirement.marker is not None:  # of an extra
+        if requirement.marker is not None:  # belongs to an extra
             continue
         found = machine.version(requirement.name)
         text = f'{requirement.name} {found or "is missing"} (required: {requirement.specifier or "any"})'
@@ -130,7 +130,7 @@ def versions() -> Iterator[Finding]:
 
 
 def extras() -> Iterator[Finding]:
-    """What is optional."""
+    """Optional packages."""
     for extra, modules in EXTRAS.items():
         missing = [name for name in modules if importlib.util.find_spec(name) is None]
         if missing:
@@ -143,7 +143,7 @@ def extras() -> Iterator[Finding]:
 
 
 def cores() -> Finding:
-    """How many threads make sense."""
+    """The useful number of threads."""
     usable, all_ = machine.cores(), os.cpu_count() or 1
     text = f'{usable} of {all_} cores usable, {machine.processor()}'
     if usable == all_:
@@ -152,14 +152,14 @@ def cores() -> Finding:
 
 
 def compiled_code() -> Finding:
-    """Where the machine code of the rules is kept, and how much of it there is."""
+    """Location and size of the cache of compiled rules."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
         folder = compiled.cache_folder()
     if folder is None:
         return Finding(
-            NOTE, 'no folder for compiled code can be written: every process compiles anew',
-            'set NUMBA_CACHE_DIR to a folder that can be written',
+            NOTE, 'no folder for compiled code is writable: every process compiles again',
+            'set NUMBA_CACHE_DIR to a writable folder',
         )  # fmt: skip
     sizes = [path.stat().st_size for path in folder.rglob('*') if path.is_file()]
     text = f'compiled code in {folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB'
@@ -167,7 +167,7 @@ def compiled_code() -> Finding:
 
 
 def backends() -> Iterator[tuple[str, Finding]]:
-    """Which values of MUJOCO_GL draw a picture, each tried in a process of its own."""
+    """The values of MUJOCO_GL that can render, each tested in a separate process."""
     runs = {name: _start(_DRAW, name) for name in BACKENDS}
     for name, run in runs.items():
         status, out, error = _end(run)
@@ -178,24 +178,24 @@ def backends() -> Iterator[tuple[str, Finding]]:
 
 
 def self_test(works: Sequence[str]) -> Iterator[Finding]:
-    """Steps an environment for a second and draws it, with MUJOCO_GL as it is.
+    """Steps an environment for a second and renders it, with the current value of MUJOCO_GL.
 
     Args:
-      works: values of MUJOCO_GL that draw.
+      works: values of MUJOCO_GL that can render.
     """
     status, out, error = _end(_start(_RUN))
-    if not out:  # where the chosen library is missing, dm_control cannot even be imported
+    if not out:  # if the chosen library is missing, importing dm_control fails
         _, out, other = _end(_start(_RUN, 'disable'))
         if not out:
             yield Finding(
                 FAILED, f'no environment runs: {other}',
-                'see what failed above; if nothing: pip install --force-reinstall trl_suite',
+                'see failures above; if there are none: pip install --force-reinstall trl_suite',
             )  # fmt: skip
             return
     yield Finding(OK, f'an environment runs: {", ".join(json.loads(out.splitlines()[-1]))}')
     if status:
         remedy = (
-            'export MUJOCO_GL=disable if you need no pictures, else install what is named above'
+            'export MUJOCO_GL=disable if you need no rendering, else install a library named above'
         )
         if works:
             remedy = f'export MUJOCO_GL={works[0]}'
@@ -210,7 +210,7 @@ def _start(code: str, backend: str | None = None) -> subprocess.Popen[str]:
     environment = dict(os.environ)
     if backend is not None:
         environment['MUJOCO_GL'] = backend
-        environment.pop('PYOPENGL_PLATFORM', None)  # of another library
+        environment.pop('PYOPENGL_PLATFORM', None)  # may be set for another library
     return subprocess.Popen(
         [sys.executable, '-W', 'ignore', '-c', _GUARD + code], env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL,
@@ -218,7 +218,7 @@ def _start(code: str, backend: str | None = None) -> subprocess.Popen[str]:
 
 
 def _end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """Returns exit status, what was printed, and why it failed in one line."""
+    """Returns exit status, standard output, and the error in one line."""
     try:
         out, error = run.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -230,7 +230,7 @@ def _end(run: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 def report(found: Iterable[Finding]) -> Iterator[str]:
-    """Yields lines, remedies indented below what they are for."""
+    """Yields lines, with remedies indented below their findings."""
     for finding in found:
         yield f'{finding.state:<6}  {finding.text}'
         if finding.remedy:
@@ -238,11 +238,13 @@ def report(found: Iterable[Finding]) -> Iterator[str]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints what is found, and returns 1 if anything is wrong."""
+    """Prints all findings, and returns 1 if any check failed."""
     found = []
     for finding in findings():  # some take seconds
         found.append(finding.state)
         print('\n'.join(report([finding])), flush=True)
     failed = found.count(FAILED)
-    print(f'\n{failed} thing{"" if failed == 1 else "s"} to mend' if failed else '\nall is well')
+    print(
+        f'\n{failed} check{"" if failed == 1 else "s"} failed' if failed else '\nall checks passed'
+    )
     return int(failed > 0)

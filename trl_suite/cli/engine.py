@@ -1,4 +1,4 @@
-"""Imports the engine for those commands that need it, when they need it."""
+"""Imports the engine lazily, for commands that need it."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def load(name: str = 'trl_suite.suite') -> Any:
         return importlib.import_module(name)
     except ModuleNotFoundError:
         raise
-    # What dm_control dies of where the library that MUJOCO_GL names is missing.
+    # Errors of dm_control if the library that MUJOCO_GL names is missing.
     except (AttributeError, ImportError) as error:
         raise RuntimeError(rendering.no_gl(error)) from error

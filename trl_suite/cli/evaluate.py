@@ -1,4 +1,4 @@
-"""`trl-suite evaluate`: runs a policy for whole episodes, and sums up."""
+"""`trl-suite evaluate`: runs a policy for whole episodes, and summarises them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trl_suite.util import files
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Runs a policy for whole episodes, and prints the sums."""
+    """Runs a policy for whole episodes, and prints a summary."""
     if arguments.json is not None:
         files.check_path(arguments.json, ('.json',))
     spec = engine.load().find(arguments.id)

@@ -1,4 +1,4 @@
-"""`trl-suite info`: everything about one environment."""
+"""`trl-suite info`: a full description of one environment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from trl_suite.cli import engine
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Prints everything about one environment."""
+    """Prints a full description of one environment."""
     suite = engine.load()
     spec = suite.find(arguments.id)
     environment = suite.build_environment(spec, {}, {})

@@ -1,4 +1,4 @@
-"""What machine this is: processor, cores that may be used, versions."""
+"""The machine: processor, usable cores, versions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pathlib
 import platform
 
 PACKAGES = ('mujoco', 'dm-control', 'numpy')
-_QUOTA = pathlib.Path('/sys/fs/cgroup/cpu.max')  # of a container: microseconds, or max; period
+_QUOTA = pathlib.Path('/sys/fs/cgroup/cpu.max')  # microseconds, or max; period
 
 
 def cores() -> int:
-    """Returns how many cores this process may use: what its affinity and its container leave."""
+    """Returns the number of cores that this process may use, by its affinity and its container."""
     try:
         count = len(os.sched_getaffinity(0))
     except AttributeError:  # not Linux
@@ -26,7 +26,7 @@ def cores() -> int:
 
 
 def processor() -> str:
-    """Returns the name of the processor, or of its architecture where no name is known."""
+    """Returns the name of the processor, or its architecture if the name is unknown."""
     try:
         lines = pathlib.Path('/proc/cpuinfo').read_text().splitlines()
     except OSError:
@@ -44,7 +44,7 @@ def version(package: str) -> str | None:
 
 
 def sentence() -> str:
-    """Returns the machine in one line, to be stated beside figures."""
+    """Returns the machine in one line, for reports of measurements."""
     found = ', '.join(f'{package} {version(package)}' for package in PACKAGES)
     return (
         f'{processor()}, {cores()} of {os.cpu_count()} cores usable, {platform.system()} '

@@ -12,9 +12,9 @@
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
     trl-suite gallery --filter Dog2D_Gaps
 
-Bad input ends with one line on stderr and exit status 2. A command NAME is the function `run` of the
-module `trl_suite.cli.NAME` (of try, a word of Python: `try_file`); the engine is imported only by
-those that need it.
+Invalid input ends with one line on stderr and exit status 2. A command NAME is the function `run` of
+the module `trl_suite.cli.NAME` (`try_file` for `try`, which is a keyword of Python); the engine is
+imported only by commands that need it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
       prog: name of the program in the help.
 
     Returns:
-      The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
-      error, with one line on stderr; 130 after an interrupt, 143 after SIGTERM.
+      The exit status: 0; 1 if a check of `doctor` or a picture failed; 2 after an error, with one
+      line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
     try:
         with program.terminable():
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
             status = command.run(arguments) or 0
             sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
+        # The reader has closed the pipe; nothing may be flushed into it at exit.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, like all others."""
+    """A parser whose errors are one line, like those of commands."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f'{message} (see {self.prog} --help)')
@@ -92,7 +92,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     def add_policy(command: argparse.ArgumentParser, default: str) -> None:
         command.add_argument(
             '--policy', default=default, type=_policy_name, metavar='POLICY',
-            help=f'{", ".join(acting.POLICIES)}, or an .npz file; the reference is the trained one shipped',
+            help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped one',
         )  # fmt: skip
 
     command = add('list', 'list the environments of the catalogue')
@@ -100,10 +100,10 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         command.add_argument(f'--{name}', help=f'only those of one {name}')
     command.add_argument('--trained', action='store_true', help='only those with a shipped policy')
 
-    command = add('info', 'tell everything about one environment')
+    command = add('info', 'describe one environment in full')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
 
-    command = add('rollout', 'run a policy, over ends of episodes')
+    command = add('rollout', 'run a policy for a number of steps')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
     command.add_argument('--steps', type=_positive, default=256, help='control steps')
@@ -122,11 +122,11 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     command.add_argument(
         '--policy', default='best', type=_best_or_policy, metavar='POLICY',
-        help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that there is',
+        help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that exists',
     )  # fmt: skip
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
 
-    command = add('evaluate', 'run a policy for whole episodes, and sum up')
+    command = add('evaluate', 'run a policy for whole episodes, and summarise them')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     add_policy(command, 'reference')
     command.add_argument('--episodes', type=_positive, default=50, help='how many')
@@ -134,26 +134,26 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
     command.add_argument(
         '--step-limit', type=_positive, metavar='N',
-        help="steps after which an episode is cut, instead of the environment's limit",
+        help="steps after which an episode is truncated, instead of the environment's limit",
     )  # fmt: skip
-    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
+    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of all results')
 
-    command = add('terrain', 'plot draws of a terrain, or write one as a mesh')
+    command = add('terrain', 'plot random grounds of a terrain, or write one as a mesh')
     command.add_argument(
         'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
     )
     command.add_argument('--draws', type=_positive, default=3, help='how many')
     command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
-    command.add_argument('--seed', type=int, default=0, help='of the draws')
+    command.add_argument('--seed', type=int, default=0, help='of the grounds')
     command.add_argument(
         '--terrain-level', type=float, default=0.0, help='which of the parameter sets'
     )
     command.add_argument(
         '--output', type=pathlib.Path, metavar='FILE',
-        help='a .png; or a mesh of the first draw, .obj, .glb or .stl',
+        help='a .png; or a mesh of the first ground, .obj, .glb or .stl',
     )  # fmt: skip
 
-    command = add('clip', 'carry a motion file over to a character, and check it')
+    command = add('clip', 'retarget a motion file to a character, and check it')
     command.add_argument(
         'file', metavar='FILE', type=pathlib.Path,
         help='BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; its content tells',
@@ -162,18 +162,18 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')
     command.add_argument(
         '--map', type=pathlib.Path, metavar='FILE',
-        help="a .json of joints: the character's to the motion's; by usual names",
+        help="a .json of joints: the character's to the motion's; default: by usual names",
     )  # fmt: skip
-    command.add_argument('--scale', type=float, help='of lengths; by the length of limbs')
+    command.add_argument('--scale', type=float, help='of lengths; default: by the length of limbs')
     command.add_argument(
         '--cycle', nargs='*', type=float, metavar='TIME',
-        help='cut one cycle out, from a time to another (s); without times, where it fits best',
+        help='cut one cycle, from a start to an end time (s); by default the best one is found',
     )  # fmt: skip
     command.add_argument('--frames', action='store_true', help='print every fault in every frame')
     command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
     command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
 
-    command = add('try', 'read a character from a file, tell what becomes of it, and draw it')
+    command = add('try', 'read a character from a file, print its properties, and draw it')
     command.set_defaults(command='try_file')
     command.add_argument('file', metavar='FILE', type=pathlib.Path, help='an .xml, .mjcf or .urdf')
     command.add_argument('--root', metavar='BODY', help='that carries all others')
@@ -186,17 +186,17 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         '--spatial', action=argparse.BooleanOptionalAction,
-        help="moves in three dimensions, or not; by default as the root's joints say",
+        help="whether it moves in three dimensions; by default derived from the root's joints",
     )  # fmt: skip
     command.add_argument(
         '--turn', nargs=4, type=float, metavar=('W', 'X', 'Y', 'Z'),
-        help='a quaternion that makes it look along +x with z up',
+        help='quaternion that makes it face +x with z up',
     )  # fmt: skip
     command.add_argument(
         '--output', type=pathlib.Path, metavar='FILE', help='a .png of it on three terrains'
     )
 
-    add('doctor', 'look at the installation; say what is wrong and what to do')
+    add('doctor', 'check the installation; print problems and remedies')
 
     command = add('bench', 'measure the speed of this machine against raw MuJoCo')
     command.add_argument(
@@ -214,7 +214,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         '--filter', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
     )
-    command.add_argument('--overwrite', action='store_true', help='also what is there already')
+    command.add_argument('--overwrite', action='store_true', help='replace existing pictures')
     return parser
 
 

@@ -1,4 +1,4 @@
-"""`trl-suite rollout`: runs a policy, over ends of episodes."""
+"""`trl-suite rollout`: runs a policy for a number of steps, through successive episodes."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
     from trl_suite.environments.environment import Environment
 
-SHOWN_EPISODES = 8  # episodes that are printed one by one
-_ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
+SHOWN_EPISODES = 8  # largest number of episodes that are printed
+_ENDS = ('fell', 'stuck', 'diverged')  # causes of an end of episode, in a task's info
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Runs a policy, writes what was asked for, and prints a line per episode and per file."""
+    """Runs a policy, writes the requested files, and prints a line per episode and per file."""
     for path, suffixes in (
         (arguments.video, rendering.VIDEO_SUFFIXES),
         (arguments.strip, rendering.IMAGE_SUFFIXES),
         (arguments.trajectory, ('.npz',)),
     ):
-        if path is not None:  # before the work rather than after it
+        if path is not None:  # checked before the rollout
             files.check_path(path, suffixes)
     suite = engine.load()
     environment = suite.make(arguments.id, {'random': arguments.seed})
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
             if into_video:
                 video.add(image)
             if into_strip:
-                in_strip.discard(done)  # the start that follows an end has the same number
+                in_strip.discard(done)  # the initial state of the next episode has the same number
                 pictures.append(image)
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
@@ -76,8 +76,8 @@ def run(arguments: argparse.Namespace) -> None:
 def _run(
     environment: Environment, policy: rendering.Policy, steps: int
 ) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
-    """Yields steps done, every time step, and the action taken from it: zeros where none is."""
-    import tqdm  # dm_control brings it
+    """Yields the number of steps, every time step, and its action: zeros at ends of episodes."""
+    import tqdm  # a dependency of dm_control
 
     from trl_suite.evaluation import PROGRESS_DELAY
 
@@ -99,7 +99,7 @@ def _run(
 
 
 class _Record:
-    """What a rollout leaves behind: a row per time step, and an entry per episode."""
+    """Data of a rollout: an entry per time step, and one per episode."""
 
     def __init__(self, environment: Environment) -> None:
         self._environment = environment
@@ -126,7 +126,7 @@ class _Record:
             episode['end'] = next((end for end in _ENDS if info.get(end)), cut)
 
     def arrays(self) -> dict[str, Any]:
-        """The rows as arrays; actions[i] was taken from observations[i], if step i had any."""
+        """The entries as arrays; actions[i] was taken from observations[i], if there was one."""
         names = ('observations', 'actions', 'rewards', 'discounts', 'step_types', 'qpos')
         return {
             name: np.array(column)

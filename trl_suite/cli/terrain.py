@@ -1,4 +1,4 @@
-"""`trl-suite terrain`: plots draws of a terrain, or writes one as a mesh."""
+"""`trl-suite terrain`: plots random grounds of a terrain, or writes one as a mesh."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from trl_suite import rendering, terrain
 from trl_suite.terrain.mesh import LARGEST_SIDE
 from trl_suite.util import files
 
-BEFORE = 2.0  # m; of planar ground behind the start
+BEFORE = 2.0  # m; extent of planar ground behind the start
 LONGEST = LARGEST_SIDE - BEFORE  # m
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Plots draws of a terrain, or writes one as a mesh, and prints the file's name."""
+    """Plots random grounds of a terrain, or writes one as a mesh, and prints the file's name."""
     name = pathlib.Path(arguments.terrain)
     known = name.name if name.suffix not in ('.json', '.txt') else name.stem
     output = arguments.output or pathlib.Path(f'terrain_{known}.png')
@@ -36,7 +36,7 @@ def _write_mesh(arguments: argparse.Namespace, output: pathlib.Path) -> None:
     if not 0 < length <= LONGEST:
         raise ValueError(f'length is {length}; expected metres in (0, {LONGEST:g}]')
     draw = terrain.SpatialGround if source.spatial else terrain.PlanarGround
-    # As the first of the plots.
+    # The same ground as in the first plot.
     ground = draw(
         source, np.random.SeedSequence((arguments.seed, 0)), terrain_level=arguments.terrain_level
     )

@@ -1,6 +1,6 @@
-"""`trl-suite view`: dm_control's viewer on an environment, with a policy that acts.
+"""`trl-suite view`: dm_control's viewer for an environment that is controlled by a policy.
 
-Steps that last longer than 1/30 s (gaits, plans of footsteps) are shown frame by frame.
+Steps that last longer than 1/30 s (gaits, footstep plans) are shown frame by frame.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from trl_suite.environments import named_policies as acting
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
-INSTEAD = 'without one, make a film of it: trl-suite rollout ID --video FILE.mp4'
+INSTEAD = 'without one, write a video: trl-suite rollout ID --video FILE.mp4'
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -38,13 +38,13 @@ def run(arguments: argparse.Namespace) -> None:
     def policy() -> rendering.Policy:
         return acting.policy(name, environment, arguments.id, arguments.seed)
 
-    policy()(environment.reset())  # what cannot act says so before a window opens
+    policy()(environment.reset())  # errors of the policy are raised before a window opens
     environment.random_state.seed(arguments.seed)
     view(environment, policy(), f'{suite.find(arguments.id).id}: {name}')
 
 
 def check_screen() -> None:
-    """Makes sure that a window can be opened, and lets dm_control draw by way of GLFW.
+    """Checks that a window can be opened, and makes dm_control use GLFW.
 
     Raises:
       RuntimeError: there is no screen, or none that GLFW can use; the message says what to do.
@@ -55,14 +55,14 @@ def check_screen() -> None:
         raise RuntimeError(
             'a window needs a screen, but neither DISPLAY nor WAYLAND_DISPLAY is set; ' + INSTEAD
         )
-    import glfw  # dm_control brings it
+    import glfw  # a dependency of dm_control
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter('always')
         if not glfw.init():
-            reason = ' '.join(str(each.message) for each in caught) or 'it does not say why'
+            reason = ' '.join(str(each.message) for each in caught) or 'GLFW gives no reason'
             raise RuntimeError(f'a window needs a screen that GLFW can use ({reason}); {INSTEAD}')
-    # dm_control draws windows with no other library. It reads the variable when it is imported.
+    # dm_control's windows need GLFW. It reads the variable when it is imported.
     os.environ['MUJOCO_GL'] = 'glfw'
     render = sys.modules.get('dm_control._render')
     if render is not None and getattr(render, 'BACKEND', None) != 'glfw':
@@ -73,7 +73,7 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     """Shows an environment until the window is closed.
 
     Args:
-      environment: begins a new episode.
+      environment: the environment; it is reset.
       policy: time step -> action.
       title: of the window.
 
@@ -92,9 +92,9 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
 class Frames(dm_env.Environment):
     """An environment whose long steps are shown frame by frame, 1/30 s each.
 
-    A step is simulated as a whole and then played back: every step of this environment puts the
-    simulation into the state of the next frame, the last one into that from which it goes on. Actions
-    count, and the policy is asked, only where no frame is left.
+    A step is simulated as a whole and then played back: every step of this environment sets the
+    simulation to the state of the next frame, the last one to the state after the step. Actions
+    take effect, and the policy is called, only when no frame is left.
     """
 
     def __init__(self, environment: Environment, policy: rendering.Policy) -> None:
@@ -103,7 +103,7 @@ class Frames(dm_env.Environment):
         self._action = np.zeros(environment.action_spec().shape)
 
     def policy(self, time_step: dm_env.TimeStep) -> np.ndarray:
-        """Returns the action that is due, of a step that is being played back the one it had."""
+        """Returns the policy's action, or during playback the action of the current step."""
         if not self._left:
             self._action = self._policy(time_step)
         return self._action
@@ -134,5 +134,5 @@ class Frames(dm_env.Environment):
 
     @property
     def physics(self) -> Any:
-        """The simulation, as the viewer draws it."""
+        """The simulation that the viewer shows."""
         return self._environment.physics

@@ -1,4 +1,4 @@
-"""Reference motions: clips and step libraries, their sampling, and readers. Pure NumPy."""
+"""Reference motions in pure NumPy: clips and step libraries, their sampling, and readers."""
 
 from trl_suite.motion.capture import Capture, read_amc, read_bvh
 from trl_suite.motion.clip import Clip, load, names

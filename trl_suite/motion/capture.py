@@ -1,11 +1,11 @@
 """Captured motion: BVH files and Acclaim's skeleton and motion files (ASF, AMC; the CMU database).
 
-Their skeletons are not ours: `trl_suite.retargeting` carries a capture over to a character. BVH is
-read by the package pybvh. Acclaim's two formats are read here: the packages that parse them lose
-frames or refuse bones without degrees of freedom, and dm_control's reader of AMC loses the names of
-bones.
+`trl_suite.retargeting` transfers a capture to the skeleton of a character. BVH is read by the
+package pybvh. Acclaim's two formats are read here: existing packages lose frames or reject bones
+without degrees of freedom, and dm_control's reader of AMC loses the names of bones.
 
-Turned into our frame (x forward, y left, z up) from that of the file, by default y up and z forward.
+Captures are rotated from the file's frame, by default y up and z forward, to that of trl_suite
+(x forward, y left, z up).
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from trl_suite.util import errors
 from trl_suite.util.files import existing, read_text
 
 BVH_UNIT = 0.01  # m; most files are in cm
-ACCLAIM_UNIT = 0.0254  # m; inches, times what the file says
+ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
 ACCLAIM_RATE = 120.0  # frames per second of the CMU database; the files do not say
 _AXES = {'x': (1.0, 0.0, 0.0), 'y': (0.0, 1.0, 0.0), 'z': (0.0, 0.0, 1.0)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Capture:
-    """A motion of any skeleton of ball joints, in our frame.
+    """A motion of any skeleton of ball joints, in the frame of trl_suite.
 
     Attributes:
       name: of the file.
-      times: of the frames, s, (n,), from 0 on.
+      times: of the frames, s, (n,), starting at 0.
       joints: names, parents before children, the root first; J of them.
-      parents: number of each joint's parent, -1 of the root.
-      rest: where joints are in the rest pose, from the root, m, (J, 3).
+      parents: index of each joint's parent, -1 for the root.
+      rest: positions of joints relative to the root in the rest pose, m, (J, 3).
       positions: of the root, m, (n, 3).
-      rotations: of what hangs on each joint, from its rest pose, in world axes, unit quaternions wxyz,
+      rotations: of each joint's bones from their rest pose, in world axes, unit quaternions wxyz,
         (n, J, 4).
     """
 
@@ -65,11 +65,11 @@ def read_bvh(
     Args:
       path: the file. Joints have three rotation channels each, the root three positions too.
       unit: of lengths, m.
-      forward: axis that the rest pose looks along: 'x', 'y', 'z', or with a - before it.
+      forward: axis that the rest pose faces: 'x', 'y' or 'z', with a - before it if negative.
       up: axis that points up.
 
     Raises:
-      ValueError: a malformed file, or axes that are none; the message names the file.
+      ValueError: a malformed file, or invalid axes; the message names the file.
       FileNotFoundError: there is no such file.
       ImportError: the extra 'clips' is not installed.
     """
@@ -81,7 +81,7 @@ def read_bvh(
         import pybvh
     except ImportError as error:
         raise ImportError(
-            "pybvh is needed to read BVH and missing; pip install 'trl_suite[clips]'"
+            "pybvh is needed to read BVH and not installed; pip install 'trl_suite[clips]'"
         ) from error
     with tempfile.TemporaryDirectory() as folder:
         copy = pathlib.Path(folder, 'copy.bvh')  # pybvh reads no other suffix
@@ -118,15 +118,15 @@ def read_amc(
     forward: str = 'z',
     up: str = 'y',
 ) -> Capture:
-    """Reads a motion of Acclaim's format, such as those of the CMU motion capture database.
+    """Reads a motion in Acclaim's format, such as those of the CMU motion capture database.
 
-    A joint has the name of the bone that hangs on it.
+    A joint has the name of its child bone.
 
     Args:
       path: the motion, an .amc file.
       skeleton: the .asf file that belongs to it.
       rate: frames per second.
-      unit: of lengths, m, before the file's own factor.
+      unit: of lengths, m, before multiplication by the file's factor.
       forward, up: as for `read_bvh`.
 
     Raises:
@@ -165,18 +165,16 @@ def read_amc(
 
 
 def frame(forward: str, up: str) -> np.ndarray:
-    """Returns the matrix (3, 3) that turns vectors of a file's frame into ours.
+    """Returns the rotation matrix (3, 3) from a file's frame to that of trl_suite.
 
     Raises:
-      ValueError: an axis that is none, or twice the same.
+      ValueError: an axis is invalid, or both are the same.
     """
     rows = []
     for name, axis in (('forward', forward), ('up', up)):
         letter = axis.lstrip('+-')
         if letter not in _AXES or len(axis) > 2:
-            raise ValueError(
-                f"{name} is {axis!r}; expected 'x', 'y' or 'z', with - before it or not"
-            )
+            raise ValueError(f"{name} is {axis!r}; expected 'x', 'y', 'z', '-x', '-y' or '-z'")
         rows.append(np.array(_AXES[letter]) * (-1 if axis[0] == '-' else 1))
     if abs(rows[0] @ rows[1]) > 0:
         raise ValueError(f'forward is {forward!r} and up {up!r}; expected two axes')
@@ -184,9 +182,9 @@ def frame(forward: str, up: str) -> np.ndarray:
 
 
 def _euler(order: str, angles: np.ndarray, intrinsic: bool) -> np.ndarray:
-    """Returns quaternions (n, 4) of turns about axes, angles (n, 3) rad in that order.
+    """Returns quaternions (n, 4) of Euler angles (n, 3) rad about axes in the given order.
 
-    Intrinsic turns are about axes that turn along, the others about fixed ones.
+    Intrinsic rotations are about body axes, the others about fixed ones.
     """
     result = np.tile([1.0, 0.0, 0.0, 0.0], (len(angles), 1))
     for axis, angle in zip(order.lower(), angles.T, strict=True):
@@ -208,7 +206,7 @@ def _capture(
     local: Sequence[np.ndarray],
     axes: np.ndarray,
 ) -> Capture:
-    """Puts a motion together: offsets from parents, rotations against parents, the file's axes."""
+    """Builds a Capture from offsets and rotations relative to parents, in the file's frame."""
     if len(times) < 2:
         raise ValueError(f'{path}: {len(times)} frames; expected at least 2')
     rest = np.zeros_like(offsets)
@@ -254,7 +252,7 @@ def _three_numbers(words: Sequence[str]) -> bool:
 
 
 def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, bool]:
-    """Reads a .asf file: bones, parents before children, the factor of lengths, and if in degrees."""
+    """Reads a .asf file: bones (parents first), factor of lengths, whether angles are degrees."""
     bones: dict[str, dict[str, Any]] = {
         'root': {'parent': '', 'dof': [], 'axis': np.zeros(3), 'order': 'xyz', 'tip': np.zeros(3)}
     }
@@ -307,7 +305,7 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
                     bone['dof'] = _dofs(values)
             elif section == 'hierarchy' and key not in ('begin', 'end'):
                 if words[0] not in ('root', *children):
-                    raise ValueError('a bone whose own parent is not named above')
+                    raise ValueError('a bone whose parent is not named above')
                 for child in values:
                     if child not in bones:
                         raise ValueError(errors.unknown('bone', child, bones))
@@ -354,7 +352,7 @@ def _dofs(values: Sequence[str]) -> list[str]:
 
 
 def _frames(path: pathlib.Path, bones: dict[str, dict[str, Any]]) -> list[dict[str, list[float]]]:
-    """Reads a .amc file: the numbers of every bone, frame by frame."""
+    """Reads a .amc file: for every frame, the values of every bone."""
     frames: list[dict[str, list[float]]] = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()

@@ -1,9 +1,9 @@
 """A clip: one reference motion as key frames, sampled at any time.
 
 Sampling follows the original simulator (anim/Motion.cpp): positions and angles interpolate
-linearly, rotations along the shorter arc, and a looping clip goes on where it ended: its root
-displacement accumulates, height included, its heading only if the clip says so. The velocity
-differs on purpose: a central instead of a forward difference, over the same 1/60 s.
+linearly, rotations along the shorter arc. In a looping clip the root displacement accumulates over
+cycles, height included, and the heading if `turning` is set. The velocity differs intentionally: a
+central instead of a forward difference, over the same 1/60 s.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from trl_suite.motion import quaternion
 from trl_suite.motion.layout import LARGEST, Layout, Mirror
 from trl_suite.util import archive, errors, resources
 
-VELOCITY_STEP = 1 / 60  # s between the two poses of a velocity
-STEPS_SUFFIX = '_steps'  # of the names of files that hold a step library instead of a clip
+VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
+STEPS_SUFFIX = '_steps'  # suffix of files that contain a step library instead of a clip
 _UNIT_TOLERANCE = 1e-6
-_STRAIGHT = 1e-9  # rad; a cycle that turns less goes straight on
+_STRAIGHT = 1e-9  # rad; a cycle with a smaller heading change is straight
 _FIELDS: dict[str, tuple[str, int] | None] = {
     'times': None,
     'poses': None,
@@ -51,8 +51,8 @@ class Clip:
       sizes: columns per joint, 1 for a hinge (rad), 4 for a ball joint (unit quaternion wxyz).
       loop: whether the motion repeats.
       description: one line.
-      turning: whether the heading that a cycle gains accumulates too, as on a circle; else every
-        cycle of a loop repeats the heading of the first. Needs a free root.
+      turning: whether the heading change of a cycle accumulates too, as on a circle; otherwise
+        every cycle of a loop has the heading of the first. Needs a free root.
 
     Raises:
       ValueError: if a field is malformed; the message names clip and field.
@@ -71,7 +71,7 @@ class Clip:
     def __post_init__(self) -> None:
         for field in ('times', 'poses'):
             try:
-                array = np.array(getattr(self, field), dtype=float)  # a copy, to be locked
+                array = np.array(getattr(self, field), dtype=float)  # a copy, made read-only
             except (TypeError, ValueError) as error:
                 raise self._error(field, f'an array of numbers is needed ({error})') from None
             array.setflags(write=False)
@@ -123,10 +123,10 @@ class Clip:
 
     @functools.cached_property
     def _cycle(self) -> np.ndarray:
-        """What a cycle adds to the pose, shape (d,): the displacement and whole turns of pitch."""
+        """Change of the pose per cycle, shape (d,): displacement and full rotations of pitch."""
         change = np.zeros(self.poses.shape[1])
         change[: self.displacement.size] = self.displacement
-        if self.root == 'planar':  # a somersault must not unwind at the seam
+        if self.root == 'planar':  # pitch must not jump back after a somersault
             turns = np.round((self.poses[-1, 2] - self.poses[0, 2]) / (2 * np.pi))
             change[2] = 2 * np.pi * turns
         return change
@@ -144,7 +144,7 @@ class Clip:
 
     @property
     def heading_change(self) -> float:
-        """What a cycle adds to the heading of a free root, rad in (-pi, pi]; planar: 0."""
+        """Change of a free root's heading per cycle, rad in (-pi, pi]; planar: 0."""
         if self.root == 'planar':
             return 0.0
         start, end = quaternion.heading(self.poses[[0, -1], 3:7])
@@ -159,8 +159,8 @@ class Clip:
         """Returns the poses at times `t` in s.
 
         Args:
-          t: times, any shape (...), negative ones too. A looping clip repeats with its displacement
-            accumulated, before time 0 as well; any other clip holds its first and last frame.
+          t: times, any shape (...), may be negative. A looping clip repeats with its displacement
+            accumulated, also before time 0; any other clip holds its first and last frame.
 
         Returns:
           Poses, shape (..., d).
@@ -176,10 +176,10 @@ class Clip:
         return poses + cycle[..., None] * self._cycle
 
     def _turned(self, poses: np.ndarray, cycle: np.ndarray) -> np.ndarray:
-        """Returns poses of the first cycle where later cycles (...) have them."""
+        """Moves poses of the first cycle to later cycles (...)."""
         turn = self.heading_change
         angle = cycle * turn
-        # The displacements of k cycles are the sides of a polygon: its chord.
+        # The displacements of cycles are the sides of a polygon; that of k cycles is its chord.
         small = abs(turn) < _STRAIGHT
         chord = cycle if small else np.sin(angle / 2) / np.sin(turn / 2)
         start, way = self.poses[0, :3], self.displacement
@@ -207,7 +207,7 @@ class Clip:
         return self.state(t)[1]
 
     def state(self, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what `pose` and `velocity` do, in one go."""
+        """Returns the results of `pose` and `velocity` in one call."""
         t = np.asarray(t, dtype=float)
         start, end = t - VELOCITY_STEP / 2, t + VELOCITY_STEP / 2
         if not self.loop:
@@ -228,27 +228,27 @@ class Clip:
     def mirrored(self, pairs: Iterable[tuple[str, str]] | None = None) -> Clip:
         """Returns the clip with left and right exchanged.
 
-        Hinge angles keep their sign, which is right for hinges about the lateral axis, the only
-        ones our characters have. Rotations and the path of a free root are reflected in the
+        Hinge angles keep their sign, which is correct for hinges about the lateral axis, the only
+        ones of the shipped characters. Rotations and the path of a free root are reflected in the
         x-z plane.
 
         Args:
-          pairs: names of joints to swap, (right, left) in either order. Others keep their place. By
-            default the joints named right_... and left_....
+          pairs: names of joints to swap, (right, left) in either order. Other joints keep their
+            columns. By default the joints named right_... and left_....
 
         Raises:
-          ValueError: if a name is unknown or a pair's joints differ in kind.
+          ValueError: if a name is unknown or the joints of a pair differ in type.
         """
         mirror = self.layout.mirror if pairs is None else Mirror(self.layout, pairs)
         return dataclasses.replace(self, poses=mirror.pose(self.poses))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the clip as .npz without pickled objects; an old file stays until it is whole."""
+        """Writes the clip as .npz without pickled objects; an old file is replaced at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
 def load(path_or_name: str | os.PathLike[str]) -> Clip:
-    """Returns a shipped clip by name, or any clip that `Clip.save` wrote by its path.
+    """Returns a shipped clip by its name, or a clip that `Clip.save` wrote by its path.
 
     Args:
       path_or_name: a name of `names()`, or a path: a string that ends in .npz, or a PathLike.
@@ -275,7 +275,7 @@ def names() -> list[str]:
 def shipped(
     path_or_name: str | os.PathLike[str], kind: str, known: list[str], suffix: str = ''
 ) -> pathlib.Path:
-    """Returns the path of a shipped file, or the path itself: a PathLike or ending in .npz.
+    """Returns the path of a shipped file, or the argument if it is a PathLike or ends in .npz.
 
     Raises:
       ValueError: for a name that is not `known` (names the closest).

@@ -1,4 +1,4 @@
-"""The columns of poses and velocities: what interpolates how, and what mirroring exchanges."""
+"""The columns of poses and velocities, their interpolation and mirroring."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Layout:
     """
 
     def __init__(self, root: str, joints: Sequence[str], sizes: Sequence[int]) -> None:
-        """Numbers the columns.
+        """Assigns the columns.
 
         Args:
           root: 'planar' or 'free'.
@@ -72,7 +72,7 @@ class Layout:
         self._straight_rates = np.setdiff1d(np.arange(self.rates), self._turns)
 
     def blend(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns poses a share `u` (...) of the way between poses (..., columns)."""
+        """Interpolates poses (..., columns) from `before`, u = 0, to `after`, u = 1; u is (...)."""
         poses = before + u[..., None] * (after - before)
         if self.rotations:
             here = self._quaternions
@@ -80,9 +80,9 @@ class Layout:
         return poses
 
     def change(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Returns the way from poses `a` to `b` in the columns of a velocity, (..., rates).
+        """Returns the difference of poses `a` and `b` in the columns of a velocity, (..., rates).
 
-        Rotations give the rotation vector in the axes of the turning body.
+        Rotations become rotation vectors from `a` to `b` in body axes.
         """
         change = np.empty((*a.shape[:-1], self.rates))
         change[..., self._straight_rates] = (b - a)[..., self._straight]
@@ -94,7 +94,7 @@ class Layout:
 
     @functools.cached_property
     def mirror(self) -> Mirror:
-        """The exchange of left and right by the joints' names: right_x for left_x."""
+        """The exchange of left and right by joint names: right_x for left_x."""
         return Mirror(
             self,
             [
@@ -116,8 +116,8 @@ class Layout:
 class Mirror:
     """The exchange of left and right, a reflection in the x-z plane.
 
-    Hinge angles keep their sign, which is right for hinges about the lateral axis, the only ones
-    our characters have. Rotations and the path of a free root are reflected.
+    Hinge angles keep their sign, which is correct for hinges about the lateral axis, the only ones
+    of the shipped characters. Rotations and the path of a free root are reflected.
     """
 
     def __init__(self, layout: Layout, pairs: Iterable[tuple[str, str]]) -> None:
@@ -125,10 +125,11 @@ class Mirror:
 
         Args:
           layout: of the poses and velocities.
-          pairs: names of joints to swap, (right, left) in either order. Others keep their place.
+          pairs: names of joints to swap, (right, left) in either order. Other joints keep their
+            columns.
 
         Raises:
-          ValueError: if a name is unknown or a pair's joints differ in kind.
+          ValueError: if a name is unknown or the joints of a pair differ in type.
         """
         self._pose_source, self._rate_source = np.arange(layout.columns), np.arange(layout.rates)
         self._pose_sign, self._rate_sign = np.ones(layout.columns), np.ones(layout.rates)

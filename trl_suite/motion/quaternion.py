@@ -9,17 +9,17 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns what `numpy.cross` does of (..., 3); of few vectors ten times as fast."""
+    """Returns `numpy.cross` of vectors (..., 3); ten times as fast for few vectors."""
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 def slerp(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns the rotation a share `u` of the shorter way from `a` to `b`, normalised.
+    """Interpolates along the shorter arc from `a` (u = 0) to `b` (u = 1); normalised.
 
     Args:
       a: shape (..., 4).
       b: shape (..., 4).
-      u: shares, shape (...).
+      u: interpolation parameters, shape (...).
     """
     b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -b, b)
     # Twice the half-angle between the 4-vectors; unlike arccos exact for small angles.
@@ -46,7 +46,7 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(q: np.ndarray) -> np.ndarray:
-    """Returns axis times angle of the shorter way, rad, shape (..., 3)."""
+    """Returns rotation vectors, axis times angle of at most pi, rad, shape (..., 3)."""
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
@@ -61,13 +61,13 @@ def from_vector(vector: np.ndarray) -> np.ndarray:
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the shortest turn of the direction `a` into `b`, both (..., 3), any length."""
+    """Returns the smallest rotation of the direction `a` to `b`, both (..., 3), of any length."""
     a = a / np.linalg.norm(a, axis=-1, keepdims=True)
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
     across = cross(a, b)
     sine = np.linalg.norm(across, axis=-1, keepdims=True)
     angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
-    # Opposite directions have no shortest turn; any one across them will do.
+    # For opposite directions the smallest rotation is not unique; any perpendicular axis is used.
     other = cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
     flat = sine < _SMALL
     axis = np.where(flat, other, across)
@@ -75,13 +75,13 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def angle_about(q: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Returns by how much rotations (..., 4) turn about an axis (3,), rad in (-pi, pi]; (...)."""
+    """Returns the angles of rotations (..., 4) about an axis (3,), rad in (-pi, pi]; (...)."""
     angle = 2 * np.arctan2(q[..., 1:] @ np.asarray(axis, float), q[..., 0])
     return np.pi - (np.pi - angle) % (2 * np.pi)
 
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Returns vectors (..., 3) after rotations (..., 4); leading axes broadcast."""
+    """Returns vectors (..., 3) rotated by quaternions (..., 4); leading axes broadcast."""
     w, axis = q[..., :1], q[..., 1:]
     across = 2 * cross(axis, v)
     return v + w * across + cross(axis, across)
@@ -100,13 +100,13 @@ def about_z(angle: np.ndarray) -> np.ndarray:
 
 
 def heading(q: np.ndarray) -> np.ndarray:
-    """Returns the direction of the turned x axis in the ground plane, rad, shape (...)."""
+    """Returns the direction of the rotated x axis in the ground plane, rad, shape (...)."""
     w, x, y, z = (q[..., i] for i in range(4))
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def turned(way: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Returns (x, y) turned by an angle about the vertical; broadcasts (..., 2) and (...)."""
+    """Returns (x, y) rotated by an angle about the vertical; broadcasts (..., 2) and (...)."""
     x, y, cos, sin = way[..., 0], way[..., 1], np.cos(angle), np.sin(angle)
     result = np.empty((*np.broadcast_shapes(x.shape, np.shape(angle)), 2))
     result[..., 0] = cos * x - sin * y

@@ -3,10 +3,11 @@
 Both hold `Frames`, arrays of [duration of the frame in s, root x, y, z, root quaternion wxyz, then
 one number per hinge and a quaternion wxyz per ball joint, in the order of the character file]. They
 differ in `Loop`: a boolean in TerrainRL, 'wrap' or 'none' in DeepMimic, which also centres the
-root, does not carry its height over a cycle and may carry its heading.
+root, does not accumulate its height over cycles, and may accumulate its heading.
 
-The files' frame has x forward, y up and z to the right. Turned into ours, (x, y, z) -> (x, -z, y),
-hinge angles keep their sign: their hinges turn about +z, ours about (0, -1, 0), the same axis.
+The files' frame has x forward, y up and z to the right. In the frame of trl_suite,
+(x, y, z) -> (x, -z, y), hinge angles keep their sign: hinges of the files are about +z, those here
+about (0, -1, 0), which is the same axis.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from trl_suite.motion.layout import JOINT_SIZES, LARGEST
 from trl_suite.util.files import read_json, replacing
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
-_FLAT = 1e-4  # m, and length of a quaternion part, that a planar motion may leave the plane by
+_FLAT = 1e-4  # m, and quaternion components: largest deviation of a planar motion from the plane
 _ZERO = 1e-6  # length below which a quaternion has no direction
 
 
@@ -61,10 +62,10 @@ def read_terrainrl(
       path: JSON file.
       joints: joint names in the order of the character file.
       sizes: columns of each, 1 (hinge) or 4 (ball).
-      root: 'planar' or 'free'; a planar file stores the full root, too.
+      root: 'planar' or 'free'; files of planar motions store the full root, too.
 
     Returns:
-      The clip in our frame, named after the file, quaternions normalised.
+      The clip in the frame of trl_suite, named after the file, with normalised quaternions.
 
     Raises:
       ValueError: if the file is malformed or does not match the layout; the message names the file,
@@ -84,12 +85,12 @@ def read_deepmimic(
     joints: Sequence[str] | None = None,
     sizes: Sequence[int] | None = None,
 ) -> Clip:
-    """Reads a DeepMimic motion file.
+    """Reads a DeepMimic motion file; the default layout is that of humanoid3d.
 
-    As in DeepMimic the first frame is moved over the origin, and `CycleSyncRootRot` lets the
-    heading that a cycle gains accumulate. A looping clip gains no height over cycles unless
-    `CycleSyncRootHeight` is set: what the frames gain is taken out evenly, where DeepMimic would
-    jump at the seam.
+    As in DeepMimic, the first frame is moved to the origin, and with `CycleSyncRootRot` the heading
+    accumulates over cycles. The height of a looping clip accumulates only if `CycleSyncRootHeight`
+    is set: otherwise the change of height over a cycle is removed evenly from the frames, where
+    DeepMimic would jump between cycles.
 
     Args:
       path: JSON file.
@@ -98,10 +99,11 @@ def read_deepmimic(
       sizes: columns of each, 1 (hinge) or 4 (ball).
 
     Returns:
-      The clip in our frame, root 'free', named after the file, quaternions normalised.
+      The clip in the frame of trl_suite, root 'free', named after the file, with normalised
+      quaternions.
 
     Raises:
-      ValueError: as `read_terrainrl`, and for a looping clip whose displacement shall not
+      ValueError: as `read_terrainrl`, and for a looping clip whose displacement does not
         accumulate (`CycleSyncRootPos` false).
       FileNotFoundError: if there is no such file.
     """
@@ -145,7 +147,7 @@ def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
 def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
     """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged.
 
-    Such a file does not know that a heading accumulates: of a turning clip it holds one cycle.
+    The format cannot express an accumulating heading: of a turning clip the file has one cycle.
     """
     durations = np.append(np.diff(clip.times), 0.0)
     n = len(clip.times)
@@ -206,7 +208,7 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
 
 
 def _field(column: int, joints: Sequence[str] = (), sizes: Sequence[int] = ()) -> str:
-    """Names a column of a frame."""
+    """Returns the name of a column of a frame, for messages."""
     if column < _HEADER:
         return 'duration' if column == 0 else 'root position' if column < 4 else 'root quaternion'
     for joint, size in zip(joints, sizes, strict=True):
@@ -226,12 +228,12 @@ def _balls(sizes: Sequence[int]) -> Iterator[int]:
 
 
 def _upright(q: np.ndarray) -> np.ndarray:
-    """Returns quaternions of our frame in the files' frame: (x, y, z) -> (x, z, -y)."""
+    """Converts quaternions to the files' frame: (x, y, z) -> (x, z, -y)."""
     return q[:, [0, 1, 3, 2]] * np.array([1, 1, 1, -1])
 
 
 def _lying(q: np.ndarray) -> np.ndarray:
-    """Returns quaternions of the files' frame in ours: (x, y, z) -> (x, -z, y)."""
+    """Converts quaternions from the files' frame: (x, y, z) -> (x, -z, y)."""
     return q[:, [0, 1, 3, 2]] * np.array([1, 1, -1, 1])
 
 

@@ -1,14 +1,15 @@
-"""A library of single steps, and the choice of the clip nearest to a plan, for many at once.
+"""A library of single steps, and the batched selection of the clip nearest to a plan.
 
-Every clip is one step that begins in right stance, the moment both feet are down, and ends when
-the left foot lands. Left stance plays the same clips mirrored. The stance foot (its ankle, where
-the foot stands flat) is over the origin and the walker heads along x at the start; the pelvis turns
-about that heading a little as it walks.
+Every clip is one step that begins in right stance, when both feet are on the ground, and ends when
+the left foot lands. For left stance the same clips are mirrored. The stance foot (its ankle, where
+the foot is flat on the ground) is over the origin, and the walker's heading is along x at the
+start; the heading of the pelvis oscillates slightly about it.
 
-Clips are chosen as the original does (anim/MocapStepController.cpp) by seven features, `FEATURES`,
-of the moment and the plan, all seen along the root's present heading. Its weights scale with the
-spread of each feature over the library; ours are fixed, and drop the places of the feet at the
-start, which are alike in all clips of a library that varies one step after another.
+As in the original (anim/MocapStepController.cpp), clips are selected by seven features, `FEATURES`,
+of the current state and the plan, relative to the current heading of the root. The original's
+weights scale with the spread of each feature over the library; here they are fixed, and those of
+the feet at the start are 0, as these are similar in all clips of a library that varies one step
+after another.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ FEATURES = (
     *('left foot ahead of the root', 'left foot left of the root'),
     *('landing place ahead of the stance foot', 'landing place left of the stance foot'),
     'heading after the step',
-)  # m, m, m, m, m, m, rad; of a walker in right stance
+)  # m, m, m, m, m, m, rad; for a walker in right stance
 WEIGHTS = (0.0, 0.0, 0.0, 0.0, 0.54, 0.54, 0.48)  # of the features, 1/m and 1/rad
-_REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # features in left stance
+_REFLECTED = np.array([1, -1, 1, -1, 1, -1, -1])  # signs of features in left stance
 _FIELDS: dict[str, tuple[str, int] | None] = {
     'times': None,
     'poses': None,
@@ -57,10 +58,10 @@ class Steps:
       joints: joint names in the character's link order.
       sizes: columns per joint.
       labels: length m (forward), width m (outwards, to the swing side) and turn rad (change of
-        heading, positive to the swing side) of each step, shape (k, 3): where the swing foot lands,
-        from the stance foot. They hold for mirrored steps as well.
-      previous: labels of the step before each, shape (k, 3): where the swing foot comes from.
-      features: of each clip at its start, with its own landing as the plan, shape (k, 7).
+        heading, positive to the swing side) of each step, shape (k, 3): the landing place of the
+        swing foot relative to the stance foot. The same for mirrored steps.
+      previous: labels of the step before each, shape (k, 3): start place of the swing foot.
+      features: of each clip at its start, with its own landing place as the plan, shape (k, 7).
       description: one line.
 
     Raises:
@@ -80,7 +81,7 @@ class Steps:
     def __post_init__(self) -> None:
         for field in ('times', 'poses', 'labels', 'previous', 'features'):
             try:
-                array = np.array(getattr(self, field), dtype=float)  # a copy, to be locked
+                array = np.array(getattr(self, field), dtype=float)  # a copy, made read-only
             except (TypeError, ValueError) as error:
                 raise self._error(field, f'an array of numbers is needed ({error})') from None
             array.setflags(write=False)
@@ -96,7 +97,7 @@ class Steps:
             if not (np.abs(array) < LARGEST).all():
                 raise self._error(field, 'not finite, or too large')
         for i in range(len(self)):
-            self.clip(i)  # checks the rest
+            self.clip(i)  # checks the other fields
 
     def _error(self, field: str, what: str) -> ValueError:
         return ValueError(f'steps {self.name!r}, {field}: {what}')
@@ -132,9 +133,9 @@ class Steps:
         """Returns poses of steps, each at its own time.
 
         Args:
-          index: clips, any shape (...) that broadcasts with `t`.
+          index: indices of clips, any shape (...) that broadcasts with `t`.
           t: times in s, clamped to the step.
-          mirrored: where the step is one in left stance, broadcasts too.
+          mirrored: True for a step in left stance, broadcasts too.
 
         Returns:
           Poses, shape (..., d).
@@ -147,7 +148,7 @@ class Steps:
         return _mirrored(mirrored, poses, self.layout.mirror.pose)
 
     def velocity(self, index: ArrayLike, t: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns velocities of steps as `Clip.velocity` does; the ends have a one-sided one."""
+        """Returns velocities of steps as `Clip.velocity` does, with one-sided ends."""
         which, time = np.broadcast_arrays(np.asarray(index), np.asarray(t, dtype=float))
         time = np.clip(time, 0, self.duration)
         start = np.maximum(time - VELOCITY_STEP / 2, 0)
@@ -157,7 +158,7 @@ class Steps:
         return _mirrored(mirrored, velocity, self.layout.mirror.velocity)
 
     def landing(self, index: ArrayLike, mirrored: ArrayLike = False) -> np.ndarray:
-        """Returns labels with a fixed sense: forward m, to the left m, turn to the left rad."""
+        """Returns labels with fixed directions: forward m, to the left m, turn to the left rad."""
         sign = np.where(mirrored, -1, 1)[..., None]
         return self.labels[np.asarray(index)] * np.where([False, True, True], sign, 1)
 
@@ -165,7 +166,7 @@ class Steps:
         """Returns the clip nearest to each query.
 
         Args:
-          query: features of the moment and the plan, shape (n, 7); see `features`.
+          query: features of the current state and the plan, shape (n, 7); see `features`.
           weights: of the features, shape (7,). Distance is the norm of the weighted difference.
 
         Returns:
@@ -175,7 +176,7 @@ class Steps:
         return np.argmin((gap * gap).sum(axis=2), axis=1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the library as .npz without pickled objects, whole or not at all."""
+        """Writes the library as .npz without pickled objects; replaces an old file at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
@@ -188,19 +189,19 @@ def features(
     target_heading: np.ndarray,
     right_stance: np.ndarray,
 ) -> np.ndarray:
-    """Returns what clips are chosen by, for n walkers; see `FEATURES`.
+    """Returns the features by which clips are selected, for n walkers; see `FEATURES`.
 
     Args:
       root: position, world x and y in m, shape (n, 2).
       heading: direction of the root's x axis in the ground plane, rad, shape (n,).
       right: right ankle, x and y in m, shape (n, 2).
       left: left ankle, x and y in m, shape (n, 2).
-      target: where the swing ankle shall land, x and y in m, shape (n, 2).
+      target: planned landing place of the swing ankle, x and y in m, shape (n, 2).
       target_heading: the planned heading in the world, rad, shape (n,).
       right_stance: whether the right foot is the stance foot, shape (n,).
 
     Returns:
-      Shape (n, 7); those of a walker in left stance are mirrored.
+      Features, shape (n, 7); for walkers in left stance, mirrored.
     """
     side = np.asarray(right_stance)[..., None]
     stance, swing = np.where(side, right, left), np.where(side, left, right)
@@ -214,7 +215,7 @@ def features(
 
 
 def load(path_or_name: str | os.PathLike[str]) -> Steps:
-    """Returns a shipped library by its character's name, or any by the path it was saved to.
+    """Returns a shipped library by its character's name, or a saved one by its path.
 
     Args:
       path_or_name: a name of `names()`, or a path: a string that ends in .npz, or a PathLike.
@@ -233,7 +234,7 @@ def load(path_or_name: str | os.PathLike[str]) -> Steps:
 
 
 def names() -> list[str]:
-    """Returns the names of the shipped libraries, those of their characters, sorted."""
+    """Returns the sorted names of the shipped libraries, which are names of characters."""
     found = resources.directory('mocap').glob(f'*{STEPS_SUFFIX}.npz')
     return sorted(path.stem.removesuffix(STEPS_SUFFIX) for path in found)
 
@@ -241,7 +242,7 @@ def names() -> list[str]:
 def _mirrored(
     where: ArrayLike, values: np.ndarray, mirror: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Returns values (..., c), mirrored in the rows `where` (...) says so."""
+    """Returns values (..., c), mirrored where `where` (...) is true."""
     where = np.asarray(where)
     if not where.any():
         return values

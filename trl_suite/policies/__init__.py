@@ -1,4 +1,4 @@
-"""Trained policies as data: small networks in .npz files, run with NumPy alone."""
+"""Trained policies as data: small networks in .npz files, evaluated with NumPy only."""
 
 from trl_suite.policies.files import available, load, reference, save
 from trl_suite.policies.network import ACTIVATIONS, Convolution, Policy, placed

@@ -1,4 +1,4 @@
-"""Trained policies as data: a small network in one .npz file, run with NumPy alone.
+"""Trained policies as data: a small network in one .npz file, evaluated with NumPy only.
 
     from trl_suite import policies, suite
 
@@ -19,7 +19,7 @@ of observations, L the number of layers, c the number of inputs of the network: 
     block_names  U (B,)      observation blocks in order
     block_sizes  int (B,)    numbers in each; they sum to k
     actions      U (a,)      names of the actions in order
-    quantity     U ()        what an action sets, e.g. 'target angle'
+    quantity     U ()        quantity that an action controls, e.g. 'target angle'
     mean, std    float (c,)  normalisation: (observation - mean) / std
     clip         float ()    bound of the normalised observation
     activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
@@ -27,47 +27,48 @@ of observations, L the number of layers, c the number of inputs of the network: 
     weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
     bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
-    info         U ()        a JSON object: how the policy was made
+    info         U ()        a JSON object: how the policy was trained
 
-and, if the policy sees left stance as right stance in a mirror (see `trl_suite.policies.mirror`):
+and, if the policy maps left stance to right stance by reflection (see `trl_suite.policies.mirror`):
 
     mirror_phase              int ()    column of the phase; or
-    mirror_feet               int (2,)  columns of how far ahead the right and the left foot are
-    mirror_observation_index  int (k,)  what stands where in a reflected observation
+    mirror_feet               int (2,)  columns of the right and the left foot's forward position
+    mirror_observation_index  int (k,)  source column of each column of a reflected observation
     mirror_observation_sign   float (k,)
     mirror_action_index       int (a,)
     mirror_action_sign        float (a,)
 
-and, if the network sees p places that are observed as bearing and distance in a straight line, too:
+and, if the network has additional Cartesian inputs for p places that are observed as bearing and
+distance:
 
     places       int (p, 2)  columns of the bearing, rad, and of the distance, m, after any mirror;
-                             `placed` has what it sees of them, after all else
+                             `placed` appends the additional inputs
 
-and, if the network sees only a part of it, say of a map of the terrain what is near:
+and, if the network uses only some columns, e.g. the near part of a height map:
 
     columns      int (c,)    of the observation, after any mirror and with the 2p numbers of places
 
-and, if it chooses among b actions instead of composing one, as mixtures of experts do:
+and, if it selects one of b actions, as mixtures of experts do:
 
-    choices      float (b, a)  the action is the simulation whose output is the largest
+    choices      float (b, a)  the action is the row whose output is the largest
 
-and, if the first l of its inputs are a line, say of ground heights, that goes through C convolutions
-before the other c - l inputs join what comes out, position by position:
+and, if the first l of its inputs are a line, e.g. of ground heights, that passes C convolutions,
+whose outputs, position by position, are followed by the other c - l inputs:
 
     line           int ()    l
     strides        int (C,)  of each layer
     filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters); channel 0 of the
                              first is the line; window (positions, channels) @ filter
     filter_bias_0  float     (filters,); the activation is that of the hidden layers
-    origin         int ()    optional: number of the input that is subtracted from each of the line
-                             before the normalisation, as the height of the root is
+    origin         int ()    optional: index of the input that is subtracted from each of the line
+                             before the normalisation, such as the height of the root
 
-and, if what the hidden layers sum up is brought to mean 0 and standard deviation 1 (over the layer's
-outputs, with 1e-5 added to the variance) before the activation:
+and, if hidden layers have layer normalisation before the activation: mean 0 and standard deviation
+1 over the layer's outputs, with 1e-5 added to the variance:
 
     layer_norm   int ()      1
 
-Floats are written as float32, or as float16 where nothing is lost by it.
+Floats are written as float32, or as float16 if that is exact.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ from trl_suite.util.files import check_path, existing, load_arrays, replacing
 
 FORMAT = 'trl_suite policy'
 VERSION = 1
-# Key in the file -> kinds of dtype, number of axes.
+# Key in the file -> dtype kinds, number of axes.
 _FIELDS = {
     'format': ('U', 0), 'version': ('iu', 0), 'id': ('U', 0), 'block_names': ('U', 1),
     'block_sizes': ('iu', 1), 'actions': ('U', 1), 'quantity': ('U', 0), 'mean': ('f', 1), 'std': ('f', 1),
@@ -103,7 +104,7 @@ _LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
-    """Writes a policy as .npz; an old file stays until the new one is whole.
+    """Writes a policy as .npz; an old file is replaced when the new one is complete.
 
     Raises:
       ValueError: another suffix.
@@ -196,7 +197,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
                 raise ValueError('is unknown')
             read.field = 'layers'
             raise ValueError(f'is {len(weights)}, and there are arrays of others')
-    except Exception as error:  # a damaged archive fails in a dozen ways
+    except Exception as error:  # damaged archives raise many types of errors
         where = f'field {read.field!r}' if read.field else 'no readable policy'
         raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
     names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
@@ -242,7 +243,7 @@ def available() -> tuple[str, ...]:
 
 
 def _small(value: Any) -> Any:
-    """Returns an array in half precision, if nothing is lost by it."""
+    """Returns an array in half precision, if that is exact."""
     if not isinstance(value, np.ndarray) or value.dtype != np.float32:
         return value
     with np.errstate(over='ignore'):
@@ -251,7 +252,7 @@ def _small(value: Any) -> Any:
 
 
 class _Reader:
-    """Takes arrays out of an archive, and knows which one it took last and which it took."""
+    """Reads arrays from an archive; remembers the last field and all fields that were read."""
 
     def __init__(self) -> None:
         self.archive: Any = {}
@@ -269,7 +270,7 @@ class _Reader:
         return array
 
     def layers(self, kind: str, count: int, axes: int) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Returns weights and biases of so many layers, of a kind other than fully connected."""
+        """Returns weights and biases of `count` layers of one kind."""
         weight, bias = (kind, f'{kind}_bias') if kind else ('weight', 'bias')
         found = [
             (self(f'{weight}_{i}', 'f', axes), self(f'{bias}_{i}', 'f', 1)) for i in range(count)

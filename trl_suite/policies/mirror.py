@@ -1,7 +1,7 @@
-"""Left for right: observations and actions of a walker in left stance as in right stance.
+"""Reflection of observations and actions in left stance to those of right stance.
 
-Half of what a symmetric walker must learn is the other half seen in a mirror. `Mirror` is data: it
-reflects what a policy sees while the left foot stands, and reflects back what the policy answers.
+A symmetric walker needs to learn only right stance. `Mirror` is data: it reflects a policy's
+observations in left stance, and reflects the resulting actions back.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
-    """How an observation (n, size) and an action (n, k) look in a mirror.
+    """The reflection of observations (n, size) and actions (n, k).
 
     Attributes:
-      observation_index, observation_sign: a reflected observation is `o[:, index] * sign`, and its
-        phase half a cycle less or more; (size,).
+      observation_index, observation_sign: a reflected observation is `o[:, index] * sign`, with its
+        phase shifted by half a cycle; (size,).
       action_index, action_sign: a reflected action is `a[:, index] * sign`, (k,).
-      phase: the column that holds the phase of the cycle; from 0.5 on the left foot stands.
-      feet: if no column does, those of how far ahead the right foot and the left foot are: where a step
-        begins, the foot stands that is ahead.
+      phase: column of the phase of the cycle; left stance is from 0.5 to 1.
+      feet: if there is no such column, those of the forward positions of the right and the left
+        foot: at the start of a step, the stance foot is the one ahead.
     """
 
     observation_index: np.ndarray
@@ -32,10 +32,10 @@ class Mirror:
     feet: tuple[int, int] | None = None
 
     def check(self, observations: int, actions: int) -> None:
-        """Checks that this reflects observations and actions of so many numbers.
+        """Checks that the fields fit these numbers of observations and actions.
 
         Raises:
-          ValueError: it does not; the message names the field.
+          ValueError: they do not fit; the message names the field.
         """
         for kind, size in (('observation', observations), ('action', actions)):
             index, sign = getattr(self, f'{kind}_index'), getattr(self, f'{kind}_sign')
@@ -46,13 +46,13 @@ class Mirror:
         if (self.phase is None) == (self.feet is None):
             raise ValueError('mirror_phase, mirror_feet: expected one of them')
         if self.phase is not None and not 0 <= self.phase < observations:
-            raise ValueError(f'mirror_phase: {self.phase} is no column of {observations}')
+            raise ValueError(f'mirror_phase: {self.phase} is not one of {observations} columns')
         if self.feet is not None:
             right, left = self.feet if len(self.feet) == 2 else (-1, -1)
             if not 0 <= right < observations or self.observation_index[right] != left:
                 raise ValueError(
-                    f'mirror_feet: {tuple(self.feet)} are no two of {observations} columns that stand '
-                    'for each other'
+                    f'mirror_feet: {tuple(self.feet)}; expected two of {observations} columns that '
+                    'the reflection exchanges'
                 )
 
     def left(self, observation: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class Mirror:
         return action.take(self.action_index, 1) * self.action_sign
 
     def canonical(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns observations as in right stance, and which of them were of left stance."""
+        """Returns observations, reflected if in left stance, and which were in left stance."""
         left = self.left(observation)
         if left.all():
             return self.observation(observation), left
@@ -83,7 +83,7 @@ class Mirror:
         return observation, left
 
     def unmirror_action(self, action: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Returns actions, those that answer to left stance reflected."""
+        """Returns actions, reflected where `left`."""
         if left.all():
             return self.action(action)
         if left.any():
@@ -92,7 +92,7 @@ class Mirror:
 
 
 def exchanged(count: int, pairs: list[tuple[int, int]]) -> np.ndarray:
-    """Returns the numbers of 0 to count - 1 with those of each pair exchanged."""
+    """Returns the indices 0 to count - 1 with those of each pair exchanged."""
     index = np.arange(count)
     for a, b in pairs:
         index[a], index[b] = b, a
@@ -100,10 +100,10 @@ def exchanged(count: int, pairs: list[tuple[int, int]]) -> np.ndarray:
 
 
 def blocks(index: np.ndarray, signs: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns index and sign of columns that come in equal blocks.
+    """Returns index and sign of columns that form blocks of equal size.
 
     Args:
-      index: which block takes the place of each, (b,).
+      index: source block of each block, (b,).
       signs: of the columns of a block, c of them.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A policy: a small network from observations to actions, run with NumPy alone."""
+"""A policy: a small network from observations to actions, evaluated with NumPy only."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     'relu': lambda x: np.maximum(x, 0),
     'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
 }
-_FLAT = 'observations'  # key of the flat vector, where an environment gives one
-_LEAST_VARIANCE = 1e-5  # of the sums of a layer that are brought to deviation 1
+_FLAT = 'observations'  # key of the flat vector, if an environment returns one
+_LEAST_VARIANCE = 1e-5  # added to the variance in layer normalisation
 _LARGEST = float(np.finfo(np.float32).max)  # that a sum may reach
-REACH = 1.0  # m; within which a network sees where a place is, and farther away its direction
+REACH = 1.0  # m; `placed` keeps the positions of nearer places, and the directions of others
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Convolution:
     """1-D convolutions over a line, the first l inputs of a network, such as ground heights.
 
-    What comes out takes the place of the line, position by position, before the other inputs.
+    The outputs replace the line, position by position, before the other inputs.
 
     Attributes:
       line: number of inputs that form the line, l.
@@ -36,12 +36,12 @@ class Convolution:
       weights: per layer (width, channels, filters), float32, like all arrays read-only; the first has
         one channel, each other as many as the one before has filters.
       biases: per layer (filters,).
-      origin: number of the input that is subtracted from those of the line, such as the root's
-        height, before they are normalised; None: nothing is.
-      outputs: how many numbers come out: positions times filters of the last layer.
+      origin: index of the input that is subtracted from those of the line, such as the root's
+        height, before normalisation; None for none.
+      outputs: number of outputs: positions times filters of the last layer.
 
     Raises:
-      ValueError: fields do not fit each other; the message names one.
+      ValueError: fields are inconsistent; the message names one.
     """
 
     line: int
@@ -80,7 +80,7 @@ class Convolution:
         put('outputs', positions * channels)
 
     def check(self, inputs: int) -> None:
-        """Raises ValueError unless a network with so many inputs can have it."""
+        """Raises ValueError unless it fits a network with this number of inputs."""
         if not self.line <= inputs:
             raise ValueError(f'line: has {self.line} of {inputs} inputs')
         if self.origin is not None and not 0 <= self.origin < inputs:
@@ -94,13 +94,13 @@ class Convolution:
         return np.concatenate([line, seen[:, self.line :]], axis=1)
 
     def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Returns what comes of normalised inputs (n, c), (n, outputs + c - l)."""
+        """Maps normalised inputs (n, c) to outputs and other inputs, (n, outputs + c - l)."""
         line = x[:, : self.line, None]
         for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
             width, channels, filters = weight.shape
             places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
             windows = line[:, places].reshape(len(x), len(places), width * channels)
-            # One product per simulation, so that it does not depend on how many simulations there are.
+            # One product per simulation, so that results do not depend on the batch size.
             line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
         return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
 
@@ -109,35 +109,35 @@ class Convolution:
 class Policy:
     """A network from observations to actions in [-1, 1].
 
-    Simulation i of a batch gets, bit for bit, the action that it would get alone.
+    Each action of a batch is bitwise equal to that of the single observation.
 
     Attributes:
       id: environment in which the policy was trained.
       blocks: name and size of the observation blocks, in order; k numbers in all.
       actions: names of the a actions, in order.
-      quantity: what an action sets, as `ActionMap.quantity` has it.
-      mean: subtracted from what the network sees, (c,) float32, like all arrays read-only.
-      std: divides what is left, (c,).
+      quantity: quantity that an action controls, as in `ActionMap.quantity`.
+      mean: mean of the inputs, for normalisation, (c,) float32, like all arrays read-only.
+      std: standard deviation of the inputs, for normalisation, (c,).
       clip: bound of the normalised observation.
       weights: per layer (inputs, outputs).
       biases: per layer (outputs,).
       activation: of all layers but the last, convolutions included, one of `ACTIVATIONS`.
       log_std: logarithm of the exploration noise's standard deviation, (a,).
-      info: how the policy was made; what JSON can hold.
-      mirror: how it sees left stance as right stance; None if it sees all as it is.
-      places: columns of bearing and distance of what the network sees in a straight line, too, as
-        `placed` adds it, (p, 2); None: nothing.
-      columns: of the observation, after any mirror and with such places, that the network sees, (c,);
-        None: all.
-      choices: actions of which the one with the largest output is taken, (b, a); None: the outputs
-        are the action.
-      convolution: what the first of the inputs go through before the others join them, so that
-        `weights[0]` has as many inputs as then are left; None: nothing.
-      layer_norm: whether the sums of each fully connected layer but the last are brought to mean 0
-        and standard deviation 1 before the activation.
+      info: how the policy was trained; a JSON object.
+      mirror: the reflection of left stance to right stance; None for none.
+      places: columns of bearing and distance of places for which `placed` adds Cartesian inputs,
+        (p, 2); None for none.
+      columns: columns of the observation, after any mirror and with these inputs, that the network
+        uses, (c,); None for all.
+      choices: actions of which the one with the largest output is selected, (b, a); None: the
+        outputs are the action.
+      convolution: convolutions of the first inputs, whose outputs are then inputs of `weights[0]`,
+        followed by the other inputs; None for none.
+      layer_norm: whether each fully connected layer but the last has layer normalisation before
+        the activation.
 
     Raises:
-      ValueError: a field is malformed, or fields do not fit each other; the message names it.
+      ValueError: a field is malformed, or fields are inconsistent; the message names one.
     """
 
     id: str
@@ -249,15 +249,15 @@ class Policy:
 
     @property
     def observation_size(self) -> int:
-        """How many numbers an observation has, k."""
+        """Size of an observation, k."""
         return sum(size for _, size in self.blocks)
 
     def __call__(self, observation: Any) -> np.ndarray:
         """Returns the action without noise, in [-1, 1].
 
         Args:
-          observation: (k,) or (n, k); or a mapping with all blocks, each (size,) or (n, size), of
-            which entries that are no blocks of the policy are left out.
+          observation: (k,) or (n, k); or a mapping with all blocks, each (size,) or (n, size); its
+            other entries are ignored.
 
         Returns:
           (a,) or (n, a), float64.
@@ -277,13 +277,13 @@ class Policy:
         return np.clip(output + np.exp(self.log_std.astype(float)) * noise, -1, 1)
 
     def check(self, environment: Any) -> None:
-        """Checks that observation and action are what the policy was trained with.
+        """Checks that an environment has the policy's observations and actions.
 
         Args:
           environment: an `Environment` or `VectorEnvironment`.
 
         Raises:
-          ValueError: they are not; the message has both.
+          ValueError: they differ; the message has both.
         """
         blocks = tuple((name, part.stop - part.start) for name, part in environment.blocks.items())
         if blocks != self.blocks:
@@ -327,7 +327,7 @@ class Policy:
 
     @functools.cached_property
     def _scales(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and deviation as doubles, so that they need not be cast at every call."""
+        """Mean and standard deviation as doubles, so that calls need not convert them."""
         return self.mean.astype(float), self.std.astype(float)
 
     def _output(self, flat: np.ndarray) -> np.ndarray:
@@ -346,7 +346,7 @@ class Policy:
         if self.convolution is not None:
             x = self.convolution(x, activation)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            # Row by row, so that an action does not depend on how many rows there are.
+            # One product per row, so that an action does not depend on the batch size.
             x = (x @ weight if len(x) == 1 else np.matmul(x[:, None], weight)[:, 0]) + bias
             if i < len(self.weights) - 1:
                 if self.layer_norm:
@@ -376,15 +376,16 @@ def _largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) 
 
 
 def _bounded(x: np.ndarray, bound: float) -> np.ndarray:
-    """Returns numbers clipped to [-bound, bound]; of few numbers quicker than `numpy.clip`."""
+    """Returns numbers clipped to [-bound, bound]; for few numbers faster than `numpy.clip`."""
     return np.minimum(np.maximum(x, -bound), bound)
 
 
 def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Adds to observations (n, k) how far ahead and to the left places are, (n, k + 2p).
+    """Appends forward and left coordinates of places to observations (n, k), (n, k + 2p).
 
-    A bearing jumps behind the back, and what is near is seen too coarsely beside what is far. So a
-    place within `REACH` is seen where it is, in units of it, and one farther away as a direction.
+    A bearing is discontinuous behind the character, and after normalisation, small distances have a
+    low resolution. So the position of a place within `REACH` is appended in units of `REACH`, and
+    of one farther away its direction.
 
     Args:
       observation: (n, k).
@@ -397,7 +398,7 @@ def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
-    """Returns a read-only copy of numbers of columns."""
+    """Returns a read-only copy of column indices."""
     array = np.array(value)
     if array.ndim != axes or array.dtype.kind not in 'iu' or not array.size:
         raise ValueError(f'{name}: expected integers, at least one')

@@ -1,4 +1,4 @@
-"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps."""
+"""Rendering without a screen: frames, videos, film strips, plots of terrain, height maps."""
 
 from trl_suite.rendering.drawing import Policy, frame, frames, markers, no_gl, watching
 from trl_suite.rendering.pictures import (

@@ -1,4 +1,4 @@
-"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps.
+"""Rendering without a screen: frames of environments.
 
     from trl_suite import suite
     from trl_suite import rendering
@@ -10,9 +10,9 @@
     policy = lambda time_step: environment.task.clip_action(0)
     rendering.video(rendering.frames(environment, policy, steps=90), 'rollout.mp4')
 
-Drawing needs an OpenGL library, chosen by the environment variable MUJOCO_GL before Python starts:
-egl or osmesa without a screen, glfw with one. What becomes of frames, and pictures that need no
-OpenGL, are `trl_suite.rendering.pictures`.
+Rendering needs an OpenGL library, chosen by the environment variable MUJOCO_GL before Python
+starts: egl or osmesa without a screen, glfw with one. `trl_suite.rendering.pictures` writes frames
+to files, and makes pictures without OpenGL.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 
 from trl_suite.util import errors
 
-if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
+if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
 
 
@@ -45,24 +45,24 @@ def frame(
     camera: str | int = 'side',
     ghost: bool = False,
 ) -> np.ndarray:
-    """Draws the current state, and what the task marks: places, goals, directions.
+    """Renders the current state, and the task's markers: places, goals, directions.
 
     Args:
       environment: any composer environment, after `reset`.
       height: pixels.
       width: pixels.
       camera: name of a camera, short ('side', 'front') or full ('biped2d/side'), or its number; -1
-        is a camera that looks at the whole model.
-      ghost: also draw the reference clip, translucent and set back a little to the side. It walks
-        its own way from the start of the episode, so the distance between the two shows.
+        is a camera that shows the whole model.
+      ghost: also draw the reference clip, translucent and slightly farther from the camera. Its
+        displacement since the start of the episode is that of the clip, not of the character.
 
     Returns:
       The picture, shape (height, width, 3), uint8.
 
     Raises:
       ValueError: unknown camera, a size that is not positive or above the model's limit, or a ghost
-        where the task has no reference clip.
-      RuntimeError: there is no OpenGL to draw with; the message names MUJOCO_GL and its choices.
+        although the task has no reference clip.
+      RuntimeError: no OpenGL library works; the message names MUJOCO_GL and its choices.
     """
     physics = environment.physics
     limits = physics.model.vis.global_
@@ -93,18 +93,18 @@ def frame(
 def frames(
     environment: composer.Environment, policy: Policy, steps: int = 256, **options: Any
 ) -> Iterator[np.ndarray]:
-    """Runs a policy from a reset on, over ends of episodes, and draws every state.
+    """Runs a policy after a reset, through successive episodes, and renders every state.
 
-    Where a step lasts longer than 1/30 s (gaits), every 1/30 s is drawn instead of every state.
+    If steps last longer than 1/30 s (gaits), there is a frame every 1/30 s instead.
 
     Args:
-      environment: is reset and stepped.
-      policy: time step -> action; not asked at the end of an episode.
+      environment: reset and stepped by this function.
+      policy: time step -> action; not called at the end of an episode.
       steps: control steps.
       **options: of `frame`.
 
     Yields:
-      One picture per state: steps of them, one more for every reset.
+      One frame per state: `steps` frames, and one more for every reset.
     """
     within: list[np.ndarray] = []
 
@@ -127,7 +127,7 @@ def frames(
 
 @contextlib.contextmanager
 def watching(environment: composer.Environment, look: Callable[[], None]) -> Iterator[bool]:
-    """Has `look` called every 1/30 s where steps last longer; yields whether that is so."""
+    """Calls `look` every 1/30 s if steps last longer than that; yields whether they do."""
     task: Any = environment.task
     watched = hasattr(task, 'watch')
     if watched:
@@ -157,26 +157,26 @@ def _camera(physics: Any, camera: str | int) -> int:
 
 
 def _check_gl(physics: Any) -> None:
-    """Makes the drawing context at the first picture."""
+    """Creates the rendering context for the first frame."""
     try:
         _use_chosen_library()
         _ = physics.contexts
-    # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
+    # Errors depend on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
 
 
 def _use_chosen_library() -> None:
-    """Lets dm_control take the library that MUJOCO_GL names now, if the one it took cannot draw.
+    """Makes dm_control use the library that MUJOCO_GL now names, if its current one does not work.
 
-    dm_control reads the variable when it is imported. Who imports it before this package, as sorted
-    imports do, leaves it with GLFW, also where there is no screen.
+    dm_control reads the variable when it is imported. If it is imported before this package, as
+    with sorted imports, it uses GLFW, even if there is no screen.
     """
     render = sys.modules.get('dm_control._render')
     if getattr(render, 'BACKEND', None) != 'glfw' or _screen():
         return
     if os.environ.get('MUJOCO_GL') not in ('egl', 'osmesa'):
-        # GLFW itself would warn, and leave a half-made context that fails once more at exit.
+        # GLFW would warn, and leave an incomplete context that fails again at exit.
         raise RuntimeError('GLFW finds no screen')
     assert render is not None
     importlib.reload(render)
@@ -189,7 +189,7 @@ def _screen() -> bool:
 
 
 def no_gl(error: Exception) -> str:
-    """Returns the sentence for a machine on which nothing can be drawn."""
+    """Returns the error message for a machine without a working OpenGL library."""
     set_to = os.environ.get('MUJOCO_GL')
     state = 'is not set' if set_to is None else f'is {set_to!r}'
     reason = str(error).strip().partition('\n')[0].rstrip('.')
@@ -201,11 +201,11 @@ def no_gl(error: Exception) -> str:
 
 
 def _ghost(task: Any) -> Callable[[Any, Any], None]:
-    """Returns a scene callback that adds the reference pose to what is drawn."""
+    """Returns a scene callback that adds the reference pose."""
     import mujoco
 
     def add(physics: Any, scene: Any) -> None:
-        # Data of its own on the same model: neither the model nor the simulation is touched.
+        # Separate data of the same model: neither the model nor the simulation changes.
         model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
         addresses = task.figure.pose_qpos
         data.qpos[addresses] = task.reference_pose(0)
@@ -227,7 +227,7 @@ def _ghost(task: Any) -> Callable[[Any, Any], None]:
 
 
 def markers(task: Any) -> Callable[[Any, Any], None]:
-    """Returns a scene callback that adds a task's markers to what is drawn."""
+    """Returns a scene callback that adds a task's markers."""
     import mujoco
 
     def add(physics: Any, scene: Any) -> None:
@@ -237,7 +237,7 @@ def markers(task: Any) -> Callable[[Any, Any], None]:
             scene.ngeom += 1
             geom = scene.geoms[scene.ngeom - 1]
             cosine, sine = np.cos(marker.yaw), np.sin(marker.yaw)
-            if marker.shape == 'arrow':  # they point along their z axis
+            if marker.shape == 'arrow':  # arrows point along their z axis
                 axes = np.array([[0, -sine, cosine], [0, cosine, sine], [-1, 0, 0]])
             else:
                 axes = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])

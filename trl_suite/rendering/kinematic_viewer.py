@@ -1,9 +1,9 @@
-"""A character without its physics: put into poses, measured, and drawn on a level floor.
+"""A character without physics, for posing, measuring and rendering on a level floor.
 
 from trl_suite import motion
-from trl_suite.rendering import kinematic_viewer as kinematic viewer
+from trl_suite.rendering import kinematic_viewer
 
-figure = kinematic viewer.KinematicViewer('raptor')
+figure = kinematic_viewer.KinematicViewer('raptor')
 figure.put(motion.load('raptor_run_050').pose(0.1))
 image = figure.picture(camera='side')  # (480, 640, 3) uint8
 """
@@ -23,8 +23,8 @@ from trl_suite.motion import Clip, Layout
 from trl_suite.motion.layout import ROOT_SIZES
 
 FLOOR = 200.0  # m; half length
-SHADOWS = 8.0  # extents of the scene that have shadows; their edge, with its specks, is far away
-TILE = 1.0  # m; edge of a square of the floor, so that distances can be seen
+SHADOWS = 8.0  # range of shadows, in extents; so large that artefacts at its edge are far away
+TILE = 1.0  # m; edge of a square of the floor, as a scale
 _SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
@@ -33,17 +33,17 @@ class KinematicViewer:
 
     Attributes:
       character: the entity.
-      layout: what the columns of its poses are, as of a `Clip`.
-      links: names of the links that have collision geoms, in the order of `corners`; some occur twice if
-        they have more than one.
-      environment: a `composer.Environment` without any task, as `rendering` takes it.
+      layout: the columns of its poses, as in a `Clip`.
+      links: name of the link of each collision geom, in the order of `corners`; links with several
+        geoms are repeated.
+      environment: a `composer.Environment` with a null task, for `rendering`.
     """
 
     def __init__(self, character: str | characters.CharacterSpec) -> None:
         """Compiles a character.
 
         Args:
-          character: a name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+          character: a name in `trl_suite.characters.CHARACTERS`, or a user's own spec.
 
         Raises:
           ValueError: an unknown name; the message has the closest matches.
@@ -103,27 +103,27 @@ class KinematicViewer:
         return pose
 
     def put(self, pose: np.ndarray) -> None:
-        """Puts it into a pose, (columns,) as of `layout`.
+        """Sets the pose, (columns,) as in `layout`.
 
         Raises:
           ValueError: a pose of another length.
         """
         pose = np.asarray(pose, float)
         if pose.shape != (self.layout.columns,):
-            raise ValueError(f'a pose of shape {pose.shape}; expected ({self.layout.columns},)')
+            raise ValueError(f'pose has shape {pose.shape}; expected ({self.layout.columns},)')
         data = self._physics.data
         data.qpos[self._pose_qpos] = pose
-        # What follows the character, cameras and light, needs its centre of mass.
+        # Cameras and light that track the character need its centre of mass.
         mujoco.mj_fwdPosition(self._physics.model.ptr, data.ptr)
 
     def corners(self) -> np.ndarray:
-        """Returns the corners of the bounding boxes of all collision geoms, m, (collision geoms, 8, 3)."""
+        """Returns the corners of the bounding boxes of all collision geoms, m, (geoms, 8, 3)."""
         data = self._physics.data
         frames = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         return data.geom_xpos[self._geoms][:, None] + self._local @ frames.transpose(0, 2, 1)
 
     def places(self) -> np.ndarray:
-        """Returns where the joints of all links are, m, (links, 3), the root's place first."""
+        """Returns the positions of the joints of all links, m, (links, 3), the root's first."""
         return self._physics.data.xpos[self._bodies].copy()
 
     def orientations(self) -> np.ndarray:
@@ -131,7 +131,7 @@ class KinematicViewer:
         return self._physics.data.xquat[self._bodies].copy()
 
     def axes(self) -> list[np.ndarray | None]:
-        """Returns the axis of every hinge in the frame of its link, (3,); None of other joints."""
+        """Returns the axis of every hinge in the frame of its link, (3,); None for others."""
         joints = self._physics.bind(self.character.joints)
         hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
         return [
@@ -140,7 +140,7 @@ class KinematicViewer:
         ]
 
     def parents(self) -> list[int]:
-        """Returns the number of each link's parent in link order, -1 of the root."""
+        """Returns the index of each link's parent in link order, -1 for the root."""
         model, bodies = self._physics.model, self._bodies.tolist()
         return [
             bodies.index(parent) if (parent := model.body_parentid[body]) in bodies else -1
@@ -148,11 +148,11 @@ class KinematicViewer:
         ]
 
     def picture(self, **options: Any) -> np.ndarray:
-        """Draws it; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
+        """Renders the pose, (h, w, 3) uint8; options are those of `trl_suite.rendering.frame`."""
         return rendering.frame(self.environment, **options)
 
     def film_strip(self, clip: Clip, columns: int = 8, **options: Any) -> np.ndarray:
-        """Draws evenly spaced poses of a clip side by side; options are those of `picture`."""
+        """Renders evenly spaced poses of a clip side by side; options are those of `picture`."""
         images = []
         for time in np.linspace(0, clip.duration, columns):
             self.put(clip.pose(time))

@@ -1,8 +1,7 @@
-"""Pictures as files: videos, film strips, plots of terrain, height maps. None needs OpenGL.
+"""Pictures as files, without OpenGL: videos, film strips, plots of terrain, height maps.
 
-The names are also those of `trl_suite.rendering`, which draws the frames. Files appear under their
-names when they are complete, never before. Videos, PNG files and plots need
-`pip install 'trl_suite[video]'`.
+`trl_suite.rendering` also exports these names. Files get their names only when they are complete.
+Videos, PNG files and plots need `pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
@@ -21,29 +20,29 @@ from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
 from trl_suite.util import errors
 from trl_suite.util.files import Path, check_path, replacing
 
-if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
+if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
 
 CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
 MAP_PIXELS = 8  # of each sample of a height map, along both axes
 HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
-ROOT_COLOUR = (20, 20, 20)  # where the character stands on its height map
+ROOT_COLOUR = (20, 20, 20)  # at the character's position on its height map
 MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
 MOST_DRAWS = 100  # in one plot
-MAP_POINTS = 400  # at most, along each axis of such a plot
+MAP_POINTS = 400  # largest number of points along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
 
 
 def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:
-    """Writes pictures as a video; what `Video` does, in one call.
+    """Writes frames as a video; equivalent to `Video`, in one call.
 
     Args:
       frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as
         `rendering.frames`.
-      path: where to write; .mp4 (h264) or .gif.
-      fps: pictures per second; 30 is real time. A .gif can only last whole 1/100 s per picture.
+      path: file to write; .mp4 (h264) or .gif.
+      fps: frames per second; 30 is real time. In a .gif each frame lasts a multiple of 1/100 s.
 
     Raises:
       ValueError: another suffix, no pictures, pictures of different sizes, or an odd size for h264.
@@ -56,9 +55,9 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
 
 
 class Video:
-    """A video to which pictures are added one by one; an .mp4 keeps none of them in memory.
+    """A video to which frames are added one by one; an .mp4 keeps none of them in memory.
 
-    Used as a context manager; the file appears at the end, and not at all after an exception.
+    Used as a context manager; the file is created at the end, and not after an exception.
     Arguments and errors are those of `video`.
     """
 
@@ -164,12 +163,12 @@ class Video:
 def film_strip(
     frames: Iterable[np.ndarray], path: Path | None = None, columns: int = 8
 ) -> np.ndarray:
-    """Puts evenly spaced pictures side by side, the first and the last among them.
+    """Puts evenly spaced frames side by side, including the first and the last.
 
     Args:
       frames: pictures (h, w, 3) uint8, all of one size.
-      path: where to write it as .png; not written if None.
-      columns: how many pictures; all of them if there are fewer.
+      path: .png file to write; None for none.
+      columns: number of pictures; all of them if there are fewer.
 
     Returns:
       The strip, shape (h, about columns * w, 3), uint8.
@@ -196,7 +195,7 @@ def film_strip(
 
 
 def spread(count: int, chosen: int) -> list[int]:
-    """Returns up to `chosen` indices of `count`, evenly spaced, first and last among them."""
+    """Returns up to `chosen` indices below `count`, evenly spaced, including first and last."""
     if chosen == 1:
         return [0]
     return sorted(set(np.linspace(0, count - 1, min(chosen, count)).round().astype(int).tolist()))
@@ -210,20 +209,20 @@ def plot_terrain(
     seed: int = 0,
     terrain_level: float = 0.0,
 ) -> None:
-    """Plots several draws of a terrain: profiles below each other, or maps side by side.
+    """Plots several random grounds of a terrain: profiles below each other, or maps side by side.
 
-    Three-dimensional terrain is seen from above, x to the right, y up; an arrow is a start.
+    Maps of three-dimensional terrain have x to the right and y up; an arrow marks a start.
 
     Args:
-      terrain: what `trl_suite.terrain.load` takes.
-      path: where to write; .png.
-      draws: how many.
-      length: how far ahead of the start, m; of a map its side, about the origin, at most 300 m.
-      seed: draw i is the strip or ground with the seed sequence (seed, i).
-      terrain_level: which of the terrain's parameter sets.
+      terrain: an argument of `trl_suite.terrain.load`.
+      path: file to write; .png.
+      draws: number of grounds.
+      length: extent ahead of the start, m; for a map its side, at most 300 m, around the origin.
+      seed: ground i has the seed sequence (seed, i).
+      terrain_level: number of the terrain's parameter set.
 
     Raises:
-      ValueError: bad arguments; see also `trl_suite.terrain.load`.
+      ValueError: invalid arguments; see also `trl_suite.terrain.load`.
       ImportError: the extra 'video' is not installed.
       OSError: the file cannot be written.
     """
@@ -235,7 +234,7 @@ def plot_terrain(
         raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
     if seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or more')
-    # Figures of their own class draw without a screen and leave the user's pyplot alone.
+    # `Figure` needs no screen and does not affect the user's pyplot.
     make = _optional('matplotlib.figure').Figure
     if terrain.spatial:
         figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
@@ -270,7 +269,7 @@ def _plot_profiles(
     for panel, heights in zip(panels, grounds, strict=True):
         panel.fill_between(x, heights, low - room, color='0.75', linewidth=0)
         panel.plot(x, heights, color='0.2', linewidth=1)
-        panel.axvline(0, color='tab:red', linewidth=0.8, linestyle=':')  # where episodes start
+        panel.axvline(0, color='tab:red', linewidth=0.8, linestyle=':')  # start of episodes
         panel.set_ylabel('z (m)')
     panels[0].set(
         xlim=(x[0], x[-1]), ylim=(low - room, high + room), title=f'{terrain.name} ({terrain.type})'
@@ -288,14 +287,14 @@ def _plot_maps(
 ) -> None:
     panels = figure.subplots(1, draws, sharex=True, sharey=True, squeeze=False)[0]
     count = min(MAP_POINTS, max(2, round(length / (0.25 * terrains.GRID))))
-    # Middles of pixels.
+    # Centres of pixels.
     places = ((np.arange(count) + 0.5) / count - 0.5) * length
     maps, starts = [], []
     for i in range(draws):
         sequence = np.random.SeedSequence((seed, i))
         ground = terrains.SpatialGround(terrain, sequence, terrain_level=terrain_level)
         starts.append(ground.spawn(np.random.default_rng(sequence)))
-        # Line by line, each of which meets few of the boxes.
+        # Line by line, as each line intersects few of the boxes.
         maps.append(np.stack([ground.height(places, y) for y in places]))
     low, high = float(np.min(maps)), float(np.max(maps))
     if low == high:
@@ -322,20 +321,21 @@ def height_map(
 ) -> np.ndarray:
     """Draws the 32 x 32 heights that a character observes, from above.
 
-    Ahead is up, the character's left is left; a dark square is where it stands. Ground as high as
-    that under the character is light; brown is higher, blue lower. What a task mirrors is shown
+    Ahead is up, the character's left is left; a dark square marks its position. Ground as high as
+    that under the character is light; brown is higher, blue lower. Mirrored observations are drawn
     mirrored.
 
     Args:
-      environment: one whose task observes such a map (`terrain_observation='height'`), after `reset`.
-      path: where to write it as .png; not written if None.
-      reach: height, up or down, of the full colour, m.
+      environment: one whose task observes such a map (`terrain_observation='height'`), after
+        `reset`.
+      path: .png file to write; None for none.
+      reach: height difference at which colours are saturated, m.
 
     Returns:
       The picture, shape (256, 256, 3), uint8.
 
     Raises:
-      ValueError: the task observes no such map, reach is not positive, or another suffix.
+      ValueError: the task does not observe such a map, reach is not positive, or another suffix.
       ImportError: a path is given and the extra 'video' is not installed.
       OSError: the file cannot be written.
     """
@@ -343,18 +343,18 @@ def height_map(
     part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
     if part.stop - part.start != SAMPLES**2:
         raise ValueError(
-            f'the task {type(task).__name__}, which observes no map of {SAMPLES} x {SAMPLES} heights, has '
-            "none to draw; 3D imitation and footsteps observe one with the option terrain_observation='height'"
+            f'the task {type(task).__name__} observes no map of {SAMPLES} x {SAMPLES} heights; '
+            "3D imitation and footsteps observe one with the option terrain_observation='height'"
         )
     if not 0 < reach < np.inf:
         raise ValueError(f'reach is {reach}; expected a positive number of metres')
-    # Lines from the left, each from behind.
+    # Lines are ordered from the left, samples of a line from behind.
     heights = task.observation[0, part].reshape(SAMPLES, SAMPLES).T[::-1]
     share = np.clip(heights / reach, -1, 1)[..., None]
     full = np.where(share < 0, np.array(LOWER, float), np.array(HIGHER, float))
     colours = np.array(LEVEL) + np.abs(share) * (full - np.array(LEVEL))
     image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
-    # The middle of a sample's square is where it was taken.
+    # A sample is at the centre of its square.
     behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
     env_id = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
     column = round(0.5 * SAMPLES * MAP_PIXELS)
@@ -387,5 +387,5 @@ def _optional(name: str) -> Any:
     except ImportError as error:
         package = name.partition('.')[0]
         raise ImportError(
-            f"{package} is needed for this and missing; pip install 'trl_suite[video]'"
+            f"{package} is needed and not installed; pip install 'trl_suite[video]'"
         ) from error

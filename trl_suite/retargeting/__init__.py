@@ -1,4 +1,4 @@
-"""Motions of the user's own on a character of the suite: read, transferred, cut, and checked."""
+"""Users' own motions for a character: reading, retargeting, cutting to a cycle, and checks."""
 
 from trl_suite.retargeting.transfer import (
     FORMATS,

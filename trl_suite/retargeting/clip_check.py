@@ -1,4 +1,4 @@
-"""What is wrong with a clip on a character, frame by frame: limits, ground, feet.
+"""Checks of a clip on a character, frame by frame: joint limits, ground, sliding feet.
 
 from trl_suite import motion
 from trl_suite.retargeting import clip_check
@@ -21,8 +21,8 @@ from trl_suite.motion import Clip, quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import tables
 
-# What is a fault. Our own clips have none of these, see mocap/README.md.
-EXCESS = 1e-3  # rad beyond a joint's limits (m of a slide)
+# Thresholds of faults. Shipped clips have no faults, see mocap/README.md.
+EXCESS = 1e-3  # rad beyond a joint's limits (m for a slide)
 DEPTH = 0.01  # m below the ground
 SLIDE = 0.02  # m that a corner of a foot travels in one contact
 NEAR = 0.005  # m; a corner of a foot lower than this is in contact
@@ -31,14 +31,14 @@ KINDS = ('joint limit', 'penetration', 'foot slide')
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong in one frame.
+    """One fault in one frame.
 
     Attributes:
-      frame: from 0 on.
+      frame: its index, from 0.
       time: of the frame, s.
       kind: one of `KINDS`.
       name: of the joint or link.
-      amount: by how much a limit is passed, how deep it is, or how far it has slid.
+      amount: excess over a limit, depth below the ground, or sliding distance.
       unit: of the amount.
     """
 
@@ -52,16 +52,16 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Report:
-    """What was measured in n frames.
+    """Measurements in n frames.
 
     Attributes:
       name: of the clip.
       times: of the frames, s, (n,).
-      excess: by joint, rad beyond the limits (m of a slide), 0 within them, (n,).
+      excess: by joint, rad beyond the limits (m for a slide), 0 within them, (n,).
       units: of every joint's excess, 'rad' or 'm'.
       depth: by link, m of its lowest corner below the ground, 0 above it, (n,).
-      slide: by foot, m that a corner in contact is away from where its contact began, the most of
-        all its corners, 0 without contact, (n,).
+      slide: by foot, distance in m of a corner in contact from the place where its contact began,
+        the largest of all corners, 0 without contact, (n,).
     """
 
     name: str
@@ -87,7 +87,7 @@ class Report:
         return tuple(sorted(found, key=lambda fault: fault.frame))
 
     def __str__(self) -> str:
-        """A table: a line for every kind and joint or link, with the worst frame."""
+        """A table with a line for every kind and joint or link, and the worst frame."""
         groups: dict[tuple[str, str], list[Fault]] = {}
         for fault in self.faults:
             groups.setdefault((fault.kind, fault.name), []).append(fault)
@@ -106,21 +106,21 @@ class Report:
 
 
 def check(clip: Clip, character: str | characters.CharacterSpec, near: float = NEAR) -> Report:
-    """Measures a clip on level ground at height 0, at its own frames.
+    """Checks a clip on level ground at height 0, at its key frames.
 
     Args:
-      clip: whose joints are those of the character.
-      character: name or row.
-      near: height under which a corner of a foot is in contact, m. Feet are the end effectors.
+      clip: a clip with the joints of the character.
+      character: name or `CharacterSpec`.
+      near: height below which a corner of a foot is in contact, m. Feet are the end effectors.
 
     Raises:
-      ValueError: an unknown character, or a clip of other joints.
+      ValueError: an unknown character, or a clip with other joints.
     """
     figure = KinematicViewer(character)
     layout, own = figure.layout, clip.layout
     if (own.root, own.joints, own.sizes) != (layout.root, layout.joints, layout.sizes):
         raise ValueError(
-            f'clip {clip.name!r} (root {own.root}, joints {", ".join(own.joints)}) is none of '
+            f'clip {clip.name!r} (root {own.root}, joints {", ".join(own.joints)}) does not fit '
             f'{figure.character.spec.name!r} (root {layout.root}, joints {", ".join(layout.joints)})'
         )
     corners = np.empty((len(clip.times), len(figure.links), 8, 3))
@@ -148,7 +148,7 @@ def _excess(clip: Clip, figure: KinematicViewer) -> dict[str, np.ndarray]:
     ):
         column, _ = clip.layout.starts(joint)
         values = clip.poses[:, column]
-        if size == 4:  # one cone about the zero pose
+        if size == 4:  # a ball joint's limit is a cone about the zero pose
             turns = quaternion.rotation_vector(clip.poses[:, column : column + 4])
             values, low = np.linalg.norm(turns, axis=1), -np.inf
         found[joint] = np.maximum(0.0, np.maximum(low - values, values - high))
@@ -156,7 +156,7 @@ def _excess(clip: Clip, figure: KinematicViewer) -> dict[str, np.ndarray]:
 
 
 def _slide(corners: np.ndarray, near: float) -> np.ndarray:
-    """Returns how far corners (n, ..., 3) are from where their contacts began, the most, (n,)."""
+    """Returns the largest distance of corners (n, ..., 3) from the start of their contact, (n,)."""
     points = corners.reshape(len(corners), -1, 3)
     low = points[..., 2] < near
     begin, result = points[0, :, :2].copy(), np.zeros(len(points))

@@ -1,4 +1,4 @@
-"""Motions of the user's own on a character: read, carried over by joint names, cut to a cycle.
+"""Users' own motions for a character: reading, retargeting by joint names, cutting to a cycle.
 
     from trl_suite import retargeting, suite
 
@@ -6,9 +6,9 @@
     clip = retargeting.cycle(retargeting.retarget(motion, 'biped2d_full'))
     environment = suite.build('biped2d_full', clip=clip)
 
-Links point where the bones of the motion point; what a joint of the character cannot do is left out
-(a hinge takes the part of a rotation that is about its axis). Nothing is done about limits, feet that
-slide or ground that is entered: `trl_suite.retargeting.clip_check` tells where that happens.
+Links get the directions of the motion's bones; rotations that a joint of the character cannot
+perform are discarded (a hinge keeps the component about its axis). Violated limits, sliding feet
+and ground penetration are not corrected: `trl_suite.retargeting.clip_check` reports them.
 """
 
 from __future__ import annotations
@@ -32,18 +32,19 @@ FORMATS = {
     'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepMimic)',
     'npz': 'a clip (.npz)',
 }  # fmt: skip
-HEAD = 65536  # bytes of a file that tell its format
-STRAIGHT = 0.2  # m; a motion that gets farther is turned until it goes along +x
-SINKING = 0.05  # share of the frames that may enter the ground; captured heights are not exact
-CYCLE = (0.3, 2.5)  # s; shortest and longest cycle that is looked for
-CYCLE_FRAMES = 300  # at most, among which a cycle is looked for
-RATE_TIME = 0.1  # s; a difference of rates counts as that of poses after this time
+HEAD = 65536  # bytes at the beginning of a file from which its format is recognised
+STRAIGHT = 0.2  # m; a motion with a larger displacement is rotated to +x by it, not by its heading
+SINKING = 0.05  # fraction of frames that may penetrate the ground; captured heights are inexact
+CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
+CYCLE_FRAMES = 300  # largest number of frames in the search for a cycle
+RATE_TIME = 0.1  # s; weight of a difference of velocities against one of poses
 _LATERAL = np.array([0.0, -1.0, 0.0])  # axis of pitch, and of hinges in files of the original
 _VERTICAL = np.array([0.0, 0.0, 1.0])
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
-# How others call our joints, the first that there is: TerrainRL and DeepMimic, Acclaim (CMU), BVH
-# of several makes. {side} is right, {s} is r. Case and a prefix such as mixamorig: do not matter.
+# Names of the joints in other formats; the first that exists is used: TerrainRL and DeepMimic,
+# Acclaim (CMU), BVH of several tools. {side} is right, {s} is r. Case and prefixes such as
+# mixamorig: are ignored.
 NAMES: dict[str, tuple[str, ...]] = {
     'root': ('root', 'hips', 'pelvis', 'hip'),
     'torso': ('torso', 'chest', 'thorax', 'spine1', 'spine2', 'spine', 'abdomen'),
@@ -67,15 +68,14 @@ def read(
     """Reads a motion file of any format, which its content tells, whatever its name.
 
     Args:
-      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, whose joints are those of the character, in
-        its order, or of DeepMimic, whose joints are those of its humanoid or its dog; or what
-        `Clip.save` wrote (.npz).
+      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, with the character's joints in its order, or
+        of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save` (.npz).
       character: for TerrainRL's files.
-      skeleton: for Acclaim, the .asf file that belongs to it.
+      skeleton: for Acclaim, the corresponding .asf file.
       **options: of `motion.read_bvh` or `motion.read_amc`.
 
     Raises:
-      ValueError: another format, a malformed file, or options that do not belong to the format.
+      ValueError: another format, a malformed file, or options of another format.
       FileNotFoundError: there is no such file.
       ImportError: for BVH, if the extra 'clips' is not installed.
     """
@@ -97,7 +97,7 @@ def read(
     if found == 'npz':
         return clips.load(path)
     content = read_json(path)
-    # The two differ in how they say that a motion repeats.
+    # The two formats differ in `Loop`.
     if isinstance(content, dict) and isinstance(content.get('Loop'), str):
         return readers.read_deepmimic(path)
     layout = KinematicViewer(character).layout
@@ -131,11 +131,11 @@ def _format(path: pathlib.Path) -> str:
 
 
 def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
-    """Returns which joint of a motion each joint of a character follows, by usual names (`NAMES`).
+    """Returns a map from joints of a character to joints of a motion, by usual names (`NAMES`).
 
     Args:
       theirs: joints of the motion.
-      ours: joints of the character. Those without a counterpart are left out.
+      ours: joints of the character. Those without a counterpart are omitted.
     """
     known = {name.rpartition(':')[2].lower().replace(' ', ''): name for name in theirs}
     found = {}
@@ -153,7 +153,7 @@ def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
 def counterparts(
     motion: Clip | Capture, joints: Sequence[str], joint_map: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """Returns which joint of a motion the root and each joint of a character follow.
+    """Returns the map from root and joints of a character to joints of a motion.
 
     Args:
       motion: the motion.
@@ -172,8 +172,8 @@ def counterparts(
             raise ValueError(errors.unknown('joint of the motion', their, theirs))
     if 'root' not in chosen or len(chosen) < 2:
         raise ValueError(
-            f'motion {motion.name!r}: no root, or nothing else, has a counterpart; give a map from '
-            f'{", ".join(ours)} to {", ".join(theirs)}'
+            f'motion {motion.name!r}: the root, or all other joints, have no counterpart; pass a '
+            f'joint_map from {", ".join(ours)} to {", ".join(theirs)}'
         )
     return chosen
 
@@ -188,20 +188,20 @@ def retarget(
     joint_map: Mapping[str, str] | None = None,
     scale: float | None = None,
 ) -> Clip:
-    """Carries a motion over to a character.
+    """Retargets a motion to a character.
 
-    The motion is turned until it goes along +x (or looks there, if it stays where it is), moved over
-    the origin, scaled in its lengths, and put on the ground: all but the lowest 5 % of the frames
-    stay above it. A clip that is in the character's layout already is returned as it is, unless a map
-    or a scale is given.
+    The motion is rotated so that its displacement (or its heading, if it stays in place) is along
+    +x, moved to the origin, scaled, and put on the ground: all but the lowest 5 % of the frames are
+    above it. A clip that has the character's layout already is returned unchanged, unless a map or
+    a scale is given.
 
     Args:
-      motion: what `read` returned.
-      character: name or row.
-      joint_map: joint of the character -> joint of the motion, with 'root' for the root; joints that are
-        not named keep their zero. By default by usual names, see `guess_map`.
-      scale: of lengths; by default legs and arms of the character over those of a capture, or the height
-        of its root over the largest height of a clip's.
+      motion: the result of `read`.
+      character: name or `CharacterSpec`.
+      joint_map: joint of the character -> joint of the motion, with 'root' for the root; joints
+        that are not in it stay at 0. By default by usual names, see `guess_map`.
+      scale: factor on lengths; by default the ratio of limb lengths of the character to those of a
+        capture, or of the height of its root to the largest height of a clip's.
 
     Returns:
       A clip in the character's layout; it loops if the motion does.
@@ -229,7 +229,7 @@ def retarget(
     path = path - [*path[0, :2], 0]
     path[:, :2] = quaternion.turned(path[:, :2], np.full(len(path), -yaw))
     upright = quaternion.about_z(np.full(len(path), -yaw))
-    if layout.root == 'planar':  # it cannot turn aside: what it does, it does straight on
+    if layout.root == 'planar':  # no heading: the motion is along x
         aside = quaternion.angle_about(quaternion.multiply(upright, turns), _VERTICAL)
         upright = quaternion.multiply(quaternion.about_z(-aside), upright)
     links = _captured(figure, motion, chosen, upright) if isinstance(motion, Capture) else None
@@ -239,12 +239,12 @@ def retarget(
     return Clip(
         motion.name, motion.times, poses, layout.root, layout.joints,
         layout.sizes, getattr(motion, 'loop', False),
-        f'{motion.name}, carried over to {figure.character.spec.name}',
+        f'{motion.name}, retargeted to {figure.character.spec.name}',
     )  # fmt: skip
 
 
 def _root(motion: Clip) -> tuple[np.ndarray, np.ndarray]:
-    """Returns places (n, 3) and rotations (n, 4) of a clip's root."""
+    """Returns positions (n, 3) and rotations (n, 4) of a clip's root."""
     if motion.root == 'free':
         return motion.poses[:, :3].copy(), motion.poses[:, 3:7]
     x, z, pitch = motion.poses[:, :3].T
@@ -252,7 +252,7 @@ def _root(motion: Clip) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _yaw(path: np.ndarray, turns: np.ndarray) -> float:
-    """Returns where a motion goes, or looks to at first if it stays where it is, rad."""
+    """Returns the direction of a motion's displacement, or its first heading if that is small."""
     way = path[-1, :2] - path[0, :2]
     if np.hypot(*way) > STRAIGHT:
         return float(np.arctan2(way[1], way[0]))
@@ -260,7 +260,7 @@ def _yaw(path: np.ndarray, turns: np.ndarray) -> float:
 
 
 def _bones(figure: KinematicViewer, chosen: Mapping[str, str]) -> dict[int, int]:
-    """Returns the links of limbs, by number: those with one child that follows the motion."""
+    """Returns link -> child for limbs: links with exactly one child that follows the motion."""
     ours = ('root', *figure.layout.joints)
     children: dict[int, list[int]] = {}
     for i, parent in enumerate(figure.parents()):
@@ -272,7 +272,7 @@ def _bones(figure: KinematicViewer, chosen: Mapping[str, str]) -> dict[int, int]
 def _vectors(
     figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Returns what each limb is in its zero pose and in the rest pose of the motion, m."""
+    """Returns the vector of each limb in its zero pose and in the rest pose of the motion, m."""
     ours = ('root', *figure.layout.joints)
     figure.put(figure.standing())
     places = figure.places()
@@ -287,7 +287,7 @@ def _vectors(
 
 
 def _limbs(figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]) -> float:
-    """Returns the length of the character's limbs over that of the motion's."""
+    """Returns the ratio of limb lengths of the character to those of the motion."""
     pairs = _vectors(figure, motion, chosen).values()
     mine, other = (sum(float(np.linalg.norm(pair[i])) for pair in pairs) for i in (0, 1))
     return mine / other if other else 1.0
@@ -296,14 +296,14 @@ def _limbs(figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str]) 
 def _captured(
     figure: KinematicViewer, motion: Capture, chosen: Mapping[str, str], upright: np.ndarray
 ) -> dict[int, np.ndarray]:
-    """Returns the world orientations (n, 4) that links should have, by number."""
+    """Returns the target orientations of links, by index, (n, 4) in the world."""
     ours = ('root', *figure.layout.joints)
     vectors, parents = _vectors(figure, motion, chosen), figure.parents()
     zero = figure.orientations()
     align = {-1: _IDENTITY}  # from the zero pose to the rest pose of the motion
     links = {}
     for i, our in enumerate(ours):
-        # A hand or foot takes over from its limb; the trunk's own rest pose is upright.
+        # A hand or foot has the alignment of its limb; the trunk's rest pose is upright.
         align[i] = quaternion.between(*vectors[i]) if i in vectors else align[parents[i]]
         if our in chosen:
             turns = motion.rotations[:, motion.joints.index(chosen[our])]
@@ -324,11 +324,11 @@ def _poses(
 
     Args:
       figure: the character.
-      motion: where joints of a clip are taken from.
-      chosen: the map.
+      motion: source of joint rotations, if it is a clip.
+      chosen: the joint map.
       path: of the root, (n, 3).
       turns: of the root, (n, 4).
-      links: orientations that the links of a capture should have; None for a clip.
+      links: target orientations of links, for a capture; None for a clip.
     """
     layout, n = figure.layout, len(path)
     poses = np.zeros((n, layout.columns))
@@ -354,7 +354,7 @@ def _poses(
         column, _ = layout.starts(joint)
         if size == 1:
             axis = axes[i - 1]
-            if axis is None:  # a slide has nothing to follow
+            if axis is None:  # slides stay at 0
                 turn = np.tile(_IDENTITY, (n, 1))
             else:
                 angle = np.unwrap(quaternion.angle_about(turn, axis))
@@ -368,7 +368,7 @@ def _poses(
 
 
 def _turns(motion: Clip, joint: str) -> np.ndarray:
-    """Returns the rotations of a clip's joint against its parent, (n, 4)."""
+    """Returns the rotations of a clip's joint relative to its parent, (n, 4)."""
     column, _ = motion.layout.starts(joint)
     if motion.sizes[motion.joints.index(joint)] == 4:
         return motion.poses[:, column : column + 4]
@@ -385,14 +385,14 @@ def _lowest(figure: KinematicViewer, poses: np.ndarray) -> np.ndarray:
 
 
 def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> Clip:
-    """Cuts one cycle out of a clip, so that it can be imitated.
+    """Cuts one cycle from a clip, so that it can loop.
 
-    The gap that is left between its end and its start is spread evenly over the cycle; what it moves
-    ahead, and to the side, it does in every cycle. Give both times, or none: then the two moments are
-    chosen that are most alike in pose and rates, 0.3 to 2.5 s apart.
+    The difference between its end and its start is distributed evenly over the cycle, except for
+    the horizontal displacement, which every cycle repeats. Give both times, or none: then the two
+    times with the most similar poses and velocities are chosen, 0.3 to 2.5 s apart.
 
     Args:
-      clip: which does not loop.
+      clip: a clip that does not loop.
       start: of the cycle, s.
       end: of the cycle, s.
 
@@ -419,7 +419,7 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
 
 
 def advanced(clip: Clip, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Returns poses (n, columns) moved on by changes (n, rates), in a clip's layout."""
+    """Returns poses (n, columns) after changes (n, rates), in a clip's layout."""
     layout = clip.layout
     result = poses.copy()
     quaternions = [column for q, _ in layout.rotations for column in range(q, q + 4)]
@@ -434,7 +434,7 @@ def advanced(clip: Clip, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
 
 
 def _alike(clip: Clip) -> tuple[float, float]:
-    """Returns the two moments of a clip that are most alike, s."""
+    """Returns the two times of a clip with the most similar poses and velocities, s."""
     if clip.duration < CYCLE[0]:
         raise ValueError(
             f'clip {clip.name!r} lasts {clip.duration:.3g} s; expected at least {CYCLE[0]} s, or the '

@@ -1,21 +1,21 @@
-"""Random terrain in plain NumPy: parameter files, generators, planar strips and 3D ground.
+"""Random terrain in plain NumPy: parameter files, generators, planar and 3D ground.
 
 from trl_suite import terrain
 
 ground = terrain.PlanarGround(terrain.load('slopes_mixed'), seed=1)  # a preset, a file or a mapping
-ground.height([-0.5, 12.3])  # m; the ground is drawn as far as it is asked for
-heights, vertical = ground.window(-40, 800)  # vertices SPACING apart, from x = -1 m on
+ground.height([-0.5, 12.3])  # m; ground is generated where it is queried
+heights, vertical = ground.window(-40, 800)  # vertices SPACING apart, starting at x = -1 m
 
 mine = terrain.load({'Type': 'var2d_gaps', 'Params': [{'GapWMin': 0.2, 'GapWMax': 0.4}]})
-mine.parameters()  # with the defaults of all that was not given
-sorted(terrain.PRESETS), sorted(terrain.GENERATORS)  # what there is; `register` adds a type
+mine.parameters()  # with defaults for parameters that were not given
+sorted(terrain.PRESETS), sorted(terrain.GENERATORS)  # names; `register` adds a type
 
 forest = terrain.SpatialGround(terrain.load('pillars3d'), seed=1)  # three-dimensional
 x, y, heading = forest.spawn(np.random.default_rng(1))
 forest.height(x, y), forest.goal(np.random.default_rng(2), root=(x, y))
 sorted(terrain.PRESETS3D), sorted(terrain.GENERATORS3D)  # `register3d` adds a type
 
-around = terrain.Surroundings(1, terrain.capacity(terrain.load('pillars3d')))  # of n characters
+around = terrain.Surroundings(1, terrain.capacity(terrain.load('pillars3d')))  # for n characters
 around.begin(0, forest, (x, y))
 around.height_map(np.array([[x, y]]), np.array([heading]))  # (1, 1024), 32 x 32 samples
 

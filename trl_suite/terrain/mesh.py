@@ -1,4 +1,4 @@
-"""Drawn ground as a mesh, for other programs."""
+"""Export of generated ground as a mesh, for other programs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import trimesh
 
 WRITTEN = ('.obj', '.glb', '.stl')
-WIDTH = 2.0  # m; of planar ground
-DEPTH = 2.0  # m; of boxes that stand on nothing
-LARGEST_SIDE = 500.0  # m; of what is written
+WIDTH = 2.0  # m; of the band that represents planar ground
+DEPTH = 2.0  # m; of boxes on ground without a level
+LARGEST_SIDE = 500.0  # m; of the exported piece
 
 _Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -29,20 +29,20 @@ _Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 def to_mesh(
     ground: PlanarGround | SpatialGround, low: npt.ArrayLike = -10.0, high: npt.ArrayLike = 10.0
 ) -> trimesh.Trimesh:
-    """Returns a piece of ground as a mesh; its upper side is where heights say it is.
+    """Returns a piece of ground as a mesh, whose upper side agrees with the heights of the ground.
 
-    Planar ground is a band 2 m wide. Boxes stay boxes; moving ones stand where they begin.
+    Planar ground becomes a band 2 m wide. Boxes stay boxes, moving ones at their initial places.
 
     Args:
-      ground: what was drawn.
-      low, high: from where to where, m: x of planar ground; else two corners, (2,), or one number
-        for x and y.
+      ground: the ground to export.
+      low, high: bounds of the piece, m: of x for planar ground; otherwise two corners, (2,), or one
+        number for both x and y.
 
     Returns:
       A `trimesh.Trimesh`; x forward, y left, z up, in m.
 
     Raises:
-      ValueError: low is not below high, or they are more than LARGEST_SIDE apart.
+      ValueError: low is not less than high, or they are more than LARGEST_SIDE apart.
       ImportError: trimesh is not installed.
     """
     trimesh = library('trimesh', 'trimesh')
@@ -67,12 +67,12 @@ def save_mesh(
     """Writes a piece of ground as a mesh file.
 
     Args:
-      ground: what was drawn.
-      path: .obj, .glb (whose y axis points up, as its format has it) or .stl.
+      ground: the ground to export.
+      path: .obj, .glb (written with the y axis up, as that format requires) or .stl.
       low, high: as for `to_mesh`.
 
     Raises:
-      ValueError: another suffix, or as `to_mesh`.
+      ValueError: the suffix is another one, or as `to_mesh`.
       OSError: the file cannot be written.
     """
     target = check_path(path, WRITTEN)
@@ -115,7 +115,7 @@ def _ground(ground: SpatialGround, low: np.ndarray, high: np.ndarray) -> list[Pi
 
 
 def _sheet(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> Piece:
-    """A height grid; cells are cut from the back left to the front right, as the ground is."""
+    """A height grid; cells are split from back left to front right, as in the ground."""
     k, m = heights.shape
     points = np.stack([*np.meshgrid(x, y, indexing='ij'), heights], 2).reshape(-1, 3)
     near = (np.arange(k - 1)[:, None] * m + np.arange(m - 1)).ravel()
@@ -125,7 +125,7 @@ def _sheet(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> Piece:
 
 
 def _box(box: Boxes, level: float | None, low: np.ndarray, high: np.ndarray) -> Piece:
-    """One box with upright sides, cut off at the rim if it is not turned."""
+    """One box with vertical sides, clipped to the bounds if its yaw is 0."""
     trimesh = library('trimesh', 'trimesh')
     position, half, yaw, top, slope = (part[0] for part in box)
     if not yaw:

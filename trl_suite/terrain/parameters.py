@@ -1,36 +1,36 @@
-"""Terrains as parameter files: the format of the paper, its presets, and blending between sets.
+"""Terrains as parameter files: the paper's format, its presets, and interpolation between sets.
 
 A terrain file is a JSON object:
 
     {"Type": "var2d_gaps",
      "Params": [{"GapSpacingMin": 2, "GapSpacingMax": 2.5, "GapWMin": 0.25, "GapWMax": 0.3}]}
 
-`Type` is a key of GENERATORS. `Params` is a list of parameter sets, each flat, name -> number; what
-a set leaves out takes the type's default, and an empty or absent list means all defaults. With
-several sets the terrain can be blended from one to the next, e.g. as a curriculum. `GroundWidth`,
+`Type` is a key of GENERATORS. `Params` is a list of parameter sets, each a flat object, name ->
+number. A parameter that a set omits takes the type's default; an empty or absent list means all
+defaults. Between several sets `terrain_level` interpolates, e.g. for a curriculum. `GroundWidth`,
 `VertSpacingX` and `VertSpacingZ` are accepted and have no effect on planar ground, as in the
 original. The example printed in the paper is the preset `slopes_mixed_humanoid`.
 
 Three-dimensional types are keys of GENERATORS3D; their files look the same. Their height grids have
 vertices 0.2 m apart, so another `VertSpacingX` or `VertSpacingZ` is refused.
 
-The original ignored what it did not understand. Here a file is refused, with a sentence that names
-file, set and key, if it has
+The original ignored unknown entries. Here a file raises a ValueError that names the file, set and
+key, if it has
 * a key that its type does not use (of another type, or misspelt), or the same key twice;
-* a value that is no finite number;
-* a range whose Min is above its Max, given or default;
+* a value that is not a finite number;
+* a range whose Min is above its Max, be they given or defaults;
 * a negative spacing, width or count, or a value beyond `generators.LIMITS`. Zero is allowed: every
-  feature has at least one vertex, so no generator can run for ever.
+  feature has at least one vertex, so every generator terminates.
 
-The presets are the terrain files of the original under their names there (planar ones in PRESETS,
+The presets are the original's terrain files under their original names (planar ones in PRESETS,
 three-dimensional ones in PRESETS3D), and `mixed_humanoid`, which is `slopes_mixed_humanoid` without
-its slopes. They differ from the files of the original thus:
+its slopes. They differ from the original's files as follows:
 * `gaps_humanoid` (GapH) and `cliffs_humanoid` (StepH1) have their reversed ranges in ascending
   order, which is the same distribution;
-* `mixed_curriculum` means steps of 0.05 to 0.1 m in its first set, but spelt the names without the
-  0, so that the original used the default 0.1 to 0.4 m; here they are as meant;
-* entries without effect are left out: bumps and slopes of `cliffs_rugged`, all that has nothing to
-  do with gaps in `test_terrain`, lengths of legs of trails, slices of belts, spacings of stairs.
+* `mixed_curriculum` intends steps of 0.05 to 0.1 m in its first set, but its file spells the names
+  without the 0, so that the original used the default 0.1 to 0.4 m; here the intended values apply;
+* entries without effect are omitted: bumps and slopes of `cliffs_rugged`, everything but gaps in
+  `test_terrain`, lengths of legs of trails, slices of belts, spacings of stairs.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ class Terrain:
     """A terrain type with its parameters.
 
     Attributes:
-      name: preset name, path of the file, or anything else that tells the user which one it is.
+      name: preset name, path of the file, or any other name, for messages.
       type: a key of GENERATORS or of GENERATORS3D.
       parameter_sets: the sets as given, without defaults; read-only.
 
     Raises:
-      ValueError: unknown type, or a parameter that is refused (see the module).
+      ValueError: unknown type, or an invalid parameter (see the module).
     """
 
     name: str
@@ -100,11 +100,11 @@ class Terrain:
         """Returns a value for every parameter of the type.
 
         Args:
-          terrain_level: which set; between whole numbers, a linear interpolation of the two neighbours,
-            number by number. Clamped to the sets there are.
+          terrain_level: number of the set; between whole numbers, each parameter is interpolated
+            linearly between the two neighbouring sets. Clamped to the existing sets.
 
         Raises:
-          ValueError: the terrain_level is not a number.
+          ValueError: terrain_level is not a number.
         """
         if (
             isinstance(terrain_level, bool)
@@ -171,14 +171,14 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
     """Returns a terrain.
 
     Args:
-      source: a Terrain (returned as it is), the name of a preset, the path of a terrain file (a str
-        that ends in .json or .txt, or any os.PathLike), or the content of one as a mapping.
+      source: a Terrain (returned unchanged), the name of a preset, the path of a terrain file (a
+        str that ends in .json or .txt, or any os.PathLike), or the content of one as a mapping.
 
     Raises:
-      ValueError: unknown preset or type, malformed file, or a parameter that is refused (see the
-        module); the message names file, set, key and reason.
+      ValueError: unknown preset or type, malformed file, or an invalid parameter (see the module);
+        the message names file, set, key and reason.
       OSError: the file cannot be read.
-      TypeError: the source is something else.
+      TypeError: the source has another type.
     """
     if isinstance(source, Terrain):
         return source

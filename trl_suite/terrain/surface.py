@@ -1,14 +1,15 @@
-"""Ground from a user's own function, array, picture or mesh: the same in every episode.
+"""Ground from a user's own function, array, image or mesh: the same in every episode.
 
     ramp = terrain.from_function(lambda x: 0.1 * np.maximum(x, 0), 'my_ramp')  # planar
     waves = terrain.from_function(waves)  # def waves(x, y): three-dimensional
     hill = terrain.from_image('hill.png', spacing=0.2, low=0.0, high=3.0)
     canyon = terrain.from_mesh('canyon.glb', spacing=0.1, start_span=5.0)
-    across = terrain.from_mesh('canyon.glb', line=0.0)  # planar: what lies over y = 0
+    across = terrain.from_mesh('canyon.glb', line=0.0)  # planar: the section at y = 0
 
-All return a `Terrain`, which goes wherever a preset does. Episodes start at the origin; with a
-`start_span` the seed moves the ground under it. Planar ground has a vertex every SPACING,
-three-dimensional ground every GRID; finer detail is lost. Beyond an array its rim goes on for ever.
+All return a `Terrain`, which can be used wherever a preset can. Episodes start at the origin; with
+a `start_span` the ground is shifted at random. Planar ground has a vertex every SPACING,
+three-dimensional ground every GRID; finer detail is lost. Beyond an array, the heights of its rim
+continue.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from trl_suite.util.files import check_size, existing
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
 Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
-LARGEST = 1e7  # vertices of an array, pixels of a picture
+LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
 MOST_BYTES = 10**9  # of a mesh file
 
 HeightFunction = Callable[..., npt.ArrayLike]
@@ -44,7 +45,7 @@ HeightFunction = Callable[..., npt.ArrayLike]
 
 @dataclasses.dataclass(frozen=True)
 class Surface(Terrain):
-    """A terrain that knows how it was made, so that another process can make it again."""
+    """A terrain that is pickled as the call that made it, so that other processes can repeat it."""
 
     recipe: tuple[Any, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
@@ -59,32 +60,33 @@ def from_function(
     start_span: float = 0.0,
     replace: bool = False,
 ) -> Terrain:
-    """Makes terrain from heights as a function of the place.
+    """Makes terrain from heights as a function of x, or of x and y.
 
     Args:
       function: x (k,) -> heights (k,), m, of planar ground; or x, y (k, m) -> heights (k, m) of
-        three-dimensional ground. It is given arrays, and must always answer the same. To cross
+        three-dimensional ground. It gets arrays, and must be deterministic. For use in other
         processes it must be importable.
       name: of the terrain and of its type; by default the function's.
-      start_span: an episode starts anywhere from -start_span to start_span, m, along x and, in
-        three dimensions, along y: there the ground is moved to the origin, by whole cells.
+      start_span: episodes start at random from -start_span to start_span, m, along x and, in three
+        dimensions, along y: the ground is shifted so that this place is at the origin. In three
+        dimensions it is shifted by whole cells.
       replace: whether an existing type of that name may be replaced.
 
     Raises:
-      ValueError: no name, a name that is taken, a function of none or more than two arguments, or
-        one that does not answer an array with an array of its shape.
-      TypeError: it is no function, or none of arrays.
+      ValueError: there is no name, or it is taken; or the function has no or more than two
+        arguments, or does not return an array of the shape of its arguments.
+      TypeError: it is not a function, or fails for arrays.
     """
     if not callable(function):
         raise TypeError(f'a function of x, or of x and y, is needed, not {function!r}')
     if name is None:
         name = str(getattr(function, '__name__', 'object'))
         if name == '<lambda>' or not hasattr(function, '__name__'):
-            raise ValueError(f'the function {function!r} has no name of its own; give name=')
+            raise ValueError(f'the function {function!r} has no name; pass name=')
     arguments = _arguments(function)
     taken = GENERATORS if arguments == 1 else GENERATORS3D
     known = _functions.get((arguments, name))
-    # A notebook's cell, run again. Of a lambda nobody knows whether it is the same.
+    # A notebook's cell that is run again. Whether two lambdas are the same cannot be decided.
     again = known is not None and _place(known) == _place(function)
     again &= not _place(function)[1].endswith('<lambda>')
     if name in taken and known is not function and not again and not replace:
@@ -100,7 +102,7 @@ _functions: dict[tuple[int, str], HeightFunction] = {}
 
 
 def _place(function: HeightFunction) -> tuple[str, str]:
-    """Where a function is written."""
+    """Module and qualified name of a function."""
     return getattr(function, '__module__', ''), getattr(function, '__qualname__', repr(function))
 
 
@@ -117,19 +119,19 @@ def _arguments(function: HeightFunction) -> int:
 
 
 def _check_answer(name: str, function: HeightFunction, arguments: int) -> None:
-    """Asks for a few heights: what is wrong with a function is better said before an episode."""
+    """Queries a few heights, so that errors of a function are reported before an episode."""
     shape = (2, 3)[-arguments:]
     try:
         found = np.asarray(function(*[np.zeros(shape)] * arguments))
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f'the height function {name!r} failed where it was given an array: {error}; numpy has '
-            'functions of arrays, as np.sin instead of math.sin, or np.where instead of if'
+            f'the height function {name!r} failed with an array as its argument: {error}; use '
+            'functions of arrays: np.sin instead of math.sin, np.where instead of if'
         ) from error
     if found.shape != shape or found.dtype.kind not in 'fiu':
         raise ValueError(
-            f'the height function {name!r} answers an array of shape {shape} with {found.dtype} of '
-            f'shape {found.shape}; expected numbers of the same shape'
+            f'the height function {name!r} returned {found.dtype} of shape {found.shape} for an '
+            f'array of shape {shape}; expected numbers of the same shape'
         )
 
 
@@ -159,15 +161,15 @@ def from_heights(
     line: float | None = None,
     start_span: float = 0.0,
 ) -> Terrain:
-    """Makes terrain from an array of heights, linear in between.
+    """Makes terrain from an array of heights, with linear interpolation.
 
     Args:
       heights: m; (k,) along x for planar ground, or (k, m) along x and along y (to the left).
-      spacing: between them, m.
+      spacing: distance of neighbouring heights, m.
       name: for messages.
-      first: number of the first vertex along each axis, which stands at first * spacing; by default
-        the middle of the array is the origin.
-      line: y in m of a line through (k, m) heights, which makes the ground planar.
+      first: index of the first vertex along each axis, which is at first * spacing; by default the
+        middle of the array is at the origin.
+      line: y in m of a section through (k, m) heights, which makes the ground planar.
       start_span: as for `from_function`.
 
     Raises:
@@ -180,7 +182,7 @@ def from_heights(
             f'each axis and no more than {LARGEST:g} in all'
         )
     if not np.isfinite(heights).all():
-        raise ValueError(f'{name}: heights must be finite; those at {_where(heights)} is not')
+        raise ValueError(f'{name}: heights must be finite; the one at {_where(heights)} is not')
     if not 0 < spacing < math.inf:
         raise ValueError(f'{name}: spacing is {spacing}; expected a positive number of metres')
     corner = -(np.array(heights.shape) // 2) if first is None else np.atleast_1d(first)
@@ -191,12 +193,12 @@ def from_heights(
     if line is not None:
         if heights.ndim == 1:
             raise ValueError(
-                f'{name}: heights of shape {heights.shape} are a line already; give no line'
+                f'{name}: heights of shape {heights.shape} are planar already; do not pass line'
             )
         x = spacing * (corner[0] + np.arange(len(heights)))
         heights, corner = _Raster(heights, spacing, corner)(x, line), corner[:1]
     raster = _Raster(heights, spacing, corner)
-    # Named by what it holds: whoever makes the same ground again, anywhere, finds the same type.
+    # Named by a hash of its content, so that the same ground has the same type in every process.
     digest = hashlib.sha256(heights.tobytes())
     digest.update(repr((heights.shape, spacing, corner.tolist())).encode())
     type_name = f'{name}#{digest.hexdigest()[:12]}'
@@ -211,7 +213,7 @@ def _where(heights: np.ndarray) -> list[int]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Raster:
-    """Heights (k,) or (k, m) whose first vertex stands at corner * spacing."""
+    """Heights (k,) or (k, m) whose first vertex is at corner * spacing."""
 
     heights: np.ndarray
     spacing: float
@@ -229,7 +231,7 @@ class _Raster:
         return self.heights[i] + u * (self.heights[i + 1] - self.heights[i])
 
     def __call__(self, x: np.ndarray, y: npt.ArrayLike) -> np.ndarray:
-        """Heights at points, bilinear."""
+        """Heights at points, by bilinear interpolation."""
         (i, u), (j, v) = self._weights(x, 0), self._weights(np.asarray(y), 1)
         near, far = (
             self.heights[i + k, j] + v * (self.heights[i + k, j + 1] - self.heights[i + k, j])
@@ -249,11 +251,11 @@ def from_image(
 ) -> Terrain:
     """Makes terrain from a height image: grey is height.
 
-    The picture is a map: x runs to its right, y up, and the origin is the pixel in its middle.
+    The image is a map: x points to its right, y up, and the origin is the pixel in its middle.
 
     Args:
-      path: .png, of 8 or 16 bits per pixel, or what else Pillow reads; of a picture in colours the
-        mean of red, green and blue counts.
+      path: .png, of 8 or 16 bits per pixel, or another format that Pillow reads; of colour images
+        the mean of red, green and blue is used.
       spacing: between pixels, m.
       low: height of black, m.
       high: height of white, m.
@@ -261,7 +263,7 @@ def from_image(
       start_span: as for `from_function`.
 
     Raises:
-      ValueError: no picture, a picture without range, or as `from_heights`.
+      ValueError: the file is not an image, low or high is invalid, or as `from_heights`.
       FileNotFoundError: there is no such file; the message has similar names.
       ImportError: imageio is not installed.
     """
@@ -303,22 +305,23 @@ def from_mesh(
     line: float | None = None,
     start_span: float = 0.0,
 ) -> Terrain:
-    """Makes terrain from a mesh, seen from above: of what lies over a point the highest counts.
+    """Makes terrain from a mesh: the height at a point is that of the highest triangle there.
 
-    Points that nothing lies over are as low as the lowest point of the mesh.
+    Points outside the mesh have the height of its lowest point.
 
     Args:
       path: .obj, .glb, .gltf, .stl or .ply.
-      spacing: between the points at which heights are taken, m.
+      spacing: distance of the points at which heights are sampled, m.
       scale: m per unit of the file, 0.001 for one in millimetres.
       up: the file's axis that points up, 'z' or 'y' (then z points to the viewer: -y here); by
-        default 'y' for .glb and .gltf, as that format has it, and 'z' for the others.
-      centre: move the middle of the mesh to the origin; else its own origin is ours.
+        default 'y' for .glb and .gltf, as that format requires, and 'z' for the others.
+      centre: whether to move the middle of the mesh to the origin; otherwise its origin is kept.
       line: as for `from_heights`.
       start_span: as for `from_function`.
 
     Raises:
-      ValueError: no mesh, one that does not lie over the origin, too many points, or bad numbers.
+      ValueError: the file is not a mesh, the mesh does not cover the origin, there are too many
+        points, or a number is invalid.
       FileNotFoundError: there is no such file; the message has similar names.
     """
     file = existing(path, MESHES)
@@ -362,7 +365,7 @@ def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
       triangles: corners, (t, 3, 3) m.
       x, y: ascending, (k,) and (m,) m.
     """
-    # A library's rays would need another library, and take three times as long.
+    # Ray casting by trimesh would need another library, and take three times as long.
     heights = np.full((len(x), len(y)), -np.inf)
     low, high = (triangles.min(1) - 1e-9).T, (triangles.max(1) + 1e-9).T
     bounds = [np.searchsorted(x, low[0]), np.searchsorted(x, high[0])]
@@ -401,18 +404,18 @@ def _triangles(file: os.PathLike[str]) -> np.ndarray:
         # Unprocessed: merging equal corners takes most of the time, and changes no height.
         mesh = trimesh.load_scene(file, process=False).to_mesh()
         triangles = np.asarray(mesh.triangles, float)
-    except Exception as error:  # of the reader's own kinds
-        raise ValueError(f'{file}: not a mesh that can be read ({error})') from None
+    except Exception as error:  # the reader raises types of its own
+        raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
     if not len(triangles) or not np.isfinite(triangles).all():
-        raise ValueError(f'{file}: not a mesh: it has no triangles, or some that are not finite')
+        raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')
     return triangles
 
 
 def library(name: str, source: str) -> Any:
-    """Imports what only some need; `source` is what pip is to install where it is missing."""
+    """Imports an optional library; if it is missing, the error names `source` to install by pip."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition('.')[0]
-        message = f'{package} is needed for this and missing; pip install {source}'
+        message = f'{package} is needed and not installed; pip install {source}'
         raise ImportError(message) from error

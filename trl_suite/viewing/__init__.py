@@ -1,1 +1,1 @@
-"""What one looks at: frames, videos, film strips, plots, windows."""
+"""Interactive viewing, and the gallery of pictures."""

@@ -1,11 +1,11 @@
-"""Re-makes all pictures: environments, terrains, characters, learning curves, and the suite at once.
+"""Makes all pictures: environments, terrains, characters, learning curves, and the whole suite.
 
     trl-suite gallery --output gallery --filter '*Dog2D*'
 
-Files, FOLDER/...: environments/ID.jpg, a film strip; curves/ID.png, of a policy that is shipped;
-terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg. At
-most about 40 kB each, but for the last one and some maps. What is there stays, unless asked otherwise or the policy
-that it shows has been replaced.
+Files in the folder: environments/ID.jpg, a film strip; curves/ID.png, for shipped policies;
+terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg.
+Each has at most about 40 kB, except the last one and some maps. Existing files are kept, unless
+`--overwrite` is given or the policy that they show has been replaced.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
 
 LARGEST = 40_000  # bytes of a picture
-QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, until it is small enough
+QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, tried until the file is small enough
 COLOURS = 64  # of a palette
 SEED = 1  # of every environment
-SECONDS, LONGER = 4.0, 12.0  # that a film strip covers; of plans
-# Episodes and times that show what an environment is about, where its first seconds do not: seed,
-# begin and end in s, camera.
+SECONDS, LONGER = 4.0, 12.0  # duration of a film strip; of one for tasks with plans
+# Episodes and times that are typical of an environment, if its first seconds are not: seed, begin
+# and end in s, camera.
 SCENES = {
     'PD_Biped3D_HLC_Soccer-v0': (8, 6.0, 16.0, 'back'),
     'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0, 8.5, 'back'),
@@ -51,12 +51,12 @@ SCENES = {
 COLUMNS = 6  # pictures of a film strip
 STRIP_SIZE = (180, 240)  # height and width of each, pixels
 CHARACTER_SIZE = (360, 480)
-TERRAIN_LENGTH = {False: 24.0, True: 60.0}  # m; in the plane, in space
-CLOSE_LENGTH = 12.0  # m; of ground whose features are small
+TERRAIN_LENGTH = {False: 24.0, True: 60.0}  # m; planar, three-dimensional
+CLOSE_LENGTH = 12.0  # m; for ground with small features
 CLOSE = ('var3d_checkers', 'var3d_ramp', 'var3d_stairs')
 TERRAIN_DRAWS = 2
-FRAME = 1 / 30  # s between two moments that could be drawn
-# What a family and the suite look like: id and time, s.
+FRAME = 1 / 30  # s between two frames
+# Frames that represent each family and the suite: id and time, s.
 FAMILIES = {
     'imitation': ('PD_Raptor2D_LLC_Imitate_Flat-v0', 2.0),
     'plaid': ('PD_Biped2D_Gaps_Terrain-v0', 2.0),
@@ -74,13 +74,13 @@ SUITE_SIZE, SUITE_LARGEST = (240, 320), 120_000  # pixels of each picture; bytes
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """One picture that can be made.
+    """One picture of the gallery.
 
     Attributes:
-      path: below the folder, with / between parts.
-      draw: returns it, (h, w, 3) uint8.
-      source: digest of what it shows, '' if that stays the same.
-      largest: how many bytes it may have.
+      path: path in the folder, with / between parts.
+      draw: function that returns the picture, (h, w, 3) uint8.
+      source: digest of the policy that it shows, '' if none.
+      largest: largest number of bytes.
     """
 
     path: str
@@ -107,28 +107,28 @@ def items() -> Iterator[Item]:
 
 
 def character_path(name: str) -> str:
-    """Returns where the picture of a character lies, below the folder."""
+    """Returns the path in the folder of a character's picture."""
     return f'characters/{name}.jpg'
 
 
 def terrain_path(name: str) -> str:
-    """Returns where the picture of a preset lies, below the folder."""
+    """Returns the path in the folder of a preset's picture."""
     suffix = 'jpg' if terrains.load(name).spatial else 'png'
     return f'terrains/{name.replace("/", "_")}.{suffix}'
 
 
 def strip_path(id: str) -> str:
-    """Returns where the film strip of an environment lies, below the folder."""
+    """Returns the path in the folder of an environment's film strip."""
     return f'environments/{id}.jpg'
 
 
 def curve_path(id: str) -> str:
-    """Returns where the learning curve of an environment lies, below the folder."""
+    """Returns the path in the folder of an environment's learning curve."""
     return f'curves/{id}.png'
 
 
 def record(id: str) -> dict[str, Any] | None:
-    """Returns how the policy of an environment was trained (trained/README.md), if it is shipped."""
+    """Returns the training record (trained/README.md) of an environment's shipped policy, if any."""
     path = resources.directory('trained') / f'{id}.json'
     return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
 
@@ -144,19 +144,19 @@ def make(
     """Makes the pictures that are missing, or that show a policy that has been replaced.
 
     Args:
-      folder: where; it is made if need be.
-      only: pattern in the manner of a shell, with or without `*` around it, of paths below the folder.
-      again: also make those that are there.
-      progress: show a bar.
+      folder: output folder; created if necessary.
+      only: shell-style pattern of paths in the folder; `*` is added on both sides.
+      again: whether to replace existing pictures.
+      progress: whether to show a progress bar.
 
     Returns:
-      What was written; and what failed, by path below the folder. One that fails stops no other.
+      Paths of written files; and errors by path in the folder. An error does not stop the others.
 
     Raises:
       ValueError: the pattern matches nothing.
-      RuntimeError: there is no OpenGL to draw with.
+      RuntimeError: no OpenGL library works.
       ImportError: the extra 'video' is not installed.
-      OSError: the folder cannot be made.
+      OSError: the folder cannot be created.
     """
     folder = pathlib.Path(folder)
     chosen = [item for item in items() if fnmatch.fnmatch(item.path, f'*{only}*')]
@@ -183,7 +183,7 @@ def make(
 
 
 def character(name: str) -> np.ndarray:
-    """Draws a character: in the first pose of its clip if it has one, else standing straight."""
+    """Renders a character in the first pose of its clip, or standing straight if it has no clip."""
     figure = KinematicViewer(name)
     clip = characters.CHARACTERS[name].clip
     if clip is not None:
@@ -205,14 +205,14 @@ def terrain(terrain: Any) -> np.ndarray:
 
 
 def terrain_length(terrain: terrains.Terrain) -> float:
-    """Returns how much of a terrain is plotted, m: ahead, or the side of a map."""
+    """Returns the length of a plot of a terrain, m: ahead, or the side of a map."""
     return CLOSE_LENGTH if terrain.type in CLOSE else TERRAIN_LENGTH[terrain.spatial]
 
 
 def scene(id: str) -> tuple[int, float, float, str]:
     """Returns what a film strip shows: seed, begin and end (s), camera.
 
-    Plans are seen from behind, with what is ahead, unless obstacles would stand in between.
+    Tasks with plans are rendered from behind, unless obstacles would hide the character.
     """
     spec = suite.find(id)
     if spec.id in SCENES:
@@ -224,9 +224,9 @@ def scene(id: str) -> tuple[int, float, float, str]:
 
 
 def film_strip(id: str) -> np.ndarray:
-    """Draws what `scene` says, or until the episode ends, under the best policy: `acting.best`."""
+    """Renders `scene`, or until the episode ends, with the best policy: `acting.best`."""
     moments: list[int] = []
-    _run(id, lambda environment: moments.append(0))  # how many there are until the episode ends
+    _run(id, lambda environment: moments.append(0))  # counts frames until the episode ends
     first = min(round(scene(id)[1] / FRAME), len(moments) - 1)
     spread = rendering.spread(len(moments) - first, COLUMNS)
     images = _draw(id, {first + number for number in spread}, STRIP_SIZE)
@@ -234,18 +234,18 @@ def film_strip(id: str) -> np.ndarray:
 
 
 def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarray:
-    """Draws one moment of such an episode.
+    """Renders one frame of such an episode.
 
     Args:
       id: of the environment.
-      time: since its start, s.
+      time: since the start of the episode, s.
       size: height and width, pixels.
     """
     return _draw(id, {round(time / FRAME)}, size)[-1]
 
 
 def together() -> np.ndarray:
-    """Draws moments of several environments, in rows."""
+    """Renders frames of several environments, in rows."""
     rows = [[moment(*scene, SUITE_SIZE) for scene in row] for row in SUITE]
     strips = [rendering.film_strip(row, columns=len(row)) for row in rows]
     margin = np.full((rendering.STRIP_MARGIN, *strips[0].shape[1:]), 255, np.uint8)
@@ -253,7 +253,7 @@ def together() -> np.ndarray:
 
 
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
-    """Draws chosen moments of an episode, FRAME apart."""
+    """Renders the frames `wanted` of an episode, by number; they are FRAME apart."""
     camera = scene(id)[-1]
     images: list[np.ndarray] = []
     number = itertools.count()
@@ -267,7 +267,7 @@ def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
 
 
 def _run(id: str, look: Callable[[Environment], None]) -> None:
-    """Runs an episode to the end of the scene, and has `look` called at every moment."""
+    """Runs an episode to the end of the scene, and calls `look` for every frame."""
     seed, _, seconds, _ = scene(id)
     environment = suite.make(id, {'random': seed})
     _, policy = acting.best(environment, id)
@@ -289,7 +289,7 @@ def _run(id: str, look: Callable[[Environment], None]) -> None:
 
 
 def curve(id: str) -> np.ndarray:
-    """Plots what the policies of all seeds achieved while they learnt, the shipped one in front.
+    """Plots the learning curves of all seeds, that of the shipped policy in front.
 
     Raises:
       ValueError: no policy is shipped.
@@ -325,13 +325,13 @@ def curve(id: str) -> np.ndarray:
 
 
 def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
-    """Writes a picture, made small: a .png with a palette, or a .jpg as good as its size allows.
+    """Writes a small picture: a .png with a palette, or a .jpg of the best quality that fits.
 
     Args:
       image: (h, w, 3) uint8.
-      path: where to.
-      source: digest of what it shows, which is kept in the file.
-      largest: how many bytes a .jpg may have, if a quality is low enough for it.
+      path: file to write.
+      source: digest of the policy that it shows, stored in the file.
+      largest: number of bytes that a .jpg should not exceed; the lowest quality may exceed it.
 
     Raises:
       ValueError: another suffix.
@@ -356,7 +356,7 @@ def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = L
 
 
 def _source(path: pathlib.Path) -> str:
-    """Returns the digest that `save` has kept in a file, '' if there is none."""
+    """Returns the digest that `save` stored in a file, '' if there is none."""
     from PIL import Image
 
     with contextlib.suppress(OSError), Image.open(path) as image:

@@ -1,4 +1,4 @@
-"""dm_control's viewer as it suits the suite. Where GLFW finds no screen, importing this warns."""
+"""dm_control's viewer, adapted to the suite. If GLFW finds no screen, importing this warns."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from dm_control.viewer import application, viewer
 from trl_suite import rendering
 from trl_suite.environments.environment import Environment
 
-AZIMUTH, ELEVATION = 90.0, -8.0  # degrees; who walks along x is seen from the right
+AZIMUTH, ELEVATION = 90.0, -8.0  # degrees; from the right of a character that walks along x
 DISTANCE = 4.0  # m; of the camera
 
 
 class Window(application.Application):
-    """A viewer that is under way at once and follows the character.
+    """A viewer that runs from the start and tracks the character.
 
-    It also draws what the task marks, and a height field anew that has changed on the way. dm_control's
-    own (1.0.50) has no public way to any of this.
+    It also draws the task's markers, and uploads changed height fields. dm_control's viewer
+    (1.0.50) has no public interface for any of these.
     """
 
     def __init__(self, environment: Environment, title: str) -> None:
         super().__init__(title)
         self._shown = environment
-        self._field = np.zeros(0)  # as the graphics card has it
+        self._field = np.zeros(0)  # as uploaded to the graphics card
         self._pause_subject.toggle()
         self._viewer = viewer.Viewer(
             self._viewport, self._window.mouse, self._window.keyboard,
@@ -35,7 +35,7 @@ class Window(application.Application):
 
     def _perform_deferred_reload(self, params: Any) -> None:
         super()._perform_deferred_reload(params)
-        if params.zoom_to_scene:  # for the first time; later the camera stays as it was
+        if params.zoom_to_scene:  # at the first time only; later reloads keep the camera
             self._viewer.camera.settings = following(self._shown)
 
     def _before_drawing(self, model: Any, data: Any, scene: Any) -> None:
@@ -45,13 +45,13 @@ class Window(application.Application):
         if model.nhfield and not np.array_equal(model.hfield_data, self._field):
             self._field = model.hfield_data.copy()
             drawn = self._renderer._mujoco_context
-            if drawn is not None:  # else it is about to be made, with this very field
+            if drawn is not None:  # else it will be created with this field
                 with self._renderer._surface.make_current() as gl:
                     gl.call(mujoco.mjr_uploadHField, model.ptr, drawn.ptr, 0)
 
 
 def following(environment: Environment) -> Any:
-    """Returns the settings of a camera that looks at the character, wherever it goes."""
+    """Returns the settings of a camera that tracks the character."""
     task, model = environment.task, environment.physics.model
     joint = int(np.flatnonzero(model.jnt_qposadr == task.figure.pose_qpos[0])[0])
     camera = wrapper.MjvCamera()

@@ -1,17 +1,17 @@
-"""The planar terrain generators: random features one after another, and rolling ground under them.
+"""The planar terrain generators: random features in sequence, optionally on rolling ground.
 
 A planar terrain is a polyline with vertices SPACING apart. A generator is a function of
 (parameters, length in m, random generator) that returns a `Profile`: the vertices to append to the
-ground so far, which stands at height 0. It repeats its feature until the length is reached, so it
-overshoots by up to one feature. Two primitives make all features:
+existing ground, whose last vertex is at height 0. It repeats its feature until the length is
+reached, so it overshoots by up to one feature. All features consist of two primitives:
 
 * a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
-  flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m at its crest and
-  0.225 m at its foot. The level of the ground is unchanged.
+  flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m wide at its crest
+  and 0.225 m at its foot. The level of the ground is unchanged.
 * a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
 
-The processes are those of the terrain generator of the original (Terrain RL Simulator, 2018);
-equality is in distribution, not draw by draw. New generators join through `register`:
+The random processes are those of the original's terrain generator (Terrain RL Simulator, 2018):
+equal in distribution, not draw by draw. `register` adds a generator:
 
     @register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
     def saw(parameters, length, rng):
@@ -40,7 +40,7 @@ from trl_suite.util.errors import unknown
 SPACING = 0.025  # m between vertices
 STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
 LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
-LONGEST = 1e6  # m; most ground asked for at once
+LONGEST = 1e6  # m; largest length of a stretch, and largest |x| of a query
 
 # Defaults of the parameters, by feature (those of the original).
 GAPS = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
@@ -59,8 +59,8 @@ CLIFFS = {'CliffSpacingMin': 5, 'CliffSpacingMax': 7, 'CliffH0Min': 0.1, 'CliffH
 BUMPS = {'BumpHMin': 0, 'BumpHMax': 0.03}
 SLOPES = {'SlopeDeltaRange': 0.25, 'SlopeDeltaMin': -0.35, 'SlopeDeltaMax': 0.35}
 
-# What values make sense, by name without Min or Max: a length or a count below zero means nothing,
-# and the upper bounds keep a stretch of ground in memory. Names not listed here may be any number.
+# Valid values, by name without Min or Max: lengths and counts are not negative, and upper bounds
+# limit the memory of a stretch of ground. Names not listed here may be any number.
 _LENGTH, _COUNT, _HEIGHT, _SLOPE = (0.0, 1e3), (0.0, 100.0), (-1e3, 1e3), (-100.0, 100.0)
 LIMITS = {
     **dict.fromkeys(('GapSpacing', 'WallSpacing', 'StepSpacing', 'CliffSpacing'), _LENGTH),
@@ -70,7 +70,7 @@ LIMITS = {
     **dict.fromkeys(('GapH', 'WallH', 'StepH0', 'StepH1', 'BumpH'), _HEIGHT),
     **dict.fromkeys(('CliffH0', 'CliffH1', 'NarrowGapDepth'), _HEIGHT),
     **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange'), _SLOPE),
-    # Of three-dimensional ground.
+    # Three-dimensional ground.
     **dict.fromkeys(('PathWidth0', 'PathWidth1', 'PathWidthDeltaStdev', 'PathTurnLength'), _LENGTH),
     **dict.fromkeys(('ConveyorStripLength', 'ConveyorSpacing'), _LENGTH),
     **dict.fromkeys(('ObstacleWidth0', 'ObstacleWidth1'), (0.0, 40.0)),
@@ -84,7 +84,7 @@ LIMITS = {
     'ObstacleDensity': (0.0, 2.0),
     'ObstacleSpeedLerpPow': (0.0, 100.0),
     'Slope': (-10.0, 10.0),
-    # Of ground that is a function of the place.
+    # Ground that is a function of x, or of x and y.
     'StartSpan': (0.0, 1e5),
 }
 
@@ -96,7 +96,7 @@ class Profile:
     Attributes:
       heights: heights of the vertices, SPACING apart, m, shape (k,).
       vertical: True where the cell between the previous vertex and this one is the vertical face of
-        a feature, shape (k,). The first cell begins at the last vertex of the ground so far.
+        a feature, shape (k,). The first cell begins at the last vertex of the existing ground.
     """
 
     heights: np.ndarray
@@ -111,8 +111,8 @@ Function = Callable[[Parameters, float, np.random.Generator], Profile]
 class Generator(NamedTuple):
     """A terrain type: its function, and its parameters with their defaults.
 
-    Ground that is the same in every episode has a `line` besides, heights (k,) at x (k,), m; a
-    `PlanarGround` then takes its vertices from there.
+    Ground that is the same in every episode also has a `line`, a function that returns heights (k,)
+    at x (k,), m; a `PlanarGround` then takes its vertices from this function.
     """
 
     function: Function
@@ -130,12 +130,12 @@ def check(
     """Returns parameter values as floats.
 
     Args:
-      where: what the values belong to, for the message.
+      where: the owner of the values, for the message.
       values: name -> number.
       defaults: values of the parameters that are not given.
 
     Raises:
-      ValueError: a value is no finite number, is outside LIMITS, or a Min is above its Max.
+      ValueError: a value is not a finite number or is outside LIMITS, or a Min is above its Max.
     """
     checked = {}
     for key, value in values.items():
@@ -173,7 +173,7 @@ def register(
       replace: whether an existing type of that name may be replaced.
 
     Raises:
-      ValueError: the name is taken, or a default makes no sense (see `check`).
+      ValueError: the name is taken, or a default is invalid (see `check`).
     """
     if type_name in _generators and not replace:
         raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
@@ -187,7 +187,7 @@ def register(
 
 
 def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Registers planar ground whose heights are a function of x; replaces what has that name."""
+    """Registers planar ground whose heights are a function of x; replaces a type of that name."""
 
     def ahead(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         heights = line(SPACING * np.arange(cells(length) + 1))
@@ -200,7 +200,7 @@ def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> N
 def draw(
     type_name: str, parameters: Parameters, length: float, rng: np.random.Generator
 ) -> Profile:
-    """Draws one stretch of ground, and checks what the generator made of it.
+    """Generates one stretch of ground, and checks the generator's result.
 
     Args:
       type_name: a key of GENERATORS.
@@ -209,8 +209,8 @@ def draw(
       rng: source of randomness.
 
     Raises:
-      ValueError: unknown type, a length that is not positive and below LONGEST, or a generator
-        that returns something else than a finite `Profile` of at least one vertex.
+      ValueError: unknown type, a length that is not positive or above LONGEST, or a generator that
+        returns anything but a finite `Profile` of at least one vertex.
     """
     if type_name not in _generators:
         raise ValueError(unknown('terrain type', type_name, _generators))
@@ -235,22 +235,23 @@ def draw(
 
 
 def cells(length: float) -> int:
-    """Returns the number of cells a length in m takes: rounded up, but 0.2 m is 8 cells."""
+    """Returns the number of cells of a length in m: rounded up, except for rounding errors."""
     return math.ceil(length / SPACING - 1e-9)
 
 
-# Features: each draws one and writes its level runs, number of vertices and height, in order.
-# Heights count from the ground before the feature; the last run is the ground after it.
+# Features: each function draws one and writes it as runs of equal height, (number of vertices,
+# height), in order. Heights are relative to the ground before the feature; the last run is the
+# ground after it.
 
 
 class Runs(NamedTuple):
-    """Room for level runs."""
+    """Preallocated arrays for runs of equal height."""
 
     counts: np.ndarray
     levels: np.ndarray
 
 
-# Features, and where their parameters begin among those of the type. A Max follows its Min.
+# Features, and the index of their first parameter among those of the type. A Max follows its Min.
 _GAP, _STEP, _WALL, _MIXED, _NARROW_GAPS, _CLIFF = range(6)
 _MIXTURE: Parameters = {**GAPS, **WALLS, **STEPS}
 _SPACING, _WIDTH, _TOP = (list(GAPS).index(f'Gap{name}Min') for name in ('Spacing', 'W', 'H'))
@@ -277,21 +278,21 @@ def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
 
 @compiled_inline
 def _integer(low: float, high: float, bits: int) -> int:
-    """Draws an integer, both ends included; blended counts are truncated here, at their use."""
+    """Draws an integer, both ends included; interpolated counts are truncated only here."""
     first, last = int(low), int(high)
     return first + int((last - first + 1) * random.draw(bits))
 
 
 @compiled_inline
 def _add(number: int, count: int, level: float, runs: Runs) -> int:
-    """Adds a run to those there are; returns their new number."""
+    """Appends a run; returns the new number of runs."""
     runs.counts[number], runs.levels[number] = count, level
     return number + 1
 
 
 @compiled
 def _box(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """A gap or a wall, whose parameters begin at the first; returns the new number of runs."""
+    """Adds a gap or a wall, whose parameters begin at index `first`; returns the number of runs."""
     spacing = _cells(_uniform(first + _SPACING, parameters, bits))
     width = _cells(_uniform(first + _WIDTH, parameters, bits))
     number = _add(number, spacing, 0.0, runs)
@@ -301,10 +302,10 @@ def _box(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs)
 
 @compiled
 def _rise_range(first: int, parameters: np.ndarray, bits: int) -> int:
-    """Returns which of two ranges of a signed rise is drawn from.
+    """Chooses one of the two ranges of a signed rise.
 
-    A range whose ends are both 0 is switched off; of two that are on, a coin decides. So direction
-    comes from the numbers alone: with two positive ranges the ground only ascends.
+    A range whose ends are both 0 is switched off; of two active ranges, each has probability 1/2.
+    The sign of the rise is that of the range: with two positive ranges the ground only ascends.
     """
     low, high = first + _RISES[0], first + _RISES[1]
     down = parameters[high] != 0.0 or parameters[high + 1] != 0.0
@@ -324,7 +325,7 @@ def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs
 
 @compiled
 def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """A cluster of gaps with stepping stones between; all floors count from the same surface."""
+    """A cluster of gaps with stepping stones; all gap depths are below the same surface."""
     spacing = first + _SPACING
     low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
     for _ in range(_integer(low, high, bits)):
@@ -371,10 +372,10 @@ def _draw_features(
     kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, counts: np.ndarray,
     levels: np.ndarray,
 ) -> tuple[int, int]:  # fmt: skip
-    """Draws features until no vertices are missing, or no room is left.
+    """Draws features until no vertices are missing, or the arrays are full.
 
     Returns:
-      The number of runs there are then, and how many vertices are missing.
+      The number of runs, and the number of vertices that are still missing.
     """
     runs = Runs(counts, levels)
     base = levels[number - 1] if number else 0.0
@@ -391,7 +392,7 @@ def _draw_features(
 def _spread(
     number: int, counts: np.ndarray, levels: np.ndarray, heights: np.ndarray, vertical: np.ndarray
 ) -> None:
-    """Writes the vertices of runs: their height changes at vertical faces only, where a run begins."""
+    """Writes the vertices of runs; where a run begins at another height, the cell is vertical."""
     i, before = 0, 0.0
     for k in range(number):
         for j in range(i, i + counts[k]):
@@ -402,7 +403,7 @@ def _spread(
 
 
 def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Repeats a feature until the length is reached; every one has at least one vertex."""
+    """Repeats a feature until the length is reached; every feature has at least one vertex."""
     wanted = missing = cells(length)
     values = np.array([parameters[name] for name in _NAMES[kind]], float)
     bits, number = random.address(rng), 0
@@ -417,7 +418,7 @@ def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Gen
     return Profile(heights, vertical)
 
 
-# Overlays: added over the vertices of a stretch.
+# Overlays: added to the heights of a stretch.
 
 
 def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) -> Profile:
@@ -425,7 +426,7 @@ def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) 
 
     Per vertex the slope changes by up to SlopeDeltaRange: down with a probability that grows
     from 0 to 1 as the slope crosses the band from SlopeDeltaMin to SlopeDeltaMax, else up.
-    A band without width adds nothing.
+    A band of width 0 adds nothing.
     """
     low, high = parameters['SlopeDeltaMin'], parameters['SlopeDeltaMax']
     if low == high:
@@ -443,7 +444,7 @@ def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) 
 def _walk(
     heights: np.ndarray, changes: np.ndarray, thresholds: np.ndarray, sloped: np.ndarray
 ) -> None:
-    """Adds a walk of the slope to heights."""
+    """Adds a random walk of the slope to heights."""
     slope = offset = 0.0
     for k in range(len(heights)):
         slope = slope - changes[k] if slope > thresholds[k] else slope + changes[k]

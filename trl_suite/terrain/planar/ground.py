@@ -1,4 +1,4 @@
-"""The endless planar ground of one episode."""
+"""The unbounded planar ground of one episode."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from trl_suite.terrain.planar.generators import (
 )
 from trl_suite.util.compiled import compiled
 
-STRETCH = 20.0  # m; nominal length drawn at once; slopes restart in every stretch
-PAD_END = 1.0  # m; the flat start ends here
+STRETCH = 20.0  # m; nominal length generated at once; slopes restart in every stretch
+PAD_END = 1.0  # m; end of the flat start
 INTENDED_CENTRE = -1.0  # m
 _UNUSED = np.random.default_rng(0)  # for level ground, which draws nothing
-_FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # draws between two parts; 2**128 by the golden ratio
+_FAR = 0x9E3779B97F4A7C15F39CC0605CEDC835  # distance of two streams: 2**128 / golden ratio draws
 
 
 class PlanarGround:
-    """Planar ground without end, drawn in stretches of 20 m as it is asked for.
+    """Unbounded planar ground, generated in stretches of 20 m when it is queried.
 
-    Vertex i stands at x = i * SPACING, for any integer i; the ground is linear in between. Ground
-    to the right and to the left is drawn from two random streams of their own, so what stands where
-    depends on the seed alone, never on when or how far the ground was asked for.
+    Vertex i is at x = i * SPACING, for any integer i; the ground is linear in between. Ground to
+    the right and ground to the left have separate random streams, so the ground depends on the seed
+    only, not on the order or extent of queries.
 
     The first two stretches meet at height 0 at the `centre`. A stretch over x = 0 begins with flat
-    ground, meant to reach x = +1 (the original's rule). With the centre at -1, where the original
-    wanted it, that is a flat start from x = -1 to +1, and the first spacing follows. As run, the
-    original put the centre elsewhere; then either a feature ends exactly at the centre behind the
+    ground, intended to reach x = +1 (the original's rule). With the centre at -1, as the original
+    intended, the ground is flat from x = -1 to +1, and the first spacing follows. When run, the
+    original has its centre elsewhere; then either a feature ends exactly at the centre behind the
     character (centre in (-1, 0]), or one ends at the centre in front of it and the flat ground
     lies 20 m behind (centre > 0).
 
     Ground that is a function of x (see `from_function`) has neither stretches nor a flat start: its
-    heights are those of the function, from where the seed has put the origin if starts are spread.
+    heights are those of the function, shifted by a random offset if it has a `start_span`.
 
     Attributes:
       type: the terrain type.
@@ -60,28 +60,28 @@ class PlanarGround:
         spawn: str = 'intended',
         centre: float = 0.0,
     ):
-        """Prepares the ground; it is drawn when it is first asked for.
+        """Prepares the ground; it is generated when it is first queried.
 
         Args:
-          terrain: what ground.
-          seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
+          terrain: the type and parameters of the ground; planar.
+          seed: an integer, a SeedSequence (not changed: the same one gives the same ground), or a
             Generator (from which four numbers are drawn).
-          terrain_level: which of the parameter sets, see `Terrain.parameters`.
-          spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start of the
-            original as run.
-          centre: where the first two stretches meet if spawn is 'upstream', m; else not used. In
-            the original 3 for gait machines, and x - 0.5 for the imitation of a clip that has moved
-            x m forward at its start phase.
+          terrain_level: number of the parameter set, see `Terrain.parameters`.
+          spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start that the
+            original has when run.
+          centre: x where the first two stretches meet if spawn is 'upstream', m; otherwise unused.
+            In the original 3 for gait machines, and x - 0.5 for the imitation of a clip that has
+            moved x m forward at its start phase.
 
         Raises:
-          ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or further
-            than LONGEST, or a terrain_level that is no number.
-          TypeError: the seed is something else.
+          ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or whose
+            magnitude exceeds LONGEST, or a terrain_level that is not a number.
+          TypeError: the seed has another type.
         """
         if terrain.spatial:
             raise ValueError(
                 f'terrain {terrain.name!r} ({terrain.type}) is three-dimensional; planar characters '
-                'and a Strip need planar terrain'
+                'and a PlanarGround need planar terrain'
             )
         if spawn not in ('intended', 'upstream'):
             raise ValueError(f"spawn must be 'intended' or 'upstream', not {spawn!r}")
@@ -89,12 +89,12 @@ class PlanarGround:
             raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
         self.type = terrain.type
         self.parameters = terrain.parameters(terrain_level)
-        # Heights of the vertices from number _low on; one fewer flags for the cells between them.
+        # Heights of the vertices _low, _low + 1, ...; one flag less, for the cells between them.
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)
         self._sequence = seed_sequence(seed)
-        self._offset = 0.0  # m; where the origin lies on a line
+        self._offset = 0.0  # m; argument of the line function at the origin
         if self._line is not None:
             self._low = 0
             span = self.parameters['StartSpan']
@@ -104,29 +104,29 @@ class PlanarGround:
 
     @functools.cached_property
     def _streams(self) -> tuple[np.random.Generator, np.random.Generator]:
-        """What ground to the right and to the left is drawn from."""
-        # Two far parts of one stream; `jumped` would draw a seed from the system for nothing.
+        """Random generators of the ground to the right and to the left."""
+        # Two distant parts of one stream; `jumped` would needlessly draw a seed from the system.
         right, left = np.random.PCG64(self._sequence), np.random.PCG64(self._sequence)
         left.advance(_FAR)
         return np.random.Generator(right), np.random.Generator(left)
 
     @property
     def extent(self) -> tuple[float, float]:
-        """From where to where the ground is drawn so far, m."""
+        """Lowest and highest x of the ground that exists so far, m."""
         return self._low * SPACING, (self._low + len(self._heights) - 1) * SPACING
 
     def ensure(self, lo: float, hi: float) -> None:
-        """Draws the ground from lo to hi (m) as far as it is not there yet.
+        """Generates the ground from lo to hi (m) where it does not exist yet.
 
         Raises:
-          ValueError: lo or hi is not finite or further than LONGEST from 0.
+          ValueError: lo or hi is not finite, or further than LONGEST from 0.
         """
         if not (abs(lo) <= LONGEST and abs(hi) <= LONGEST):
             raise ValueError(f'ground exists within {LONGEST:g} m of 0, not from {lo!r} to {hi!r}')
         self._extend(math.floor(lo / SPACING), math.ceil(hi / SPACING))
 
     def window(self, lo_index: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices lo_index, lo_index + 1, ... and draws them if need be.
+        """Returns the vertices lo_index, lo_index + 1, ..., generated if necessary.
 
         Returns:
           heights: m, shape (count,).
@@ -134,7 +134,7 @@ class PlanarGround:
         """
         if count < 1:
             raise ValueError(f'count must be positive, not {count!r}')
-        # One vertex more to the left, so that the first cell is known.
+        # One more vertex to the left, so that the first cell is known.
         self.ensure((lo_index - 1) * SPACING, (lo_index + count - 1) * SPACING)
         first = lo_index - self._low
         heights = self._heights[first : first + count]
@@ -144,15 +144,15 @@ class PlanarGround:
         """Returns the heights of the ground at x (m), of the shape of x, by linear interpolation.
 
         Raises:
-          ValueError: x holds a value that is not finite or further than LONGEST from 0.
+          ValueError: a value of x is not finite, or further than LONGEST from 0.
         """
         left, rise, fraction = self._cell(x)
         return left + fraction * rise
 
     def slope(self, x: npt.ArrayLike) -> np.ndarray:
-        """Returns dh/dx of the cells that x (m) lies in; at a vertex, of the cell to its right.
+        """Returns dh/dx of the cells that contain x (m); at a vertex, of the cell to its right.
 
-        Vertical faces count as what they are in the polyline: one cell wide.
+        Vertical faces are one cell wide, as in the polyline.
 
         Raises:
           ValueError: as `height`.
@@ -160,7 +160,7 @@ class PlanarGround:
         return self._cell(x)[1] / SPACING
 
     def state(self) -> dict[str, Any]:
-        """Returns everything `from_state` needs to go on exactly as this strip would."""
+        """Returns a state from which `from_state` continues exactly as this ground would."""
         return {
             'type': self.type,
             'parameters': dict(self.parameters),
@@ -174,13 +174,13 @@ class PlanarGround:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> PlanarGround:
-        """Returns a strip as it was when `state` was taken."""
+        """Returns the ground that had this `state`."""
         strip = cls.__new__(cls)
         strip.set_state(state)
         return strip
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Puts the strip back to what it was when `state` was taken."""
+        """Restores the ground to the time at which `state` was taken."""
         right, left = np.random.default_rng(0), np.random.default_rng(0)
         right.bit_generator.state, left.bit_generator.state = state['right'], state['left']
         self.type, self.parameters = state['type'], dict(state['parameters'])
@@ -191,12 +191,12 @@ class PlanarGround:
 
     @property
     def _line(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """What the ground is, if it is a function of x."""
+        """The function of x that gives the heights; None for other ground."""
         generator = GENERATORS.get(self.type)
         return None if generator is None else generator.line
 
     def _on_line(self, first: int, count: int) -> np.ndarray:
-        """Heights of vertices of a line, (count,) m."""
+        """Heights of vertices from the line function, (count,) m."""
         assert self._line is not None
         x = (first + np.arange(count)) * SPACING + self._offset
         heights = np.asarray(self._line(x), dtype=float)
@@ -214,7 +214,7 @@ class PlanarGround:
         return heights
 
     def _cell(self, x: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the height left of x, the rise over the cell, and where in the cell x lies."""
+        """Returns the height of the vertex left of x, the rise over the cell, and x in the cell."""
         x = np.asarray(x, dtype=float)
         if not x.size:
             return x, x, x
@@ -229,7 +229,7 @@ class PlanarGround:
         return left, self._heights[i + 1] - left, position - number
 
     def _extend(self, low: int, high: int) -> None:
-        """Draws stretches until the vertices from low to high are there."""
+        """Generates stretches until the vertices from low to high exist."""
         end = self._low + len(self._heights) - 1
         if self._line is not None:
             self._extend_line(min(low, self._low), max(high, end))
@@ -253,7 +253,7 @@ class PlanarGround:
         self._low, self._heights, self._vertical = start, heights, vertical
 
     def _extend_line(self, low: int, high: int) -> None:
-        """Takes the vertices from low to high that are missing, and some more, from the line."""
+        """Adds missing vertices from low to high, and a margin, from the line function."""
         end, more = self._low + len(self._heights) - 1, cells(STRETCH)
         parts = [self._heights]
         if low < self._low:
@@ -266,15 +266,15 @@ class PlanarGround:
             self._vertical = np.abs(np.diff(self._heights)) > STEEP * SPACING
 
     def _stretch(self, begin: int, side: int) -> tuple[int, np.ndarray, np.ndarray]:
-        """Draws a stretch that begins at a vertex.
+        """Generates a stretch that begins at a vertex.
 
         Returns:
-          How many level vertices come first, some if it covers x = 0; heights and vertical faces of
-          those that follow, as of a `Profile`.
+          The number of level vertices at its beginning (not 0 only if it covers x = 0), and heights
+          and vertical faces of the vertices that follow, as in a `Profile`.
         """
         generator = GENERATORS.get(self.type)
         if generator is not None and generator.function is flat:
-            # Without the streams, which take longer to make than the ground.
+            # Not from the streams: creating them takes longer than generating the ground.
             profile = flat(self.parameters, STRETCH, _UNUSED)
         else:
             profile = draw(self.type, self.parameters, STRETCH, self._streams[side])
@@ -289,7 +289,7 @@ def _append(
     last: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
     vertical: np.ndarray,
 ) -> int:  # fmt: skip
-    """Writes a stretch behind the last vertex there is; returns which is the last one then."""
+    """Writes a stretch after the last vertex; returns the index of the new last vertex."""
     base = heights[last]
     for k in range(pad):
         heights[last + 1 + k], vertical[last + k] = base, False
@@ -304,9 +304,9 @@ def _prepend(
     first: int, pad: int, more: np.ndarray, faces: np.ndarray, heights: np.ndarray,
     vertical: np.ndarray,
 ) -> int:  # fmt: skip
-    """Writes a stretch before the first vertex there is, on which its last one comes to lie.
+    """Writes a stretch before the first vertex, with which its last vertex coincides.
 
-    The ground that it is appended to, at height 0, becomes the new first vertex, which is returned.
+    Its start, at relative height 0, becomes the new first vertex; returns the index of that vertex.
     """
     height, end = heights[first], more[-1]
     first -= pad + len(more)
@@ -324,7 +324,7 @@ def _prepend(
 def seed_sequence(
     seed: int | np.random.SeedSequence | np.random.Generator,
 ) -> np.random.SeedSequence:
-    """Returns the SeedSequence that a seed stands for."""
+    """Returns the SeedSequence of a seed."""
     if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0:
         return np.random.SeedSequence(int(seed))
     if isinstance(seed, np.random.SeedSequence):

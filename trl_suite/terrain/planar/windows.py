@@ -1,4 +1,4 @@
-"""Windows of the planar grounds of n simulations, as arrays, and functions of one of them."""
+"""Windows of the planar grounds of n simulations, as arrays, and functions of one simulation."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class PlanarWindows(NamedTuple):
 
     Attributes:
       start: number of the first vertex of a window, (n,); NaN before the first episode.
-      centre: middle of the stretch that a window is good for, (n,) m.
-      reach: how far from there it is laid anew, m.
+      centre: middle of the range of character positions for which a window is valid, (n,) m.
+      reach: distance of the character from the centre beyond which a window is refilled, m.
       heights: of the vertices, (n, W) m.
       rises: from each vertex to the next, (n, W) m; the last is 0.
       vertical: whether the cell before a vertex is a vertical face, (n, W) bool.
-      wide: heights of the vertices from W before the window on, (n, 3 W + 1) m.
-      is_wide: whether `wide` was drawn for this window, (n,) bool.
+      wide: heights of vertices, the first of them W before the window, (n, 3 W + 1) m.
+      is_wide: whether `wide` is filled for the current window, (n,) bool.
     """
 
     start: np.ndarray
@@ -37,7 +37,7 @@ class PlanarWindows(NamedTuple):
 
 
 def empty(n: int, vertices: int, reach: float) -> PlanarWindows:
-    """Returns room for n windows."""
+    """Allocates n windows."""
     heights, rises = np.zeros((2, n, vertices))
     return PlanarWindows(
         start=np.full(n, np.nan),
@@ -46,7 +46,7 @@ def empty(n: int, vertices: int, reach: float) -> PlanarWindows:
         heights=heights,
         rises=rises,
         vertical=np.zeros((n, vertices), bool),
-        wide=np.zeros((n, 3 * vertices + 1)),  # memory is taken where it is written
+        wide=np.zeros((n, 3 * vertices + 1)),  # the system allocates only written pages
         is_wide=np.zeros(n, bool),
     )
 
@@ -55,7 +55,7 @@ def empty(n: int, vertices: int, reach: float) -> PlanarWindows:
 def height(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the height in m of the ground of simulation i at x, m.
 
-    Beyond the window it has no meaning, but is finite where x is: see `far_height`.
+    Beyond the window the result is meaningless, but finite if x is finite; see `far_height`.
     """
     u = x * _CELLS_PER_METRE - ground.start[i]
     whole = np.floor(u)
@@ -79,10 +79,11 @@ def is_outside(i: int, x: float, ground: PlanarWindows) -> bool:
 
 @compiled_inline
 def far_height(i: int, x: float, ground: PlanarWindows) -> float:
-    """Returns the height in m at x, m, up to the length of a window beyond the window.
+    """Returns the height in m at x, m, from `wide`: up to one window length beyond the window.
 
-    Only where `is_wide`; further away the ends go on. The last bit is that of `PlanarGround.height`, not of
-    `height`: of a character that looks beyond its window all heights are taken from here.
+    Valid where `is_wide`; beyond `wide` its end values apply. Rounded as `PlanarGround.height` is,
+    which `height` is not: if a terrain observation reaches beyond the window, all of its heights
+    come from this function.
     """
     position = x / SPACING
     whole = np.floor(position)
@@ -98,13 +99,13 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
 
 @compiled_inline
 def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
-    """Returns whether a character at x, m, is so far that its window must be laid anew."""
+    """Returns whether the window of simulation i must be refilled for a character at x, m."""
     return abs(x - ground.centre[i]) > ground.reach
 
 
 @compiled_inline
 def _within(number: float, count: int) -> int:
-    """The nearest of the numbers 0, 1, ..., count - 1; 0 for what is no number."""
+    """The nearest of the integers 0, 1, ..., count - 1; 0 for NaN."""
     if not number > 0.0:
         return 0
     return int(number) if number < count - 1 else count - 1

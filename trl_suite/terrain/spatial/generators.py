@@ -1,10 +1,10 @@
 """The three-dimensional terrain generators: functions of (parameters, random generator).
 
-A generator returns a `Layout`: the ground of one episode. It draws all that it needs from the random
-generator, once; what is endless it returns as functions that draw from streams of their own, so
-that what stands where depends on the seed alone, never on when or how far the ground is asked for.
-The processes are those of the original (Terrain RL Simulator, 2018); equality is in distribution.
-New generators join through `register3d`:
+A generator returns a `Layout`: the ground of one episode. It uses the random generator only while
+it runs; unbounded parts are functions with random streams of their own, so that the ground depends
+on the seed only, not on the order or extent of queries.
+The random processes are those of the original (Terrain RL Simulator, 2018), equal in distribution.
+`register3d` adds a generator:
 
     @register3d('mounds3d', {'Radius': 2.0, 'HeightMin': 0.1, 'HeightMax': 0.3})
     def mounds(parameters, rng):
@@ -16,10 +16,10 @@ New generators join through `register3d`:
 
         return Layout(level=None, grid=grid)
 
-Deviations from the original, all of them on purpose: vertical faces where it has flanks of one grid
-cell (paths, stairs, blocks and pillars; dense low boxes, checkers and trails keep the flanks); where
-blocks overlap the higher counts, not the later; stairs without a seam 1 m beside the start; belts
-that do not drift by slices; ground that does not depend on where the character has been.
+Intentional deviations from the original: vertical faces where it has flanks of one grid cell
+(paths, stairs, blocks and pillars; dense low boxes, checkers and trails keep the flanks); where
+blocks overlap, the higher one applies, not the later one; stairs have no seam 1 m to the side of
+the start; belts do not drift by slices; the ground does not depend on the character's path.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ from trl_suite.util.errors import unknown
 
 TILE = 80.0  # m; side of the squares in which obstacles are drawn; one is centred on the origin
 CLEAR = 2.0  # m; half side of the square about the origin that obstacles leave clear
-DENSE = 0.25  # 1/m^2; obstacles closer than that are a height grid, where later ones win
-FAR = 1e3  # m; where things end that go on for ever
+DENSE = 0.25  # 1/m^2; denser obstacles form a height grid, in which later ones overwrite earlier
+FAR = 1e3  # m; where unbounded boxes end
 LANDING = 1.0  # m; half length of the level start of ramps and stairs
 TREAD = 0.5  # m
 RISE = 0.05  # m per tread, on average
 FIRST_TREAD = 0.13154  # share of the range of heights at which the landing of stairs lies
 CLIFF_PERIOD, CLIFF_SWAY, CLIFF_HALF_WIDTH = 12.0, 5.0, 2.5  # m
 CLIFF_HEIGHT, CLIFF_SLOPE, CLIFF_ROUGHNESS = 2.0, 0.5, 0.2  # m, share of the height per m, m
-MOVER_SPAN = 20.0  # m; half side of the square of the ways of moving boxes
-PLACE_SPAN = {'obstacles3d': 24.0, 'moving': 12.0}  # m; half sides of the squares of starts
+MOVER_SPAN = 20.0  # m; half side of the square that contains the paths of moving boxes
+PLACE_SPAN = {'obstacles3d': 24.0, 'moving': 12.0}  # m; half sides of the squares of start places
 BELT_TOP = 0.01  # m above the plane
 
 # Defaults of the parameters (those of the original).
@@ -67,7 +67,7 @@ MOVING = {'ObstacleWidth0': 0.5, 'ObstacleWidth1': 7, 'ObstacleSpeed0': 0.1, 'Ob
 MOVERS = {'NumObstacles': 10, 'ObstacleHeight0': 1, 'ObstacleHeight1': 5, **MOVING}
 CONVEYORS = {'ConveyorStripLength': 10, 'ConveyorNumStrips': 4, 'ConveyorSpacing': 3, **MOVING,
              'ConveyorNumSlices': 10}  # fmt: skip
-# Parameters without effect, by type: the original reads them in vain too, but for those of belts.
+# Parameters without effect, by type; in the original only those of belts have an effect.
 IDLE = {
     'trail3d': ('PathLength', 'PathTurnLength'), 'var3d_stairs': ('StepSpacingMin', 'StepSpacingMax'),
     'conveyor3d': ('ConveyorNumSlices',),
@@ -108,7 +108,7 @@ def register3d(
 
 
 def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """Draws the ground of an episode, and checks what the generator made of it.
+    """Generates the ground of an episode, and checks the generator's result.
 
     Args:
       type_name: a key of GENERATORS3D.
@@ -116,7 +116,7 @@ def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> 
       rng: source of randomness.
 
     Raises:
-      ValueError: unknown type, or a generator that returns something else than a sound `Layout`.
+      ValueError: unknown type, or a generator that returns anything but a valid `Layout`.
     """
     if type_name not in _generators:
         raise ValueError(unknown('three-dimensional terrain type', type_name, _generators))
@@ -131,20 +131,20 @@ def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> 
 
 
 def _between(parameters: Parameters, name: str, shares: np.ndarray) -> np.ndarray:
-    """What lies at shares of the range from {name}0 to {name}1, in either order."""
+    """Values at fractions of the range from {name}0 to {name}1, which may be descending."""
     first, second = parameters[name + '0'], parameters[name + '1']
     return first + (second - first) * shares
 
 
 def _speeds(parameters: Parameters, shares: np.ndarray) -> np.ndarray:
-    """Speeds, uniform in the logarithm but for the power that favours slow ones."""
+    """Speeds whose logarithm is uniform, except for the power, which favours slow ones."""
     a = shares ** parameters['ObstacleSpeedLerpPow']
     slow, fast = (math.log(parameters[f'ObstacleSpeed{i}']) for i in (0, 1))
     return np.exp((1 - a) * slow + a * fast)
 
 
 def hashed(*numbers: np.ndarray | int) -> np.ndarray:
-    """Uniform numbers in [0, 1) that depend on whole numbers only (of at most 63 bits)."""
+    """Uniform numbers in [0, 1), hashed from integers (of at most 63 bits)."""
     mixed = np.zeros(np.broadcast_shapes(*(np.shape(number) for number in numbers)), np.uint64)
     for number in numbers:
         mixed = (
@@ -165,7 +165,7 @@ def flat(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 @register3d('var3d_ramp', {'Slope': 0})
 def ramp(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """Level about the start, rising ahead of it and falling behind."""
+    """Level around the start, rising ahead of it and falling behind."""
     slope = parameters['Slope']
     middle = LANDING + 0.5 * FAR
     return Layout(
@@ -204,7 +204,7 @@ def stairs(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 @register3d('var3d_checkers', {'Slope': 0})
 def checkers(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """Squares of 1 m, every other one raised by `Slope` m, with flanks of one cell."""
+    """Squares of 1 m, alternate ones raised by `Slope` m, with flanks of one cell."""
     squares = round(1 / GRID)
 
     def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -216,7 +216,7 @@ def checkers(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 @register3d('var3d_path', PATH)
 def path(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """A serpentine: legs along x, by turns on the line of the start and to the right of it."""
+    """A serpentine: legs along x, alternately on the line of the start and to the right of it."""
     length, shift = max(parameters['PathLength'], GRID), parameters['PathTurnLength']
     half = min(0.5 * parameters['PathWidth0'], 0.5 * length)
     height = parameters['PathHeight0']
@@ -241,7 +241,7 @@ def cliff(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
     def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:
         sway = CLIFF_SWAY * (np.cos(2 * np.pi / CLIFF_PERIOD * GRID * i) - 1)
-        side = (-GRID * j) - sway[:, None]  # to the right of the ledge's middle
+        side = (-GRID * j) - sway[:, None]  # distance to the right of the ledge's middle
         share = np.clip(CLIFF_SLOPE * (np.abs(side) - CLIFF_HALF_WIDTH), 0, 1)
         heights = -CLIFF_HEIGHT * np.copysign(share, side)
         rough = np.flatnonzero((share > 0) & (share < 1))
@@ -265,7 +265,7 @@ def hills(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 @register3d('trail3d', TRAIL)
 def trail(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """A level path that winds ahead through rough ground, now a causeway, now a canyon."""
+    """A level winding path through rough ground, in places a causeway, in places a canyon."""
     way = Trail(dict(parameters), rng)
 
     def grid(i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -278,7 +278,7 @@ def trail(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 
 class _Obstacles:
-    """Upright rectangles, drawn by squares of TILE m when they are asked for."""
+    """Axis-aligned rectangles, generated in squares of TILE m when they are queried."""
 
     def __init__(self, parameters: Parameters, rng: np.random.Generator) -> None:
         self._parameters = parameters
@@ -287,19 +287,19 @@ class _Obstacles:
         self._largest = max(parameters['ObstacleWidth0'], parameters['ObstacleWidth1'])
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Boxes:
-        """Those that touch a rectangle as boxes."""
+        """The obstacles that touch a rectangle, as boxes."""
         begin, end, height = self.touching(low, high)
         return boxes(0.5 * (begin + end), 0.5 * (end - begin), height)
 
     def touched(self, low: Corner, high: Corner) -> bool:
-        """Whether any touch a rectangle."""
+        """Whether any obstacle touches a rectangle."""
         for begin, end, _ in self._tiles_near(low, high):
             if _meeting(begin, end, *low, *high, None):
                 return True
         return False
 
     def touching(self, low: Corner, high: Corner) -> Rectangles:
-        """Low and high corners and heights of those that touch a rectangle, in order of drawing."""
+        """Low and high corners and heights of obstacles that touch a rectangle, in drawn order."""
         found = []
         for parts in self._tiles_near(low, high):
             near = _select(*parts[:2], low, high)
@@ -310,8 +310,8 @@ class _Obstacles:
         return begin, end, height
 
     def _tiles_near(self, low: Corner, high: Corner) -> list[Rectangles]:
-        """The squares whose rectangles may touch one."""
-        # They hang out of their square ahead and to the left only.
+        """The squares whose obstacles may touch a rectangle."""
+        # Obstacles extend beyond their square in the directions of +x and +y only.
         begin = [math.floor((float(edge) - self._largest) / TILE + 0.5) for edge in low]
         end = [math.floor(float(edge) / TILE + 0.5) + 1 for edge in high]
         return [
@@ -321,14 +321,14 @@ class _Obstacles:
     def _tile(self, tile: tuple[int, int]) -> Rectangles:
         if tile not in self._tiles:
             parameters = self._parameters
-            # Numbers of squares as naturals: 0, 1, -1, 2, ... -> 0, 2, 1, 4, ...
+            # Indices of squares as natural numbers: 0, 1, -1, 2, ... -> 0, 2, 1, 4, ...
             naturals = [2 * k if k >= 0 else -2 * k - 1 for k in tile]
             rng = np.random.default_rng(np.random.SeedSequence([*self._key, *naturals]))
             count = int(parameters['ObstacleDensity'] * TILE**2 + 1e-6)
             height = _between(parameters, 'ObstacleHeight', rng.random(count))
             begin, end = np.empty((2, count, 2))
             missing: slice | np.ndarray = slice(None)
-            for _ in range(100):  # what does not fit then must stand over the start
+            for _ in range(100):  # the rest, which overlaps the start, gets height 0
                 shares = rng.random((2, *begin[missing].shape))
                 corner = TILE * (np.array(tile) - 0.5 + shares[0])
                 begin[missing] = corner
@@ -343,7 +343,7 @@ class _Obstacles:
 
 @register3d('obstacles3d', OBSTACLES)
 def obstacles(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """Level ground with upright rectangles: city blocks, a forest of pillars, or rubble."""
+    """Level ground with axis-aligned boxes: city blocks, a forest of pillars, or rubble."""
     drawn = _Obstacles(parameters, rng)
     if parameters['ObstacleDensity'] > DENSE:
         return Layout(level=None, grid=_rubble(drawn))
@@ -352,7 +352,7 @@ def obstacles(parameters: Parameters, rng: np.random.Generator) -> Layout:
 
 
 def _select(begin: np.ndarray, end: np.ndarray, low: Corner, high: Corner) -> np.ndarray:
-    """Numbers of the upright rectangles that meet another one."""
+    """Indices of the axis-aligned rectangles that intersect a given one."""
     numbers = np.empty(len(begin), int)
     return numbers[: _meeting(begin, end, *low, *high, numbers)]
 
@@ -367,10 +367,10 @@ def _meeting(
     high_y: float,
     numbers: np.ndarray | None,
 ) -> int:
-    """Which upright rectangles, from corners `begin` to `end` (k, 2), meet another one.
+    """Finds the axis-aligned rectangles, from `begin` to `end` (k, 2), that intersect a given one.
 
     Returns:
-      How many, whose numbers are written; without numbers, 1 if there is any.
+      Their number; their indices are written. Without room for indices, 1 if there is any, else 0.
     """
     count = 0
     for k in range(len(begin)):
@@ -391,11 +391,11 @@ def _rubble(drawn: _Obstacles) -> GridFunction:
         low, high = GRID * corner, GRID * np.array([i[-1], j[-1]])
         begin, end, height = drawn.touching(low, high)
         heights = np.zeros((len(i), len(j)), np.float32)
-        # Vertices in the closed rectangles; at least one line of them along each axis.
+        # Vertices in the closed rectangles; at least one vertex along each axis.
         first = np.ceil(begin / GRID).astype(int)
         last = np.maximum(np.floor(end / GRID).astype(int), first)
         first, last = np.maximum(first - corner, 0), np.maximum(last - corner + 1, 0)
-        tops = height[:, None].astype(np.float32)  # numbers would be made arrays one by one
+        tops = height[:, None].astype(np.float32)  # scalars would be converted one by one
         for a, c, b, d, top in zip(*first.T.tolist(), *last.T.tolist(), tops, strict=True):
             heights[a:b, c:d] = top
         return heights
@@ -405,9 +405,9 @@ def _rubble(drawn: _Obstacles) -> GridFunction:
 
 @register3d('dynamic_obstacles3d', MOVERS)
 def dynamic_obstacles(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """A plane on which boxes go to and fro."""
+    """A plane on which boxes move back and forth."""
     count = int(parameters['NumObstacles'])
-    # One box after the other, in the order of the original's draws.
+    # Box by box, in the order of the original's draws.
     length, height, width, x0, y0, x1, y1, speed, phase, coin = rng.random((count, 10)).T
     ways = MOVER_SPAN * (2 * np.array([x0, y0, x1, y1]) - 1)
     sizes = _between(parameters, 'ObstacleWidth', np.stack([length, width], 1))
@@ -429,7 +429,7 @@ def dynamic_obstacles(parameters: Parameters, rng: np.random.Generator) -> Layou
 
 @register3d('conveyor3d', CONVEYORS)
 def conveyors(parameters: Parameters, rng: np.random.Generator) -> Layout:
-    """A plane with belts that run to the left or to the right, one behind the other along x."""
+    """A plane with conveyor belts in sequence along x, which run to the left or to the right."""
     count = int(parameters['ConveyorNumStrips'])
     width, speed, coin = rng.random((count, 3)).T
     width = _between(parameters, 'ObstacleWidth', width)

@@ -1,4 +1,4 @@
-"""The three-dimensional ground of one episode: its surface, where to start on it, where to go."""
+"""The three-dimensional ground of one episode: its surface, start places and goals."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from trl_suite.terrain.planar.ground import seed_sequence
 from trl_suite.terrain.spatial.generators import draw3d
 from trl_suite.terrain.spatial.layout import GRID, Boxes, Layout
 
-TRAIL_SPAN = 40.0  # m; a trail starts within a square of this half side about the origin
-TRAIL_PAD = 1.0  # m; and that far inside it
-TRAIL_OFFSET = 0.4  # of the width; how far beside the middle goals lie
-START_ROOM = 1.0  # m; half side of the square that must be clear about a start
+TRAIL_SPAN = 40.0  # m; characters start on a trail within a square of this half side at the origin
+TRAIL_PAD = 1.0  # m; distance of these starts from the rim of the square
+TRAIL_OFFSET = 0.4  # of the width; largest lateral distance of goals from the middle of a trail
+START_ROOM = 1.0  # m; half side of the square around a start that must be clear
 GOAL_SPREAD = 3.0  # m
-TRIES = 1000  # places drawn before the origin is taken
-FAR_APART, AREA = 1e3, 1e5  # m, m^2; points spread more widely are looked at one by one
+TRIES = 1000  # places tried before the origin is used
+FAR_APART, AREA = 1e3, 1e5  # m, m^2; points with a larger spread are queried one by one
 RULES = ('far', 'near')
 
 Random = np.random.Generator | np.random.RandomState
 
 
 class SpatialGround:
-    """Ground of one episode, without end.
+    """Unbounded ground of one episode.
 
-    What stands where depends on the seed alone. Queries here are exact anywhere, but one ground at
-    a time; `Surroundings` answers for many characters at once.
+    It depends on the seed only. Its queries are exact everywhere, but for one ground at a time;
+    `Surroundings` queries the grounds of many characters at once.
 
     Attributes:
       type: the terrain type.
       parameters: a value for every parameter of the type.
-      layout: what the generator has drawn.
+      layout: the generator's result.
     """
 
     def __init__(
@@ -46,22 +46,22 @@ class SpatialGround:
         *,
         terrain_level: float = 0.0,
     ) -> None:
-        """Draws the ground.
+        """Generates the ground.
 
         Args:
-          terrain: what ground; three-dimensional.
-          seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
+          terrain: the type and parameters of the ground; three-dimensional.
+          seed: an integer, a SeedSequence (not changed: the same one gives the same ground), or a
             Generator (from which four numbers are drawn).
-          terrain_level: which of the parameter sets, see `Terrain.parameters`.
+          terrain_level: number of the parameter set, see `Terrain.parameters`.
 
         Raises:
-          ValueError: planar terrain, or a terrain_level that is no number.
-          TypeError: the seed is something else.
+          ValueError: planar terrain, or a terrain_level that is not a number.
+          TypeError: the seed has another type.
         """
         if not terrain.spatial:
             raise ValueError(
-                f'terrain {terrain.name!r} ({terrain.type}) is planar, a Strip; a Ground is '
-                'three-dimensional'
+                f'terrain {terrain.name!r} ({terrain.type}) is planar; a SpatialGround needs '
+                'three-dimensional terrain'
             )
         self._draw(terrain.type, terrain.parameters(terrain_level), seed_sequence(seed))
 
@@ -74,7 +74,7 @@ class SpatialGround:
         self._seed = sequence.entropy, tuple(sequence.spawn_key)
 
     def state(self) -> dict[str, Any]:
-        """Returns everything `from_state` needs: what was drawn from what."""
+        """Returns what `from_state` needs: type, parameters and seed."""
         entropy, spawn_key = self._seed
         return {
             'type': self.type,
@@ -85,7 +85,7 @@ class SpatialGround:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> SpatialGround:
-        """Returns the same ground again."""
+        """Returns the ground that had this `state`."""
         ground = cls.__new__(cls)
         sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
         ground._draw(state['type'], state['parameters'], sequence)
@@ -101,7 +101,7 @@ class SpatialGround:
 
         Args:
           x, y: m, of one shape.
-          movers: middles of the moving boxes, (k, 2); where they begin if None.
+          movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
 
         Raises:
           ValueError: a point is not finite, or further than LONGEST from the origin.
@@ -115,12 +115,12 @@ class SpatialGround:
         movers: np.ndarray | None = None,
         direction: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Horizontal velocities of the surface at points, m/s, of the shape of x and a 2.
+        """Horizontal velocities of the surface at points, m/s, of shape (*x.shape, 2).
 
         Args:
           x, y: m, of one shape.
-          movers: middles of the moving boxes, (k, 2); where they begin if None.
-          direction: of the moving boxes, 1 or -1, (k,); as they begin if None.
+          movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
+          direction: of the moving boxes, 1 or -1, (k,); their initial ones if None.
 
         Raises:
           ValueError: as `height`.
@@ -134,7 +134,7 @@ class SpatialGround:
         centres: np.ndarray | None = None,
         direction: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Heights and velocities of the highest things at points."""
+        """Heights and velocities of the surface at points."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         if not (np.abs(x) <= LONGEST).all() or not (np.abs(y) <= LONGEST).all():
             raise ValueError(f'points must be finite and within {LONGEST:g} m of 0')
@@ -172,7 +172,7 @@ class SpatialGround:
         return height.reshape(shape), velocity.reshape(*shape, 2)
 
     def movers(self, centres: np.ndarray | None = None) -> Boxes:
-        """The moving boxes as they stand; `centres` as for `height`."""
+        """The moving boxes as `Boxes`; `centres` are `movers` of `height`."""
         movers, level = self.layout.movers, self.layout.level
         assert movers is not None and level is not None
         if centres is None:
@@ -194,11 +194,11 @@ class SpatialGround:
         return triangles(corners, u, v)
 
     def spawn(self, random: Random) -> tuple[float, float, float]:
-        """Draws where a character starts: x, y (m) and its heading (rad).
+        """Draws the start of a character: x, y (m) and heading (rad).
 
-        By the layout's place: at the origin along x; anywhere in a square (24 m to each side among
-        blocks and pillars, 12 m among moving boxes and belts) where 2 m x 2 m are clear; or on the
-        middle of a trail, along it. The same number of draws is not promised.
+        Depends on the layout's place: at the origin along x; anywhere in a square (24 m to each
+        side among blocks and pillars, 12 m among moving boxes and belts) where 2 m x 2 m are clear;
+        or on the middle of a trail, along it. The number of random draws varies.
         """
         layout = self.layout
         if layout.place == 'trail':
@@ -226,16 +226,16 @@ class SpatialGround:
     ) -> np.ndarray:
         """Draws a goal on the ground.
 
-        By the layout's place: about the character (`far`: within 3 m along x and along y; `near`:
-        from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a start; or on the
-        trail, 1 to 10 segments of 2 m beyond the one nearest to the character (`step`: 1).
+        Depends on the layout's place: near the character (`far`: within 3 m along x and along y;
+        `near`: from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a start; or on
+        the trail, 1 to 10 segments of 2 m beyond the one nearest to the character (`step`: 1).
 
         Args:
           random: source of randomness.
           root: where the character is, (2,) m.
           rule: one of `RULES`.
           distance: of the nearest goal of `step`, m.
-          movers: middles of the moving boxes, (k, 2); where they begin if None.
+          movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
 
         Returns:
           The point, (3,) m.
@@ -274,7 +274,7 @@ class SpatialGround:
     def _clear(
         self, random: Random, room: float, movers: np.ndarray | None
     ) -> tuple[float, float, bool]:
-        """Draws a place whose surroundings are free of boxes and belts; tells whether it found one."""
+        """Draws a place that is clear of boxes and belts; returns x, y and whether it found one."""
         layout, span = self.layout, self.layout.span
         others = [] if layout.belts is None else [layout.belts.boxes]
         if layout.movers is not None:
@@ -294,7 +294,7 @@ def triangles(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
     Args:
       corners: heights at (0, 0), (0, 1), (1, 0), (1, 1) of each cell, (k, 2, 2).
-      u, v: where in the cells the points lie, in [0, 1], (k,).
+      u, v: coordinates of the points in their cells, in [0, 1], (k,).
     """
     over = u + v > 1
     near = np.where(over, corners[:, 1, 1], corners[:, 0, 0])

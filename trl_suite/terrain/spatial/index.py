@@ -1,4 +1,4 @@
-"""Boxes of a window, sorted into bins so that a point finds those it may lie on."""
+"""Boxes of a window, sorted into bins, so that a query tests only the boxes near its point."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialWindows) -> N
     """Replaces the boxes and belts of a window.
 
     Args:
-      i: which window; it lies where it should.
-      boxes: those that touch it, no more than there is room for.
-      belts: all of them.
+      i: index of the window, whose centre is set already.
+      boxes: those that touch the window, at most as many as were allocated.
+      belts: all belts.
       ground: the windows.
     """
     ground.boxes[i, :, HALF_X] = -1.0
@@ -43,7 +43,7 @@ def fill(i: int, boxes: Boxes, belts: Belts | None, ground: SpatialWindows) -> N
 
 @compiled
 def _put(i: int, first: int, boxes: Boxes, ground: SpatialWindows) -> None:
-    """Makes boxes those of these numbers on."""
+    """Writes boxes from index `first` on."""
     for k in range(len(boxes.top)):
         of = ground.boxes[i, first + k]
         of[X], of[Y] = boxes.position[k, 0], boxes.position[k, 1]
@@ -54,7 +54,7 @@ def _put(i: int, first: int, boxes: Boxes, ground: SpatialWindows) -> None:
 
 @compiled
 def _sort(i: int, ground: SpatialWindows) -> None:
-    """Finds out which boxes of a window touch which bins, in order of their numbers."""
+    """Lists for each bin of a window the boxes that touch it, in ascending order."""
     bins, entries = ground.bins[i], ground.bin_boxes[i]
     boxes, columns, lines = ground.boxes.shape[1], bins.shape[0], bins.shape[1]
     bins[:] = 0
@@ -76,7 +76,7 @@ def _sort(i: int, ground: SpatialWindows) -> None:
                 for line in range(begin, end):
                     entries[bins[column, line, 1]] = number
                     bins[column, line, 1] += 1
-    else:  # many large boxes: every bin has all of them
+    else:  # many large boxes: every bin lists all of them
         bins[:, :, 0], bins[:, :, 1] = 0, boxes
         for number in range(boxes):
             entries[number] = number
@@ -84,12 +84,12 @@ def _sort(i: int, ground: SpatialWindows) -> None:
         of = ground.boxes[i, number]
         across = abs(of[Y] - ground.centre[i, 1])
         if of[SINE] == 0.0 and across + HALF <= of[HALF_Y]:
-            of[HALF_Y] = np.inf  # from rim to rim, and on beyond them
+            of[HALF_Y] = np.inf  # spans the window, so it extends beyond it
 
 
 @compiled
 def _touched(i: int, number: int, ground: SpatialWindows) -> tuple[int, int, int, int]:
-    """Which bins a box touches: begin and end along x, begin and end along y."""
+    """The bins that a box touches: begin and end along x, begin and end along y."""
     of = ground.boxes[i, number]
     length, width = of[HALF_X], of[HALF_Y]
     if length < 0.0:

@@ -1,7 +1,7 @@
-"""What three-dimensional ground is made of: a level, a height grid, boxes, belts, moving boxes, a trail.
+"""Parts of three-dimensional ground: a level, a height grid, boxes, belts, moving boxes, a trail.
 
-World axes: x forward, y to the left, z up; lengths in m. The surface at a point is the highest of
-what lies there. A generator returns a `Layout`; what is endless it gives as functions.
+World axes: x forward, y to the left, z up; lengths in m. The surface at a point is the highest part
+there. A generator returns a `Layout`, in which unbounded parts are functions.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy.typing as npt
 
 from trl_suite.util.compiled import compiled
 
-GRID = 0.2  # m between the vertices of a height grid; vertex i stands at i * GRID
-TURN_DISTANCE = 5.0  # m; only farther than that from the character do moving boxes turn round
+GRID = 0.2  # m between the vertices of a height grid; vertex i is at i * GRID
+TURN_DISTANCE = 5.0  # m; moving boxes reverse only at a larger distance from the character
 PLACES = ('start', 'clear', 'trail')
 
 
 class Boxes(NamedTuple):
-    """k boxes that do not move, upright but for a slope: then their ends are square to the slope."""
+    """k static boxes, upright unless they have a slope; then their ends are normal to the slope."""
 
-    position: np.ndarray  # (k, 2) middle
+    position: np.ndarray  # (k, 2) centre
     half_size: np.ndarray  # (k, 2) along the box's own axes
-    yaw: np.ndarray  # (k,) of its x axis against the world's, rad
-    top: np.ndarray  # (k,) height of the upper face at the middle
+    yaw: np.ndarray  # (k,) angle from the world's x axis to the box's, rad
+    top: np.ndarray  # (k,) height of the upper face at the centre
     slope: np.ndarray  # (k,) rise of the upper face per m along the box's x axis
 
     def select(self, chosen: np.ndarray) -> Boxes:
-        """Returns those of a mask, or by number."""
+        """Returns the boxes of a mask or of indices."""
         return Boxes(*(part[chosen] for part in self))
 
     def extent(self) -> np.ndarray:
-        """Half sides of the smallest upright rectangles around the boxes, (k, 2)."""
+        """Half sides of the axis-aligned bounding rectangles of the boxes, (k, 2)."""
         cosine, sine = np.abs(np.cos(self.yaw)), np.abs(np.sin(self.yaw))
         length, width = self.half_size.T
         return np.stack([cosine * length + sine * width, sine * length + cosine * width], 1)
 
     def touching(self, low: npt.ArrayLike, high: npt.ArrayLike) -> np.ndarray:
-        """Which boxes touch a rectangle, (k,) bool; turned ones by the rectangle around them."""
+        """Which boxes touch a rectangle, (k,) bool; rotated ones by their bounding rectangle."""
         found = np.empty(len(self.top), bool)
         position, half_size, yaw = (np.ascontiguousarray(part, float) for part in self[:3])
         _touching(
@@ -50,7 +50,7 @@ class Boxes(NamedTuple):
         return found
 
     def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height of every box's upper face at points (m,), (m, k); -inf beside it."""
+        """Height of every box's upper face at points (m,), (m, k); -inf outside the box."""
         dx, dy = x[:, None] - self.position[:, 0], y[:, None] - self.position[:, 1]
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
@@ -65,13 +65,13 @@ def boxes(
     yaw: npt.ArrayLike = 0.0,
     slope: npt.ArrayLike = 0.0,
 ) -> Boxes:
-    """Returns boxes; what all have in common may be given once.
+    """Returns boxes; a value that all boxes share may be given once.
 
     Args:
-      position: middles, m, (k, 2).
+      position: centres, m, (k, 2).
       half_size: m, (k, 2) or (2,).
-      top: height of the upper faces at their middles, m.
-      yaw: of the box's x axis against the world's, rad.
+      top: height of the upper faces at their centres, m.
+      yaw: angle from the world's x axis to the box's, rad.
       slope: rise of the upper face per m along the box's x axis.
     """
     position = np.asarray(position, float).reshape(-1, 2)
@@ -91,7 +91,7 @@ def _touching(
     high_y: float,
     found: np.ndarray,
 ) -> None:
-    """Finds out which boxes touch a rectangle."""
+    """Finds the boxes that touch a rectangle."""
     for k in range(len(yaw)):
         x, y = position[k, 0], position[k, 1]
         cosine, sine = abs(math.cos(yaw[k])), abs(math.sin(yaw[k]))
@@ -107,26 +107,26 @@ NO_BOXES = boxes(np.zeros((0, 2)), (0, 0), 0)
 
 
 class Belts(NamedTuple):
-    """k boxes whose surface runs."""
+    """k conveyor belts: boxes whose surface moves."""
 
     boxes: Boxes
     velocity: np.ndarray  # (k, 2) m/s along the world's axes
 
 
 class Movers(NamedTuple):
-    """k upright boxes that stand on the level and go to and fro between two points each."""
+    """k upright boxes on the level, each of which moves back and forth between two points."""
 
     start: np.ndarray  # (k, 2)
     end: np.ndarray  # (k, 2)
     half_size: np.ndarray  # (k, 2)
     height: np.ndarray  # (k,)
     speed: np.ndarray  # (k,) m/s
-    phase: np.ndarray  # (k,) share of the way from start to end at which it begins
+    phase: np.ndarray  # (k,) initial position, as a fraction of the path from start to end
     direction: np.ndarray  # (k,) 1 towards the end, -1 towards the start
 
     @property
     def length(self) -> np.ndarray:
-        """Of the ways, (k,)."""
+        """Lengths of the paths, (k,)."""
         return np.linalg.norm(self.end - self.start, axis=1)
 
     @property
@@ -138,24 +138,24 @@ class Movers(NamedTuple):
 
 
 class Trail(Protocol):
-    """A path of straight segments, continued as far as it is asked for."""
+    """A path of straight segments, extended on demand."""
 
-    width: np.ndarray  # (k,) of the segments there are
+    width: np.ndarray  # (k,) of the existing segments
     start: np.ndarray  # (k, 2)
     end: np.ndarray  # (k, 2)
     heading: np.ndarray  # (k,) rad
 
     def extend(self, count: int) -> None:
-        """Makes sure that there are at least so many segments."""
+        """Extends the trail to at least `count` segments."""
 
     def leave(self, half_side: float) -> int:
-        """Number of segments up to the first that ends outside a square about the origin."""
+        """Number of segments up to the first that ends outside a square around the origin."""
 
 
 class Grid(NamedTuple):
-    """Heights of vertices as data: a finite piece of ground, with its rim going on for ever."""
+    """Heights of vertices as data: a finite piece of ground, extended by the values at its rim."""
 
-    first: tuple[int, int]  # numbers of the first vertex along x and y
+    first: tuple[int, int]  # indices of the first vertex along x and y
     heights: np.ndarray  # (k, m), along x and y
 
     def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -174,20 +174,20 @@ class Layout:
     """The ground of one episode.
 
     Attributes:
-      level: height of a plane under everything, m; None for none.
-      grid: a `Grid`, or a function from numbers of vertices, (k,) along x and (m,) along y, to
+      level: height of a plane under all other parts, m; None for none.
+      grid: a `Grid`, or a function from indices of vertices, (k,) along x and (m,) along y, to
         their heights, (k, m); linear on two triangles per cell, whose common edge runs from the
         back left to the front right corner. None for none.
       boxes: `Boxes`, or a function from two corners of a rectangle, (2,) each, to the boxes that
-        touch it. It must give the same boxes however it is asked. It may have a method `touched` of
-        the same arguments, which tells faster whether there are any.
-      belts: running surfaces.
+        touch it. A box must not depend on the query. The function may have a method `touched` with
+        the same arguments, a faster test whether there are any.
+      belts: conveyor belts.
       movers: moving boxes; they stand on the level.
-      trail: the path that spawn and goals keep to, if place is 'trail'.
-      place: where characters start and goals lie: 'start' (at the origin; goals about the
+      trail: the path of start places and goals, if place is 'trail'.
+      place: where characters start and where goals are: 'start' (at the origin; goals near the
         character), 'clear' (anywhere that is clear of boxes and belts), or 'trail'.
-      span: for 'clear', half side of the square in which they lie, m.
-      goal_room: for 'clear', half side of the square that must be clear about a goal, m.
+      span: for 'clear', half side of the square of start places and goals, m.
+      goal_room: for 'clear', half side of the square around a goal that must be clear, m.
     """
 
     level: float | None = 0.0
@@ -204,7 +204,7 @@ class Layout:
         """The boxes that touch a rectangle.
 
         Raises:
-          ValueError: a function of the user's that returns something else.
+          ValueError: a user's function returns anything else.
         """
         if isinstance(self.boxes, Boxes):
             return self.boxes.select(self.boxes.touching(low, high))
@@ -224,7 +224,7 @@ class Layout:
         """Heights of the grid at vertices (i, j) * GRID, (len(i), len(j)).
 
         Raises:
-          ValueError: a function of the user's that returns something else.
+          ValueError: a user's function returns anything else.
         """
         assert self.grid is not None
         heights = np.asarray(self.grid(i, j))
@@ -242,7 +242,7 @@ class Layout:
         return heights
 
     def fault(self) -> str:
-        """What is wrong with it, for the author of a generator; empty if nothing is."""
+        """Why the layout is invalid, for the author of a generator; empty if it is valid."""
         if self.place not in PLACES:
             return f'place must be one of {", ".join(PLACES)}, not {self.place!r}'
         if self.place == 'trail' and self.trail is None:

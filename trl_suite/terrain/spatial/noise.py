@@ -1,4 +1,4 @@
-"""Gradient noise of hills: one fixed tile, repeated without end and added up in octaves.
+"""Gradient noise of hills: one fixed tile, repeated periodically and summed in octaves.
 
 Source: K. Perlin, 'Improving noise', 2002 (the permutation and the gradients are his); the tile and
 the octaves are those of the original Terrain RL Simulator.
@@ -15,7 +15,7 @@ from trl_suite.util.compiled import compiled, compiled_inline
 
 TILE = 256  # points of the tile along each axis; the last equals the first
 PERIOD = 16  # lattice cells over the tile
-_LAYER = 8  # lattice plane at which the noise of three coordinates is cut
+_LAYER = 8  # lattice plane of the three-dimensional noise that is used
 OCTAVES = 2.0 ** -np.arange(6)  # amplitudes of the octaves
 FREQUENCIES = np.array([1, 1.96, 4.03, 7.92, 16.7, 31.12])
 _SCALES = tuple(zip(OCTAVES.tolist(), FREQUENCIES.tolist(), strict=True))
@@ -47,7 +47,7 @@ def tile() -> np.ndarray:
     hashes = np.concatenate([_PERMUTATION, _PERMUTATION])
 
     def corner(i: np.ndarray, j: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Slope of the corner's gradient, one of 12, towards a point at (x, y, 0) from it."""
+        """Product of the corner's gradient, one of 12, and the offset (x, y, 0) of a point."""
         kind = hashes[hashes[hashes[i][:, None] + j[None]] + _LAYER] & 15
         x, y = np.broadcast_arrays(x[:, None], y[None])
         first = np.where(kind < 8, x, y)
@@ -79,8 +79,8 @@ def grid(
     """Sum of the octaves on a grid.
 
     Args:
-      x, y: coordinates of its lines, m, shapes (k,) and (m,).
-      offset: where in the tile (0, 0) lies, (2,).
+      x, y: coordinates of the grid lines, m, shapes (k,) and (m,).
+      offset: position of (0, 0) in the tile, (2,).
       frequency: tiles per m of the first octave.
       amplitude: of the first octave, m.
 
@@ -102,12 +102,12 @@ def grid(
 
 
 class _Room(NamedTuple):
-    """Arrays to work in, of the lines of a grid along y."""
+    """Work arrays for the lines of a grid along y."""
 
-    cells: np.ndarray  # of the tile, that they lie in
-    shares: np.ndarray  # where in them
-    crossings: np.ndarray  # heights where they cross lines of the tile
-    heights: np.ndarray  # of the grid, so that neighbours along x are neighbours in memory
+    cells: np.ndarray  # cells of the tile that contain the lines
+    shares: np.ndarray  # positions of the lines in these cells
+    crossings: np.ndarray  # heights at the intersections with lines of the tile
+    heights: np.ndarray  # of the grid; neighbours along x are adjacent in memory
 
 
 @compiled
@@ -153,7 +153,7 @@ def _sum_octaves(
 
 @compiled_inline
 def _cell(position: float) -> tuple[int, np.float32]:
-    """Number of the tile's cell at a position in tiles, and where in the cell it lies."""
+    """Index of the tile's cell at a position in tiles, and the position in that cell."""
     position = position % 1.0 * (TILE - 1)
     cell = min(int(position), TILE - 2)
     return cell, np.float32(position - cell)
@@ -172,6 +172,6 @@ def above(x: float, y: float, offset: np.ndarray, frequency: float) -> bool:
         near = low[j] + u * (high[j] - low[j])
         far = low[j + 1] + u * (high[j + 1] - low[j + 1])
         total += octave * (2 * (near + v * (far - near)) - 1)
-        if abs(total) > octave:  # more than all further octaves together
+        if abs(total) > octave:  # more than the sum of all further octaves
             break
     return total > 0

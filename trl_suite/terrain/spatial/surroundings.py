@@ -1,4 +1,4 @@
-"""What n characters stand on and see: windows of their grounds, queried all at once."""
+"""The ground around n characters: windows of their grounds, queried in batches."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from trl_suite.terrain.spatial.windows import (
 )
 from trl_suite.util.compiled import compiled
 
-PROBES = 6  # draws by which the number of boxes of a window is foreseen
-SPARE = 1.3  # times the most boxes of any probe
+PROBES = 6  # random grounds from which the number of boxes of a window is estimated
+SPARE = 1.3  # factor on the largest number of boxes in these grounds
 
 Rows = slice | np.ndarray
 ALL = slice(None)
 
 
 def capacity(terrain: Terrain) -> Capacity:
-    """Foresees what windows of a terrain hold, from a few fixed draws."""
+    """Estimates the capacity that windows of a terrain need, from a few fixed seeds."""
     found, counts, finite, strips = [], [], True, True
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for seed in range(PROBES):
@@ -63,21 +63,21 @@ def capacity(terrain: Terrain) -> Capacity:
 
 
 class Surroundings:
-    """Windows of n grounds, 32 m x 32 m about each character, for queries over a batch axis.
+    """Windows of n grounds, 32 m x 32 m around each character, for queries over a batch axis.
 
-    A query answers for all characters at once, exactly as `SpatialGround` would, as long as it stays within
-    the window; beyond it, it answers for the rim. `follow` keeps every character so near the middle
-    that all it sees in a map lies inside.
+    A query covers all characters at once. Within the window its result equals that of
+    `SpatialGround`; beyond the window, that of the nearest point of its rim. `follow` keeps every
+    character near enough to the centre that its height map lies inside the window.
 
     Attributes:
       arrays: the windows, for the compiled functions of one simulation in
-        `trl_suite.terrain.spatial.generators.windows`.
+        `trl_suite.terrain.spatial.windows`.
       grounds: of each character.
       boxes: in each window, in order of x.
-      centre: middles of the windows, m, (n, 2).
-      way: how far moving boxes are from the start of their ways, m, (n, M).
-      direction: 1 where they go towards the end, -1 towards the start, (n, M).
-      start, axis, length, half_size, speed: of their ways and of themselves; see `Movers`.
+      centre: centres of the windows, m, (n, 2).
+      way: distances of moving boxes from the start of their paths, m, (n, M).
+      direction: 1 where they move towards the end, -1 towards the start, (n, M).
+      start, axis, length, half_size, speed: of the paths and the moving boxes; see `Movers`.
     """
 
     def __init__(self, n: int, capacity: Capacity) -> None:
@@ -97,24 +97,24 @@ class Surroundings:
 
     @property
     def windowed(self) -> bool:
-        """Whether there is anything that a window must be laid for."""
+        """Whether the terrain has any part that needs windows."""
         return self.capacity.grid or self.capacity.boxes + self.capacity.belts > 0
 
     @property
     def moving(self) -> bool:
-        """Whether any surface may move."""
+        """Whether any surface can move."""
         return self.capacity.belts > 0 or self.capacity.movers > 0
 
     def begin(self, env_id: int, ground: SpatialGround, xy: npt.ArrayLike = (0.0, 0.0)) -> None:
-        """Puts a character on another ground, moving boxes as they begin.
+        """Assigns a new ground to a character, with moving boxes at their initial places.
 
         Args:
-          env_id: which character.
-          ground: of a terrain like the one whose capacity this was made for.
-          xy: where the character is, m.
+          env_id: number of the simulation.
+          ground: of a terrain that fits the capacity given to the constructor.
+          xy: position of the character, m.
 
         Raises:
-          ValueError: the ground is of another kind than the probes led to expect.
+          ValueError: the ground has parts that the capacity does not provide for.
         """
         layout, capacity = ground.layout, self.capacity
         belts = 0 if layout.belts is None else len(layout.belts.velocity)
@@ -144,14 +144,14 @@ class Surroundings:
         self._lay(env_id, np.round(np.asarray(xy, float) / SHIFT) * SHIFT)
 
     def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> list[int]:
-        """Keeps the windows about the characters.
+        """Moves windows whose characters have left the middle.
 
         Args:
-          xy: where they are, m, (n, 2), or of the given simulations only.
-          env_ids: sorted numbers of characters; None for all.
+          xy: positions of the characters, m, (n, 2), or of the given simulations only.
+          env_ids: sorted numbers of simulations; None for all.
 
         Returns:
-          Whose windows were laid anew.
+          The simulations whose windows were refilled.
         """
         if not self.windowed:
             return []
@@ -165,25 +165,25 @@ class Surroundings:
         return leaving
 
     def advance(self, dt: float, xy: np.ndarray, env_ids: Rows = ALL) -> None:
-        """Moves moving boxes, where no physics does.
+        """Moves moving boxes, for use without a physics engine.
 
         Args:
           dt: s.
-          xy: where the characters of the simulations are, m.
-          env_ids: which ones.
+          xy: positions of the characters of these simulations, m.
+          env_ids: numbers of the simulations.
         """
         self.way[env_ids] += self.direction[env_ids] * self.speed[env_ids] * dt
         self.turn(xy, env_ids)
 
     def turn(self, xy: np.ndarray, env_ids: Rows = ALL) -> None:
-        """Turns moving boxes round that are at an end of their way and far from their character.
+        """Reverses moving boxes that are at an end of their path and far from their character.
 
-        Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
+        Within 5 m of the character they continue straight on, even beyond the end of their path.
         """
         _turn_all(self._numbers[env_ids], np.ascontiguousarray(xy, float), self.arrays)
 
     def centres(self, env_ids: Rows = ALL) -> np.ndarray:
-        """Middles of the moving boxes, m, (simulations, M, 2)."""
+        """Centres of the moving boxes, m, (simulations, M, 2)."""
         return self.start[env_ids] + self.way[env_ids][..., None] * self.axis[env_ids]
 
     def grid(self, env_id: int) -> np.ndarray:
@@ -199,7 +199,7 @@ class Surroundings:
         return out
 
     def velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
-        """Horizontal velocities of the surface at points (simulations, k), m/s, (simulations, k, 2)."""
+        """Horizontal surface velocities at points (simulations, k), m/s, (simulations, k, 2)."""
         out = np.zeros((*np.shape(x), 2))
         if self.moving:
             self._points(_velocities, x, y, env_ids, out)
@@ -218,10 +218,10 @@ class Surroundings:
         0.355 m apart. Sample 32 v + u is the u-th from behind of the v-th line from the left.
 
         Args:
-          xy: where the characters are, m, (simulations, 2).
+          xy: positions of the characters, m, (simulations, 2).
           heading: rad, (simulations,).
-          env_ids: which characters.
-          out: where to write, (simulations, 1024).
+          env_ids: numbers of the simulations.
+          out: array for the result, (simulations, 1024).
 
         Returns:
           Heights in m, (simulations, 1024).
@@ -242,8 +242,8 @@ class Surroundings:
         Arguments are those of `height_map`.
 
         Returns:
-          Velocities in m/s, (simulations, 2048): along the heading at the samples of a height map, then
-          to the right of it.
+          Velocities in m/s, (simulations, 2048): components along the heading at the samples of a
+          height map, then components to the right of it.
         """
         out = np.empty((len(xy), 2 * SAMPLES**2)) if out is None else out
         self._maps(_velocity_maps, xy, heading, env_ids, out)
@@ -257,7 +257,7 @@ class Surroundings:
         env_ids: Rows,
         out: np.ndarray,
     ) -> None:
-        """Asks a compiled loop about points."""
+        """Calls a compiled loop over points."""
         env_ids = self._numbers[env_ids]
         x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
         if x.ndim != 2 or x.shape != y.shape or len(x) != len(env_ids):
@@ -274,7 +274,7 @@ class Surroundings:
         env_ids: Rows,
         out: np.ndarray,
     ) -> None:
-        """Asks a compiled loop for maps."""
+        """Calls a compiled loop over maps."""
         env_ids = self._numbers[env_ids]
         xy, heading = np.ascontiguousarray(xy, float), np.ascontiguousarray(heading, float)
         count = len(env_ids)
@@ -288,7 +288,7 @@ class Surroundings:
     # State.
 
     def state(self, env_id: int) -> dict[str, Any]:
-        """What is needed to restore the surroundings of one character exactly."""
+        """Returns the state from which `restore` restores the surroundings of one character."""
         ground = self.grounds[env_id]
         if ground is None:
             return {'ground': None}
@@ -322,7 +322,7 @@ class Surroundings:
         if not self.capacity.boxes + self.capacity.belts:
             return
         boxes = layout.boxes_in(low, high)
-        if len(boxes.top) > self.capacity.boxes:  # those at the rim may be missing
+        if len(boxes.top) > self.capacity.boxes:  # boxes at the rim may be missing
             gap = np.abs(boxes.position - centre) - boxes.extent()
             nearest = np.argsort(gap.max(1), kind='stable')[: self.capacity.boxes]
             boxes = boxes.select(nearest)

@@ -10,24 +10,24 @@ from trl_suite.terrain.spatial import noise
 from trl_suite.terrain.spatial.layout import GRID
 
 SEGMENT = 2.0  # m
-BEGIN = (-1.25, 0.0)  # m; where the first segment starts
-STRAIGHT = 2  # segments that go straight ahead before the first turn
+BEGIN = (-1.25, 0.0)  # m; start of the first segment
+STRAIGHT = 2  # number of straight segments before the first turn
 FREQUENCY = 0.005  # tiles of noise per m: five times finer than hills
 AMPLITUDE = 5.0  # m; of the first octave
-EASY, WIDEST = 1.0, 0.6 * math.pi  # rad off straight ahead: turns are unbiased / led back
-MARGIN = 10.0  # m; a trail this far ahead does not come back
+EASY, WIDEST = 1.0, 0.6 * math.pi  # rad; |heading| up to which turns are unbiased / always back
+MARGIN = 10.0  # m; a trail this far ahead does not return
 MOST = 100_000  # segments
 
 
 class Trail:
-    """Segments of a path, drawn as far as they are asked for.
+    """Segments of a path, generated on demand.
 
-    Each segment varies the width, turns (less where it is narrow, and rather back once it has
-    turned more than 1 rad off straight ahead), and may step up or down. Where the ground around is
-    noise above the mean, the path keeps off its least width.
+    Each segment varies the width, turns (less where it is narrow, and more often back once its
+    heading is more than 1 rad off straight ahead), and may step up or down. Where the noise of the
+    surrounding ground is above its mean, the least width of the path is larger.
 
     Attributes:
-      start, end: of the segments so far, m, (k, 2).
+      start, end: of the existing segments, m, (k, 2).
       heading: rad, (k,).
       width: m, (k,).
       height: m, (k,).
@@ -35,11 +35,11 @@ class Trail:
     """
 
     def __init__(self, parameters: dict[str, float], rng: np.random.Generator) -> None:
-        """Draws the first segments.
+        """Generates the first segments.
 
         Args:
           parameters: those of `trail3d`.
-          rng: is drawn from whenever the trail is continued; nothing else may draw from it.
+          rng: used whenever the trail is extended; nothing else may draw from it.
         """
         self._parameters, self._rng = parameters, rng
         self.offset = rng.random(2)
@@ -54,7 +54,7 @@ class Trail:
         self._arrays()
 
     def extend(self, count: int) -> None:
-        """Makes sure that there are at least so many segments."""
+        """Extends the trail to at least `count` segments."""
         if count > len(self._segments):
             while len(self._segments) < min(count, MOST):
                 self._turn()
@@ -62,7 +62,7 @@ class Trail:
             self._arrays()
 
     def reach(self, x: float) -> None:
-        """Makes sure that the trail has left everything up to x m behind for good."""
+        """Extends the trail so far that further segments do not return to x m or less."""
         if self._tip[0] < x + MARGIN:
             while self._tip[0] < x + MARGIN and len(self._segments) < MOST:
                 self._turn()
@@ -70,17 +70,19 @@ class Trail:
             self._arrays()
 
     def leave(self, half_side: float) -> int:
-        """Number of segments up to the first that ends outside a square about the origin."""
+        """Number of segments up to the first that ends outside a square around the origin."""
         self.reach(half_side)
         outside = (np.abs(self.end) > half_side).any(1)
         return int(outside.argmax()) + 1
 
     def paint(self, heights: np.ndarray, i: np.ndarray, j: np.ndarray) -> None:
-        """Puts the trail into a grid: vertices within half the width of a segment; later ones win.
+        """Writes the trail into a grid: the vertices within half the width of a segment.
+
+        Later segments overwrite earlier ones.
 
         Args:
           heights: (k, m), changed in place.
-          i, j: numbers of the vertices along x and y, consecutive, (k,) and (m,).
+          i, j: indices of the vertices along x and y, consecutive, (k,) and (m,).
         """
         self.reach(i[-1] * GRID)
         half = 0.5 * self.width[:, None]
@@ -97,7 +99,7 @@ class Trail:
             cosine, sine = math.cos(heading), math.sin(heading)
             x, y = columns[a:b] - x0, rows[c:d] - y0
             along = x * cosine + y * sine
-            # Beyond the ends only the distance to them counts.
+            # Beyond the ends of a segment, the distance to the nearer end.
             beyond = along - np.minimum(np.maximum(along, 0), SEGMENT)
             distance = np.square(y * cosine - x * sine) + np.square(beyond)
             heights[a:b, c:d][distance <= 0.25 * width * width] = height
@@ -126,7 +128,7 @@ class Trail:
         self._tip = (x, y, heading + turn, width, height)
 
     def _append(self) -> None:
-        """Adds the segment that starts at the tip."""
+        """Appends the segment that starts at the tip."""
         self._segments.append(self._tip)
         x, y, heading, width, height = self._tip
         x, y = x + SEGMENT * math.cos(heading), y + SEGMENT * math.sin(heading)

@@ -1,7 +1,8 @@
-"""Windows of the three-dimensional grounds of n simulations, as arrays, and functions of one of them.
+"""Windows of the spatial grounds of n simulations, as arrays, and functions of one simulation.
 
-The functions answer for a point as `SpatialGround` would, as long as it lies within the window of its
-simulation, 32 m x 32 m; beyond the window they answer for its rim. `Surroundings` fills the arrays.
+For a point within the window of its simulation, 32 m x 32 m, results equal those of
+`SpatialGround`; beyond the window, those of the nearest point of its rim. `Surroundings` fills the
+arrays.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
 from trl_suite.util.compiled import compiled, compiled_inline
 
 HALF = 16.0  # m; half side of a window
-SHIFT = 4.0  # m; windows are centred on multiples of it, and laid anew beyond it
+SHIFT = 4.0  # m; window centres are multiples of it; a character farther away has its window moved
 VERTICES = round(2 * HALF / GRID) + 1  # of the height grid of a window, along each axis
 SQUARES = (32, 32)  # bins of a window along x and y
-STRIPS = (256, 1)  # where all boxes reach from the right rim to the left one
-ROOM = 8  # times as many entries as there are bins and boxes
+STRIPS = (256, 1)  # the same if all boxes reach from the right rim to the left one
+ROOM = 8  # entries of `bin_boxes` per bin and box
 SAMPLES = 32  # of a map, along each axis
-AHEAD = (-1.0, 10.0)  # m; along the heading, from where to where a map reaches
-ASIDE = 5.5  # m; to each side
-SPEED_ERROR = 0.005  # m/s; deviation after which moving boxes are given their speed again
+AHEAD = (-1.0, 10.0)  # m; extent of a map along the heading
+ASIDE = 5.5  # m; extent to each side
+SPEED_ERROR = 0.005  # m/s; deviation above which the speed of moving boxes is reset
 
 _FORWARD = np.linspace(*AHEAD, SAMPLES)
 _RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
@@ -36,12 +37,12 @@ _FAR_AWAY = TURN_DISTANCE**2
 _CELLS_PER_METRE = 1 / GRID
 _LAST = VERTICES - 1.0 - 1e-6
 
-# Columns of `SpatialWindows.boxes`: all numbers of a box share a line of the processor's cache.
+# Columns of `SpatialWindows.boxes`: the values of a box fill one cache line of the processor.
 X, Y, HALF_X, HALF_Y, COSINE, SINE, TOP, SLOPE = range(8)
 
 
 class Capacity(NamedTuple):
-    """The most that a window of a terrain holds."""
+    """The largest numbers of parts in a window of a terrain."""
 
     level: bool  # whether there is a plane
     grid: bool  # whether there is a height grid
@@ -52,19 +53,19 @@ class Capacity(NamedTuple):
 
 
 class SpatialWindows(NamedTuple):
-    """Windows of n grounds, with room for B boxes (belts come last) and M moving boxes each.
+    """Windows of n grounds, with up to B boxes (belts come last) and M moving boxes each.
 
-    An array of what a terrain does not have has length 0 along its second axis. The arrays are
-    changed in place and never replaced.
+    Arrays of parts that a terrain does not have are of length 0 along their second axis. The arrays
+    are changed in place and never replaced.
 
     Attributes:
       level: of the plane, (n,) m; -inf if there is none.
-      centre: middles of the windows, (n, 2) m.
+      centre: centres of the windows, (n, 2) m.
       grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
-      boxes: numbers by the columns above, (n, B, 8); HALF_X is -1 where there is no box.
+      boxes: values in the columns above, (n, B, 8); HALF_X is -1 where there is no box.
       box_velocity: of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
-      bins: which part of bin_boxes is of a bin, begin and end, (n, bins along x, along y, 2) int32.
-      bin_boxes: for every bin the numbers of the boxes that touch it, (n, k) int32.
+      bins: begin and end of each bin in bin_boxes, (n, bins along x, along y, 2) int32.
+      bin_boxes: for every bin the indices of the boxes that touch it, (n, k) int32.
       mover_start: where the path of a moving box starts, (n, M, 2) m.
       mover_axis: unit vector along the path, (n, M, 2).
       mover_length: of the path, (n, M) m.
@@ -73,7 +74,7 @@ class SpatialWindows(NamedTuple):
       mover_speed: (n, M) m/s.
       mover_distance: from the start of the path, (n, M) m; changes as boxes move.
       mover_direction: 1 towards the end of the path, -1 towards its start, (n, M).
-      mover_begin: where on its path a moving box is when its joint is at 0, (n, M) m.
+      mover_begin: distance from the start of the path at joint position 0, (n, M) m.
       mover_qpos, mover_dof: addresses of these joints in the physics, (M,).
     """
 
@@ -98,7 +99,7 @@ class SpatialWindows(NamedTuple):
 
 
 def empty(n: int, capacity: Capacity) -> SpatialWindows:
-    """Returns room for n windows of a terrain, with nothing in them."""
+    """Allocates n empty windows of a terrain."""
     boxes, movers = capacity.boxes + capacity.belts, capacity.movers
     bins = (STRIPS if capacity.strips else SQUARES) if boxes else (0, 0)
     ground = SpatialWindows(
@@ -149,11 +150,11 @@ def height_map(
     Sample 32 v + u is the u-th from behind of the v-th line from the left; see `Surroundings`.
 
     Args:
-      i: which simulation.
-      x, y: where the character is, m.
+      i: number of the simulation.
+      x, y: position of the character, m.
       heading: rad.
-      ground: of all simulations.
-      out: is given the heights in m, (1024,).
+      ground: windows of all simulations.
+      out: array for the heights in m, (1024,).
     """
     under = height(i, x, y, ground)
     cosine, sine = math.cos(heading), math.sin(heading)
@@ -175,8 +176,8 @@ def velocity_map(
 ) -> None:
     """Writes velocities of the surface around a character, relative to the surface under it.
 
-    Arguments are those of `height_map`; `out` is given velocities in m/s, (2048,): along the
-    heading at the samples of a height map, then to the right of it.
+    Arguments are those of `height_map`, but `out` is for velocities in m/s, (2048,): components
+    along the heading at the samples of a height map, then components to the right of it.
     """
     belts, movers = ground.box_velocity.shape[1], ground.mover_top.shape[1]
     if belts + movers == 0:
@@ -205,7 +206,7 @@ def velocity_map(
 
 @compiled
 def has_left(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
-    """Returns whether a character is so far from the middle that its window must be laid anew."""
+    """Returns whether a character is so far from the centre that its window must be refilled."""
     if ground.grid.shape[1] + ground.boxes.shape[1] == 0:
         return False
     return abs(x - ground.centre[i, 0]) > SHIFT or abs(y - ground.centre[i, 1]) > SHIFT
@@ -213,9 +214,9 @@ def has_left(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
 
 @compiled
 def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
-    """Turns moving boxes round that are at an end of their path and far from the character at (x, y).
+    """Reverses moving boxes that are at an end of their path and far from the character at (x, y).
 
-    Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
+    Within 5 m of the character they continue straight on, even beyond the end of their path.
     """
     for k in range(ground.mover_top.shape[1]):
         middle_x, middle_y = _mover_middle(i, k, ground)
@@ -230,7 +231,7 @@ def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
 
 @compiled
 def see_movers(i: int, qpos: np.ndarray, ground: SpatialWindows) -> None:
-    """Notes where the physics has taken moving boxes; qpos is of all simulations."""
+    """Updates the positions of moving boxes from qpos, which is that of all simulations."""
     for k in range(ground.mover_top.shape[1]):
         moved = qpos[i, ground.mover_qpos[k]]
         ground.mover_distance[i, k] = ground.mover_begin[i, k] + moved
@@ -240,16 +241,16 @@ def see_movers(i: int, qpos: np.ndarray, ground: SpatialWindows) -> None:
 def keep_moving(
     i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialWindows
 ) -> bool:
-    """Turns moving boxes round, and gives all of a simulation their speed again where one lacks it.
+    """Reverses moving boxes, and resets the speeds of all of them if one deviates.
 
     Args:
-      i: which simulation.
-      x, y: where its character is, m.
+      i: number of the simulation.
+      x, y: position of its character, m.
       qpos, qvel: of all simulations; qvel is written.
-      ground: of all simulations.
+      ground: windows of all simulations.
 
     Returns:
-      Whether qvel was written; then the physics wants to be forwarded.
+      Whether qvel was written; then the physics must be forwarded.
     """
     see_movers(i, qpos, ground)
     turn_movers(i, x, y, ground)
@@ -264,15 +265,12 @@ def keep_moving(
     return wrong
 
 
-# What queries are made of.
+# Parts of queries.
 
 
 @compiled_inline
 def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
-    """Height of the highest thing at a point that stays where it is, and the number of its box.
-
-    It is -1 if that is no box.
-    """
+    """Height of the static surface at a point, and the index of its box; -1 if it is not a box."""
     top, box = ground.level[i], -1
     if ground.grid.shape[1]:
         on_grid = _on_grid(i, x, y, ground)
@@ -300,7 +298,7 @@ def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, i
 
 @compiled_inline
 def _highest(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
-    """As `_fixed`, but with moving boxes, which are numbered on from B."""
+    """As `_fixed`, but with moving boxes, whose indices start at B."""
     top, box = _fixed(i, x, y, ground)
     for k in range(ground.mover_top.shape[1]):
         middle_x, middle_y = _mover_middle(i, k, ground)
@@ -315,7 +313,7 @@ def _highest(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float,
 
 @compiled_inline
 def _velocity_of(i: int, box: int, ground: SpatialWindows) -> tuple[float, float]:
-    """Horizontal velocity of the surface of a box, m/s, by the number that `_highest` gives it."""
+    """Horizontal velocity of the surface of a box, m/s, by its index as in `_highest`."""
     if box >= ground.boxes.shape[1]:
         k = box - ground.boxes.shape[1]
         speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
@@ -327,7 +325,7 @@ def _velocity_of(i: int, box: int, ground: SpatialWindows) -> tuple[float, float
 
 @compiled_inline
 def _mover_middle(i: int, k: int, ground: SpatialWindows) -> tuple[float, float]:
-    """Middle of a moving box, m."""
+    """Centre of a moving box, m."""
     distance = ground.mover_distance[i, k]
     return (
         ground.mover_start[i, k, 0] + distance * ground.mover_axis[i, k, 0],
@@ -343,11 +341,11 @@ def _on_grid(i: int, x: float, y: float, ground: SpatialWindows) -> float:
     column, u = _cell(u)
     line, v = _cell(v)
     cell = column * VERTICES + line
-    # Doubles; Numba's `float` leaves single precision as it is.
+    # As doubles; Numba's `float` would not convert single precision.
     near, left = np.float64(ground.grid[i, cell]), np.float64(ground.grid[i, cell + 1])
     cell += VERTICES
     front, far = np.float64(ground.grid[i, cell]), np.float64(ground.grid[i, cell + 1])
-    # A plane through three vertices and, beyond the diagonal, what the fourth is off it.
+    # A plane through three vertices and, beyond the diagonal, the offset of the fourth from it.
     off = far + near - front - left
     beyond = u + v - 1.0
     above = near + u * (front - near) + v * (left - near)
@@ -356,7 +354,7 @@ def _on_grid(i: int, x: float, y: float, ground: SpatialWindows) -> float:
 
 @compiled_inline
 def _cell(position: float) -> tuple[int, float]:
-    """Number of a cell of the grid and where in it a position lies, in cells; NaN stays NaN."""
+    """Index of the grid cell at a position, and the position in it, in cells; NaN stays NaN."""
     if position > _LAST:
         position = _LAST
     elif position < 0.0:
@@ -367,16 +365,16 @@ def _cell(position: float) -> tuple[int, float]:
 
 @compiled_inline
 def bin_of(distance: float, count: int) -> int:
-    """Number of the bin at a distance from the rim of a window, m."""
+    """Index of the bin at a distance from the rim of a window, m."""
     position = distance * (count / (2 * HALF))
-    if not position > 0.0:  # nor is it a number
+    if not position > 0.0:  # or it is NaN
         return 0
     return int(position) if position < count else count - 1
 
 
 @compiled_inline
 def _sample(u: int, v: int, x: float, y: float, cosine: float, sine: float) -> tuple[float, float]:
-    """Where a sample of a map lies, m."""
+    """Position of a sample of a map, m."""
     return (
         x + cosine * _FORWARD[u] + sine * _RIGHT[v],
         y + sine * _FORWARD[u] - cosine * _RIGHT[v],
@@ -387,7 +385,7 @@ def _sample(u: int, v: int, x: float, y: float, cosine: float, sine: float) -> t
 def _seen_part(
     i: int, k: int, x: float, y: float, cosine: float, sine: float, ground: SpatialWindows
 ) -> tuple[int, int, int, int]:
-    """Which samples of a map may lie on a moving box: begin and end of u, begin and end of v."""
+    """Samples of a map that may lie on a moving box: begin and end of u, begin and end of v."""
     half_x, half_y = ground.mover_half_size[i, k, 0], ground.mover_half_size[i, k, 1]
     if half_x < 0.0:
         return 0, 0, 0, 0
