@@ -14,6 +14,7 @@ from dm_control import composer
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
+from trl_suite.viewing import overlays
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -101,7 +102,7 @@ class GhostTest(parameterized.TestCase):
 
         def look(physics, scene):
             before = scene.ngeom
-            rendering._ghost(environment.task)(physics, scene)
+            overlays.ghost(environment.task)(physics, scene)
             for geom in scene.geoms[before : scene.ngeom]:
                 shown[geom.objid] = np.array(geom.pos), np.array(geom.rgba)
 
@@ -113,7 +114,7 @@ class GhostTest(parameterized.TestCase):
         ]  # fmt: skip
         self.assertCountEqual(shown, looks)
         for i, (position, colour) in shown.items():
-            beside = np.array([0, rendering.GHOST_BEHIND, -lift])
+            beside = np.array([0, overlays.GHOST_BEHIND, -lift])
             character = environment.physics.data.geom_xpos[i]
             np.testing.assert_allclose(position, character + beside, atol=1e-5)
             self.assertLess(colour[3], 1)
@@ -365,7 +366,7 @@ class SpatialTest(FolderTest):
         )
         environment.reset()
         colours = []
-        ghost = rendering._ghost(environment.task)
+        ghost = overlays.ghost(environment.task)
 
         def look(physics, scene):
             before = scene.ngeom
@@ -378,7 +379,7 @@ class SpatialTest(FolderTest):
         environment.physics.render(48, 64, scene_callback=look)
         self.assertEqual({alpha for mover, alpha in colours if mover}, {0.0})
         shown = {round(alpha, 6) for mover, alpha in colours if not mover}
-        self.assertEqual(shown, {rendering.GHOST_COLOUR[3]})
+        self.assertEqual(shown, {overlays.GHOST_COLOUR[3]})
 
     def test_maps_of_terrain(self):
         for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):

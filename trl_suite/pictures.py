@@ -31,6 +31,7 @@ MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
 MAP_POINTS = 400  # at most, along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
+REPLAY_SUFFIXES = ('.html',)
 
 
 def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:

@@ -1,0 +1,1 @@
+"""Pictures, videos, replays and viewers of environments."""
