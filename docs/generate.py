@@ -136,7 +136,7 @@ def home() -> str:
         'trl_suite',
         'Terrain RL Simulator (Berseth, Peng, van de Panne 2018) on MuJoCo: locomotion over random '
         'terrain, in the manner of `dm_control.suite`.',
-        '![Six environments of the suite](pictures/suite.jpg)',
+        '![Six environments of the suite](pictures/suite.webp)',
         table(
             ('reference, made from the code', ''),
             (

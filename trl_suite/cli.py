@@ -191,6 +191,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         '--only', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
     )
     command.add_argument('--again', action='store_true', help='also what is there already')
+    command.add_argument(
+        '--moving', action='store_true', help='animated pictures of environments, and no others'
+    )
     return parser
 
 

@@ -96,7 +96,7 @@ def frame(
 
     drawn = overlays.of_task(environment.task, ghost)
     camera_id = _camera(physics, camera)
-    _check_gl(physics)
+    check_gl(physics)
 
     def add(physics: Any, scene: Any) -> None:
         for overlay in drawn:
@@ -209,7 +209,7 @@ def _camera(physics: Any, camera: str | int) -> int:
     return found[0]
 
 
-def _check_gl(physics: Any) -> None:
+def check_gl(physics: Any) -> None:
     """Makes the drawing context at the first picture."""
     try:
         _use_chosen_library()

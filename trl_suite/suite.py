@@ -10,7 +10,7 @@ from typing import Any
 from trl_suite import actuation as actuation_models
 from trl_suite import catalogue, characters, errors, motion, policies
 from trl_suite import terrain as terrains
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarTerrain, SpatialTerrain, stage
 from trl_suite.catalogue import Row, find
 from trl_suite.environment import Environment
 from trl_suite.tasks import composed
@@ -53,7 +53,7 @@ def _clip(row: Row) -> motion.Clip:
 def _imitation(row: Row, options: dict[str, Any]) -> Task:
     return Imitation(
         characters.make(row.character),
-        PlanarTerrain(terrains.load(row.terrain)),
+        _arena(row),
         _clip(row),
         actuation_model=row.actuation,
         **options,
@@ -61,17 +61,12 @@ def _imitation(row: Row, options: dict[str, Any]) -> Task:
 
 
 def _gait(row: Row, options: dict[str, Any]) -> Task:
-    arena = PlanarTerrain(terrains.load(row.terrain))
-    return GaitTask(characters.make(row.character), arena, **options)
-
-
-def _spatial(row: Row) -> SpatialTerrain:
-    return SpatialTerrain(terrains.load(row.terrain))
+    return GaitTask(characters.make(row.character), _arena(row), **options)
 
 
 def _imitation3d(row: Row, options: dict[str, Any]) -> Task:
     return SpatialImitation(
-        characters.make(row.character), _spatial(row), _clip(row), actuation_model=row.actuation,
+        characters.make(row.character), _arena(row), _clip(row), actuation_model=row.actuation,
         **options,
     )  # fmt: skip
 
@@ -83,14 +78,14 @@ def _footsteps(row: Row, options: dict[str, Any]) -> Task:
     if not isinstance(steps, motion.Steps):
         steps = motion.load_steps(steps or '')
     return Footsteps(
-        characters.make(row.character), _spatial(row), steps, actuation_model=row.actuation,
+        characters.make(row.character), _arena(row), steps, actuation_model=row.actuation,
         **options,
     )  # fmt: skip
 
 
 def _footsteps2d(row: Row, options: dict[str, Any]) -> Task:
     return PlanarFootsteps(
-        characters.make(row.character), PlanarTerrain(terrains.load(row.terrain)), _clip(row),
+        characters.make(row.character), _arena(row), _clip(row),
         actuation_model=row.actuation, **options,
     )  # fmt: skip
 
@@ -104,7 +99,7 @@ def _hike(row: Row, options: dict[str, Any], with_ball: bool = False) -> Task:
     if isinstance(controller, str) and not controller.endswith('.npz'):
         options['controller'] = find(controller).id  # of an alias, too
     steps = row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
-    arena = _spatial(row)
+    arena = _arena(row)
     ball = Ball(arena) if with_ball else None
     return HighLevel(characters.make(row.character), arena, steps, ball, **options)
 
@@ -116,24 +111,24 @@ def _soccer(row: Row, options: dict[str, Any]) -> Task:
 def _journey(row: Row, options: dict[str, Any]) -> Task:
     original = options.get('reward') == 'original'
     return journey(
-        characters.make(row.character), _spatial(row), _clip(row),
+        characters.make(row.character), _arena(row), _clip(row),
         motion.load_steps(_character(row.character).name) if original else None,
         actuation_model=row.actuation, **options,
     )  # fmt: skip
 
 
 def _ball_journey(row: Row, options: dict[str, Any]) -> Task:
-    arena = _spatial(row)
+    arena = _arena(row)
     return Journey(
         characters.make(row.character), arena, _clip(row), Ball(arena),
         actuation_model=row.actuation, **options,
     )  # fmt: skip
 
 
-def _arena(row: Row) -> PlanarTerrain | SpatialTerrain:
-    if _character(row.character).spatial:
-        return _spatial(row)
-    return PlanarTerrain(terrains.load(row.terrain))
+def _arena(row: Row) -> Any:
+    """Returns the arena of a row: planar or spatial as its character is, in its family's colours."""
+    arena = SpatialTerrain if _character(row.character).spatial else PlanarTerrain
+    return arena(terrains.load(row.terrain), look=stage.LOOKS.get(row.domain, stage.OLIVE))
 
 
 def _walk(row: Row, options: dict[str, Any]) -> Task:

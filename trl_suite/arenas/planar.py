@@ -21,6 +21,7 @@ ADVANCE = 6.0  # m; travel after which the window is laid anew
 PROBES = 6  # draws by which the pool of boxes is sized
 LINE_PROBES = 10  # windows to each side, 240 m, by which it is where ground is a function of x
 SPARE = 1.3  # times the most boxes of any probe
+EDGE = 0.82  # brightness of the edges of the strip, and so of its sides
 COARSEST = 0.1  # m; tolerance up to which pieces are merged if the pool should not suffice
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
@@ -43,12 +44,14 @@ class PlanarTerrain(composer.Arena):
     height and slope queries answer from the strips' arrays, never from the collision geometry.
     """
 
-    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+    def _build(  # type: ignore[override]
+        self, terrain: Terrain, name: str = 'arena', look: stage.Look = stage.OLIVE
+    ) -> None:
         super()._build(name=name)
         self.terrain = terrain
         root = self._mjcf_root
-        stage.prepare(root)
-        _paint(root)
+        stage.prepare(root, look)
+        _paint(root, look)
         self.boxes = [
             # In the world's own body: of any other body all geoms are gone through in every substep.
             root.worldbody.add(
@@ -273,13 +276,14 @@ def _pool_size(terrain: Terrain) -> int:
     return round(SPARE * most) + PROBES
 
 
-def _paint(root: mjcf.RootElement) -> None:
+def _paint(root: mjcf.RootElement, look: stage.Look) -> None:
     """What the ground looks like."""
+    light, dark = look.ground
     # The checker spans the width of the strip once and its edge has the colour of the sides: where
     # tilted boxes overlap, their sides look like one.
     root.asset.add(
         'texture', name='ground', type='2d', builtin='checker', mark='edge', width=256, height=256,
-        rgb1=(0.47, 0.52, 0.44), rgb2=(0.42, 0.47, 0.40), markrgb=(0.36, 0.38, 0.33),
+        rgb1=light, rgb2=dark, markrgb=[EDGE * part for part in dark],
     )  # fmt: skip
     root.asset.add(
         'material', name='ground', texture='ground', texuniform=True, reflectance=0, specular=0,

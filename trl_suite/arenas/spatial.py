@@ -45,13 +45,15 @@ class SpatialTerrain(composer.Arena):
     body in every substep, and through most of them where a plane without end is among them.
     """
 
-    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+    def _build(  # type: ignore[override]
+        self, terrain: Terrain, name: str = 'arena', look: stage.Look = stage.OLIVE
+    ) -> None:
         super()._build(name=name)
         self.terrain = terrain
         self.capacity = holds = capacity(terrain)
         root = self._mjcf_root
-        stage.prepare(root)
-        _paint(root)
+        stage.prepare(root, look)
+        _paint(root, look)
         # The ground may be hit but hits nothing itself: moving boxes pass through it and each other.
         common = {
             'friction': FRICTION, 'solref': SOLREF, 'solimp': SOLIMP, 'condim': 3, 'contype': 1,
@@ -401,10 +403,10 @@ def _write_boxes(
             geom_rgba[geom, channel] = shades[shade, channel]
 
 
-def _paint(root: mjcf.RootElement) -> None:
+def _paint(root: mjcf.RootElement, look: stage.Look) -> None:
     """What the ground looks like."""
     colours = {
-        'ground': ((0.47, 0.52, 0.44), (0.42, 0.47, 0.40)),
+        'ground': look.ground,
         'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),
         'belt': ((0.34, 0.38, 0.44), (0.42, 0.46, 0.52)),
         'mover': ((0.66, 0.50, 0.30), (0.61, 0.46, 0.27)),

@@ -3,9 +3,10 @@
     trl-suite gallery --output gallery --only '*Dog2D*'
 
 Files, FOLDER/...: environments/ID.jpg, a film strip; curves/ID.png, of a policy that is shipped;
-terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg. At
-most about 40 kB each, but for the last one and some maps. What is there stays, unless asked otherwise or the policy
-that it shows has been replaced.
+terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.webp. At
+most about 40 kB each, but for the last one and some maps. With --moving, instead of these: moving/ID.webp,
+4 s of each environment. What is there stays, unless asked otherwise or the policy that it shows has been
+replaced.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from trl_suite import (
 from trl_suite import terrain as terrains
 from trl_suite.environment import Environment
 from trl_suite.mannequin import Mannequin
+from trl_suite.viewing import moving
 
 LARGEST = 40_000  # bytes of a picture
 QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, until it is small enough
@@ -72,12 +74,12 @@ FAMILIES = {
     'deeploco': ('PD_Biped3D_HLC_Soccer-v0', 12.0),
 }
 SUITE = (
-    (('PD_Biped2D_Walls_Terrain-v0', 3.0), ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 0.7),
-     ('FSM_Raptor2D_Terrain_Cliffs-v0', 2.0)),
-    (('FSM_Goat2D_Terrain_Variable_Steps-v0', 1.0), ('PD_Biped3D_HLC_Forest-v0', 5.0),
-     ('PD_Biped3D_HLC_Soccer-v0', 12.0)),
+    ('PD_Biped2D_Walls_Terrain-v0', 'PD_Dog2D_Slopes_Mixed_Terrain-v0',
+     'FSM_Raptor2D_Terrain_Cliffs-v0'),
+    ('FSM_Goat2D_Terrain_Variable_Steps-v0', 'PD_Biped3D_HLC_Forest-v0',
+     'PD_Biped3D_HLC_Soccer-v0'),
 )  # fmt: skip
-SUITE_SIZE, SUITE_LARGEST = (240, 320), 120_000  # pixels of each picture; bytes
+SUITE_SIZE, SUITE_SECONDS = (200, 320), 4.0  # pixels of each picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,32 +88,49 @@ class Item:
 
     Attributes:
       path: below the folder, with / between parts.
-      draw: returns it, (h, w, 3) uint8.
+      draw: returns it, (h, w, 3) uint8; of a moving one, many of them.
       source: digest of what it shows, '' if that stays the same.
       largest: how many bytes it may have.
     """
 
     path: str
-    draw: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+    draw: Callable[[], Any] = dataclasses.field(repr=False)
     source: str = ''
     largest: int = LARGEST
 
 
 def items() -> Iterator[Item]:
-    """Yields all pictures of the gallery."""
-    yield Item('suite.jpg', together, largest=SUITE_LARGEST)
+    """Yields all pictures of the gallery that do not move, and that of the suite."""
+    yield Item(
+        'suite.webp', functools.partial(moving.side_by_side, SUITE, SUITE_SECONDS, SUITE_SIZE)
+    )
     for name, scene in FAMILIES.items():
         yield Item(f'families/{name}.jpg', functools.partial(moment, *scene))
     for name in characters.CHARACTERS:
         yield Item(character_path(name), functools.partial(character, name))
     for name in (*terrains.PRESETS, *terrains.PRESETS3D):
         yield Item(terrain_path(name), functools.partial(terrain, name))
-    shipped = policies.available()
     for id in catalogue.BY_ID:
-        policy = _digest(f'{id}.npz') if id in shipped else ''
-        yield Item(strip_path(id), functools.partial(film_strip, id), policy)
+        yield Item(strip_path(id), functools.partial(film_strip, id), _policy_digest(id))
         if record(id):
             yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
+
+
+def moving_items() -> Iterator[Item]:
+    """Yields the moving pictures of all environments."""
+    for id in catalogue.BY_ID:
+        draw = functools.partial(moving.moving_picture, id)
+        yield Item(moving_path(id), draw, _policy_digest(id))
+
+
+def _policy_digest(id: str) -> str:
+    """Returns a digest of the policy that is shipped for an environment, '' if none is."""
+    return _digest(f'{id}.npz') if id in policies.available() else ''
+
+
+def moving_path(id: str) -> str:
+    """Returns where the moving picture of an environment lies, below the folder."""
+    return f'moving/{id}.webp'
 
 
 def character_path(name: str) -> str:
@@ -147,7 +166,11 @@ def _digest(name: str) -> str:
 
 
 def make(
-    folder: files.Path, only: str = '*', again: bool = False, progress: bool = True
+    folder: files.Path,
+    only: str = '*',
+    again: bool = False,
+    progress: bool = True,
+    moves: bool = False,
 ) -> tuple[list[pathlib.Path], dict[str, Exception]]:
     """Makes the pictures that are missing, or that show a policy that has been replaced.
 
@@ -156,6 +179,7 @@ def make(
       only: pattern in the manner of a shell, with or without `*` around it, of paths below the folder.
       again: also make those that are there.
       progress: show a bar.
+      moves: make the moving pictures of environments instead of the others.
 
     Returns:
       What was written; and what failed, by path below the folder. One that fails stops no other.
@@ -167,7 +191,8 @@ def make(
       OSError: the folder cannot be made.
     """
     folder = pathlib.Path(folder)
-    chosen = [item for item in items() if fnmatch.fnmatch(item.path, f'*{only}*')]
+    choices = moving_items() if moves else items()
+    chosen = [item for item in choices if fnmatch.fnmatch(item.path, f'*{only}*')]
     if not chosen:
         raise ValueError(
             f'no picture matches {only!r}; expected a part of an id or the name of a character, as '
@@ -251,14 +276,6 @@ def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarr
     return _draw(id, {round(time / FRAME)}, size)[-1]
 
 
-def together() -> np.ndarray:
-    """Draws moments of several environments, in rows."""
-    rows = [[moment(*scene, SUITE_SIZE) for scene in row] for row in SUITE]
-    strips = [rendering.film_strip(row, columns=len(row)) for row in rows]
-    margin = np.full((rendering.STRIP_MARGIN, *strips[0].shape[1:]), 255, np.uint8)
-    return np.concatenate([part for strip in strips for part in (margin, strip)][1:])
-
-
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
     """Draws chosen moments of an episode, FRAME apart."""
     camera = scene(id)[-1]
@@ -330,11 +347,11 @@ def curve(id: str) -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
+def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
     """Writes a picture, made small: a .png with a palette, or a .jpg as good as its size allows.
 
     Args:
-      image: (h, w, 3) uint8.
+      image: (h, w, 3) uint8; for an animated .webp a sequence of such.
       path: where to.
       source: digest of what it shows, which is kept in the file.
       largest: how many bytes a .jpg may have, if a quality is low enough for it.
@@ -345,7 +362,10 @@ def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = L
     """
     from PIL import Image, PngImagePlugin
 
-    path = files.check_path(path, ('.png', '.jpg'))
+    path = files.check_path(path, ('.png', '.jpg', *moving.SUFFIXES))
+    if path.suffix in moving.SUFFIXES:
+        moving.save(image, path, source)
+        return
     picture, content = Image.fromarray(image), io.BytesIO()
     if path.suffix == '.png':
         notes = PngImagePlugin.PngInfo()
@@ -366,14 +386,16 @@ def _source(path: pathlib.Path) -> str:
     from PIL import Image
 
     with contextlib.suppress(OSError), Image.open(path) as image:
-        kept = image.info.get('comment', '')
+        kept = image.info.get('comment') or image.info.get('xmp', '')
         return kept.decode() if isinstance(kept, bytes) else kept
     return ''
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Makes pictures, and returns 1 if any failed."""
-    written, failed = make(arguments.output, arguments.only, arguments.again)
+    written, failed = make(
+        arguments.output, arguments.only, arguments.again, moves=arguments.moving
+    )
     for path, error in failed.items():
         print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
     noun = 'picture' if len(written) == 1 else 'pictures'
