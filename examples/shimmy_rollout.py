@@ -5,10 +5,11 @@ interface: it also steps many on threads, and says how an episode ended. Needs
 `pip install 'trl_suite[shimmy]'`.
 """
 
+# First: without a screen it lets dm_control, which Shimmy imports, draw by EGL.
+from trl_suite import suite  # isort: split
+
 import gymnasium
 from shimmy.dm_control_compatibility import DmControlCompatibilityV0
-
-from trl_suite import suite
 
 
 def main() -> None:

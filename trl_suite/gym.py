@@ -8,9 +8,9 @@
 
 Gymnasium 1 has no plugins: without that import the id must name the module, as in
 'trl_suite.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. What has no id is wrapped by hand, as
-`SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the environment's
-own step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward), 'fell',
-'diverged', 'distance' (m).
+`SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the step limit
+truncates it; `info` has 'fell', 'diverged', 'distance' (m), and each reward term as 'reward_NAME': their
+sum is the reward.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from trl_suite import errors, rendering, suite
+from trl_suite import catalogue, errors, rendering, suite
 from trl_suite.catalogue import Row
 from trl_suite.environment import Environment
 from trl_suite.vector import VectorEnvironment
@@ -63,8 +63,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
           flat_observation: give one vector of all blocks side by side, else a dict of blocks.
           task_kwargs: as for `suite.load`.
           dtype: of observations and actions, float32 or float64.
-          max_episode_steps: truncate after as many steps, if the environment's own limit does not
-            come first. `gymnasium.make` has a wrapper of its own for it.
+          max_episode_steps: truncate after as many steps instead of after the step limit of the
+            row; -1 never. A 'step_limit' in `task_kwargs` counts too: the smaller one holds.
           render_mode: 'rgb_array', or None for no pictures.
           render_kwargs: options of `trl_suite.rendering.frame`.
 
@@ -99,7 +99,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         super().reset(seed=seed)
         time_step = self.environment.reset()
         self._running = True
-        return self._observation(time_step.observation), self.environment.info
+        return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
         """Takes one action, clipped to [-1, 1]; `ResetNeeded` is raised where no episode runs."""
@@ -111,7 +111,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         terminated = last and time_step.discount == 0
         self._running = not last
         observation, truncated = self._observation(time_step.observation), last and not terminated
-        return observation, float(time_step.reward), terminated, truncated, self.environment.info
+        info = flat(self.environment.info)
+        return observation, float(time_step.reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Draws the current state, (h, w, 3) uint8; None if render_mode is None."""
@@ -192,7 +193,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f'reset_mask is {rows}; expected {self.num_envs} bools, not all false')
         observation = self.environment.reset(rows, seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        return observation, masked(self.environment.info, rows)
+        return observation, masked(flat(self.environment.info), rows)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Takes one step in every row; arguments and errors are those of `VectorEnvironment.step`."""
@@ -202,10 +203,10 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if ended.any():  # and begun anew in the same step
             finals = iterate(self.observation_space, info.pop('final_observation'))
             last = (each if end else None for each, end in zip(finals, ended, strict=True))
-            result = masked({'final_info': info}, ended)
+            result = {'final_info': masked(flat(info), ended), '_final_info': ended.copy()}
             result |= {'final_obs': np.fromiter(last, object), '_final_obs': ended}
             info = self.environment.info
-        result |= masked(info, np.ones(self.num_envs, bool))
+        result |= masked(flat(info), np.ones(self.num_envs, bool))
         return observation, reward, terminated, truncated, result
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -224,13 +225,20 @@ def metadata(task: Any) -> Info:
 
 
 def limited(row: Row, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
-    """Options whose step limit is the smaller of a row's and Gymnasium's (None or -1 for none)."""
+    """Options whose step limit is the smaller of theirs and Gymnasium's, by default that of the row.
+
+    Gymnasium's is None where nothing was said of it, and -1 where there is to be none.
+    """
     options = dict(task_kwargs or {})
-    if max_episode_steps is None or max_episode_steps == -1:
+    if max_episode_steps is None:
         return options
+    if max_episode_steps == -1:
+        return {'step_limit': None, **options}
     if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
-        raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
-    own = options.get('step_limit', row.step_limit)
+        raise ValueError(
+            f'max_episode_steps is {max_episode_steps}; expected a positive integer, or -1'
+        )
+    own = options.get('step_limit')
     options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
     return options
 
@@ -255,22 +263,34 @@ def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, shape, dtype)
 
 
+def flat(info: Info) -> Info:
+    """Info without a dict in it, which few programs understand: 'reward_NAME' for each term."""
+    rest = {name: value for name, value in info.items() if name != 'reward_terms'}
+    terms = info.get('reward_terms', {})
+    return {**rest, **{f'reward_{name}': value for name, value in terms.items()}}
+
+
 def masked(info: Info, rows: np.ndarray) -> Info:
     """Info as Gymnasium has it: 0 in other rows, and beside each key '_key', the mask of rows."""
     result: Info = {}
     for name, value in info.items():
-        result[name] = masked(value, rows) if isinstance(value, dict) else value.copy()
-        if not isinstance(value, dict):
-            result[name][~rows] = 0
+        result[name] = value.copy()
+        result[name][~rows] = 0
         result[f'_{name}'] = rows.copy()
     return result
 
 
-for _id in suite.ALL_IDS:
+def unlimited(environment: str, **options: Any) -> SuiteEnv:
+    """Makes what `gymnasium.make` wraps: the limit is in its specification, and its wrapper cuts."""
+    return SuiteEnv(environment, max_episode_steps=-1, **options)
+
+
+for _id, _row in catalogue.BY_ID.items():
     if f'trl_suite/{_id}' not in gymnasium.registry:
         gymnasium.register(
             f'trl_suite/{_id}',
-            entry_point='trl_suite.gym:SuiteEnv',
+            entry_point='trl_suite.gym:unlimited',
             vector_entry_point='trl_suite.gym:SuiteVectorEnv',
             kwargs={'environment': _id},
+            max_episode_steps=_row.step_limit,
         )

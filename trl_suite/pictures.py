@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tqdm.auto
 
 from trl_suite import terrain as terrains
 from trl_suite.files import Path, check_path, replacing
@@ -39,7 +40,7 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
 
     Args:
       frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as
-        `rendering.frames`.
+        `rendering.frames`. How many there were is shown while it takes longer than 1 s.
       path: where to write; .mp4 (h264) or .gif.
       fps: pictures per second; 30 is real time. A .gif can only last whole 1/100 s per picture.
 
@@ -49,7 +50,8 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
       OSError: the file cannot be written.
     """
     with Video(path, fps) as writer:
-        for image in frames:
+        # disable=None: no bar where stderr is not a terminal; a notebook always has one.
+        for image in tqdm.auto.tqdm(frames, unit='picture', delay=1, disable=None):
             writer.add(image)
 
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from trl_suite.errors import unknown
 from trl_suite.terrain import noise
-from trl_suite.terrain.generators import _NONE, Parameters, check
+from trl_suite.terrain.generators import _NONE, Parameters, check, check_new
 from trl_suite.terrain.layout import (
     GRID,
     Belts,
@@ -104,11 +104,11 @@ def register3d(
 
     Arguments and errors are those of `register`.
     """
-    if type_name in _generators and not replace:
-        raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
     checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
 
     def add(function: Function3D) -> Function3D:
+        known = _generators.get(type_name)
+        check_new(type_name, known and known.function, function, replace)
         _generators[type_name] = Generator3D(function, checked)
         return function
 

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.files import existing
-from trl_suite.terrain.generators import GENERATORS, Parameters, register_line
+from trl_suite.terrain.generators import GENERATORS, Parameters, check_new, register_line
 from trl_suite.terrain.layout import GRID, Layout
 from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.spatial import GENERATORS3D, register3d
@@ -66,7 +66,8 @@ def from_function(
       name: of the terrain and of its type; by default the function's.
       start_span: an episode starts anywhere from -start_span to start_span, m, along x and, in
         three dimensions, along y: there the ground is moved to the origin, by whole cells.
-      replace: whether an existing type of that name may be replaced.
+      replace: whether another function's type of that name may be replaced; what is written in
+        the same place, as a notebook's cell that is run again, always may, but for lambdas.
 
     Raises:
       ValueError: no name, a name that is taken, a function of none or more than two arguments, or
@@ -81,12 +82,8 @@ def from_function(
             raise ValueError(f'the function {function!r} has no name of its own; give name=')
     arguments = _arguments(function)
     taken = GENERATORS if arguments == 1 else GENERATORS3D
-    known = _functions.get((arguments, name))
-    # A notebook's cell, run again. Of a lambda nobody knows whether it is the same.
-    again = known is not None and _place(known) == _place(function)
-    again &= not _place(function)[1].endswith('<lambda>')
-    if name in taken and known is not function and not again and not replace:
-        raise ValueError(f'terrain type {name!r} exists; pass replace=True to replace it')
+    existing = taken[name].function if name in taken else None
+    check_new(name, _functions.get((arguments, name), existing), function, replace)
     _check_answer(name, function, arguments)
     _functions[arguments, name] = function
     _register(name, function, arguments)
@@ -95,11 +92,6 @@ def from_function(
 
 
 _functions: dict[tuple[int, str], HeightFunction] = {}
-
-
-def _place(function: HeightFunction) -> tuple[str, str]:
-    """Where a function is written."""
-    return getattr(function, '__module__', ''), getattr(function, '__qualname__', repr(function))
 
 
 def _arguments(function: HeightFunction) -> int:
