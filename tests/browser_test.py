@@ -13,7 +13,8 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.viewing import browser, overlays, replays, session, web_scene
+from trl_suite.rendering import overlays, replays, web_scene
+from trl_suite.viewing import browser, session
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 HILLS, SOCCER = 'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Soccer-v0'

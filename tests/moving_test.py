@@ -5,10 +5,10 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest
 from PIL import Image
 
-from trl_suite import acting, suite
-from trl_suite.commands import gallery
-from trl_suite.viewing import moving
-from trl_suite.viewing.web_scene import root_body
+from trl_suite import suite
+from trl_suite.environments import named_policies
+from trl_suite.rendering.web_scene import root_body
+from trl_suite.viewing import gallery, moving
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 FOREST = 'PD_Biped3D_HLC_Forest-v0'
@@ -18,7 +18,7 @@ SECONDS = 0.4
 
 def shot_of(id_, seconds=SECONDS):
     environment = suite.make(id_)
-    _, policy = acting.best(environment, id_)
+    _, policy = named_policies.best(environment, id_)
     return environment, moving._take(environment, policy, 1, 0.0, seconds)
 
 

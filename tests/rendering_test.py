@@ -14,7 +14,7 @@ from dm_control import composer
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.viewing import overlays
+from trl_suite.rendering import overlays
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -152,7 +152,7 @@ class GhostTest(parameterized.TestCase):
 
 class TerrainIsCurrentTest(parameterized.TestCase):
     def assert_drawn_around(self, environment, x):
-        ground, strip = drawn_ground(environment), environment.task.arena.strips[0]
+        ground, strip = drawn_ground(environment), environment.task.arena.grounds[0]
         for centre, _, top in ground:
             np.testing.assert_allclose(top, strip.height(centre), atol=1e-4)
         left, right = ground[:, 0] - ground[:, 1], ground[:, 0] + ground[:, 1]
@@ -303,7 +303,7 @@ class SpatialTest(FolderTest):
     def build(self, terrain, **options):
         environment = suite.build(
             'biped3d', terrain=terrain,
-            task_kwargs={'random': 1, 'terrain_map': True, 'start_phase': 0.0, **options},
+            task_kwargs={'random': 1, 'terrain_observation': 'height', 'start_phase': 0.0, **options},
         )  # fmt: skip
         environment.reset()
         return environment
@@ -351,8 +351,8 @@ class SpatialTest(FolderTest):
 
     def test_height_map_refusals(self):
         for make, options, message in (
-            (lambda: suite.make(GAPS), {}, 'the task Imitation.*no map'),
-            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, 'terrain_map=True'),
+            (lambda: suite.make(GAPS), {}, 'the task PlanarImitation.*no map'),
+            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, "terrain_observation='height'"),
             (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
             (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
         ):
@@ -414,7 +414,7 @@ class PlotTerrainTest(FolderTest):
             ('gaps', {'length': float('nan')}, 'length is nan'),
             ('gaps', {'length': -3.0}, 'length is -3.0'),
             ('gaps', {'seed': -1}, 'seed is -1'),
-            ('gaps', {'blend': float('nan')}, 'blend must be a number'),
+            ('gaps', {'terrain_level': float('nan')}, 'terrain_level must be a number'),
         ):
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 rendering.plot_terrain(terrain, self.folder / 'a.png', **options)
@@ -449,6 +449,7 @@ class MissingPartsTest(FolderTest):
         program = f"""
 import numpy as np
 from trl_suite import rendering, suite
+from trl_suite.rendering import overlays
 environment = suite.make({GAPS!r})
 environment.reset()
 environment.step(np.zeros(11))
@@ -470,6 +471,7 @@ except RuntimeError as error:
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite
+from trl_suite.rendering import overlays
 environment = suite.make({GAPS!r})
 environment.reset()
 print(rendering.frame(environment).std() > 10)

@@ -10,8 +10,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.commands import view
-from trl_suite.environment import Environment
+from trl_suite.cli import view
+from trl_suite.environments.environment import Environment
 from trl_suite.viewing import frames
 
 GAPS = cli_test.GAPS
@@ -21,7 +21,7 @@ FRAME = 1 / 30  # s
 
 with warnings.catch_warnings():  # GLFW's, where there is no screen
     warnings.simplefilter('ignore')
-    window = importlib.import_module('trl_suite.commands.window')
+    window = importlib.import_module('trl_suite.viewing.window')
 
 
 class CommandTest(cli_test.CommandTest):
@@ -73,7 +73,7 @@ class CommandTest(cli_test.CommandTest):
     def test_no_screen(self):
         nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}
         with mock.patch.dict('os.environ', nothing), mock.patch('sys.platform', 'linux'):
-            self.assert_refused('neither DISPLAY nor WAYLAND_DISPLAY .* --browser', 'view', GAPS)
+            self.assert_refused('neither DISPLAY nor WAYLAND_DISPLAY .*--browser', 'view', GAPS)
         with (
             mock.patch.dict('os.environ', {'DISPLAY': ':1', 'MUJOCO_GL': 'egl'}),
             mock.patch(
@@ -81,7 +81,7 @@ class CommandTest(cli_test.CommandTest):
             ),
         ):
             self.assert_refused(
-                r'GLFW can use \(Failed to open display :1\); .* --browser', 'view', GAPS
+                r'GLFW can use \(Failed to open display :1\); .*--browser', 'view', GAPS
             )
 
 
@@ -184,7 +184,7 @@ class WindowTest(parameterized.TestCase):
         self.assertGreater(screen.pictures[-1].std(), 10)
         body = shown._viewer.camera.settings.trackbodyid
         name = environment.physics.model.id2name(body, 'body')
-        self.assertEqual(name, f'{environment.task.character.row.name}/')
+        self.assertEqual(name, f'{environment.task.character.spec.name}/')
 
     def test_ground_that_changes_is_drawn_as_it_is(self):
         environment = suite.make(HILLS, {'random': 1})

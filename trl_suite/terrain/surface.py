@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.files import existing
-from trl_suite.terrain.generators import GENERATORS, Parameters, check_new, register_line
-from trl_suite.terrain.layout import GRID, Layout
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.spatial import GENERATORS3D, register3d
+from trl_suite.terrain.planar.generators import GENERATORS, Parameters, check_new, register_line
+from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
+from trl_suite.terrain.spatial.layout import GRID, Layout
+from trl_suite.util.files import existing
 
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
@@ -66,8 +66,7 @@ def from_function(
       name: of the terrain and of its type; by default the function's.
       start_span: an episode starts anywhere from -start_span to start_span, m, along x and, in
         three dimensions, along y: there the ground is moved to the origin, by whole cells.
-      replace: whether another function's type of that name may be replaced; what is written in
-        the same place, as a notebook's cell that is run again, always may, but for lambdas.
+      replace: whether an existing type of that name may be replaced.
 
     Raises:
       ValueError: no name, a name that is taken, a function of none or more than two arguments, or

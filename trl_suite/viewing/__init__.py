@@ -1,1 +1,1 @@
-"""Pictures, videos, replays and viewers of environments."""
+"""What one looks at: frames, videos, film strips, plots, windows."""

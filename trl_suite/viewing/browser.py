@@ -12,7 +12,6 @@ otherwise; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`.
 
 from __future__ import annotations
 
-import dataclasses
 import pathlib
 import queue
 import tempfile
@@ -23,11 +22,12 @@ from typing import Any, NamedTuple
 
 import mujoco
 
-from trl_suite import acting, suite
-from trl_suite import terrain as terrains
-from trl_suite.catalogue import Row
-from trl_suite.environment import Environment
-from trl_suite.viewing import overlays, panel, web_scene
+from trl_suite import suite
+from trl_suite.environments import named_policies
+from trl_suite.environments.environment import Environment
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.rendering import overlays, web_scene
+from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Policy, Session
 
 HOST, PORT = '127.0.0.1', 8080
@@ -45,7 +45,7 @@ DECORATION = {  # drawn by MuJoCo
 class Loaded(NamedTuple):
     """An environment with all policies that fit it, and which of them acts."""
 
-    spec: Row
+    spec: EnvSpec
     environment: Environment
     policies: dict[str, Policy]
     policy: str
@@ -66,7 +66,7 @@ class Browser:
 
     def __init__(
         self,
-        spec: str | Row,
+        spec: str | EnvSpec,
         policy: str = 'best',
         seed: int = 0,
         host: str = HOST,
@@ -76,7 +76,7 @@ class Browser:
 
         Args:
           spec: an id, an alias, or what `suite.combine` returns.
-          policy: 'best', one of `acting.POLICIES`, or an .npz file.
+          policy: 'best', one of `named_policies.POLICIES`, or an .npz file.
           seed: of the environment, and of random actions.
           host: address to listen on; '0.0.0.0' lets every machine of the network in.
           port: the first that is tried, then the next ones.
@@ -188,7 +188,7 @@ class Browser:
 
         self._ask(follow)
 
-    def choose_environment(self, spec: str | Row) -> None:
+    def choose_environment(self, spec: str | EnvSpec) -> None:
         """Shows another environment, with its best policy."""
 
         def choose() -> None:
@@ -202,9 +202,7 @@ class Browser:
 
         def choose() -> None:
             spec, _, _, policy = self._loaded
-            self._show(
-                self._load(dataclasses.replace(spec, terrain=terrains.load(terrain)), policy)
-            )
+            self._show(self._load(spec.with_terrain(terrain), policy))
 
         self._ask(choose)
 
@@ -214,7 +212,7 @@ class Browser:
         def choose() -> None:
             spec, environment, policies, _ = self._loaded
             if name not in policies:
-                policies[name] = acting.policy(name, environment, spec.id, self.seed)
+                policies[name] = named_policies.policy(name, environment, spec.id, self.seed)
             self._show(Loaded(spec, environment, policies, name))
 
         self._ask(choose)
@@ -237,14 +235,14 @@ class Browser:
             except (ValueError, OSError, RuntimeError) as error:
                 self._panel.tell(' '.join(str(error).split()))
 
-    def _load(self, spec: str | Row, policy: str) -> Loaded:
+    def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
         spec = suite.find(spec) if isinstance(spec, str) else spec
-        environment = suite.build_row(spec, {'random': self.seed}, {})
-        policies = acting.available(environment, spec.id, self.seed)
+        environment = suite.build_environment(spec, {'random': self.seed}, {})
+        policies = named_policies.available(environment, spec.id, self.seed)
         if policy == 'best':
             policy = next(iter(policies))
         elif policy not in policies:
-            policies[policy] = acting.policy(policy, environment, spec.id, self.seed)
+            policies[policy] = named_policies.policy(policy, environment, spec.id, self.seed)
         return Loaded(spec, environment, policies, policy)
 
     def _show(self, loaded: Loaded) -> None:

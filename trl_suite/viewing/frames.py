@@ -11,7 +11,7 @@ import numpy as np
 from trl_suite import rendering
 
 if TYPE_CHECKING:
-    from trl_suite.environment import Environment
+    from trl_suite.environments.environment import Environment
 
 
 class Frames(dm_env.Environment):

@@ -10,11 +10,12 @@ import mujoco
 import numpy as np
 from dm_control.mujoco import engine
 
-from trl_suite import acting, rendering, suite
-from trl_suite.environment import Environment
-from trl_suite.files import Path, check_path, replacing
-from trl_suite.viewing import overlays
-from trl_suite.viewing.web_scene import root_body
+from trl_suite import rendering, suite
+from trl_suite.environments import named_policies
+from trl_suite.environments.environment import Environment
+from trl_suite.rendering import overlays
+from trl_suite.rendering.web_scene import root_body
+from trl_suite.util.files import Path, check_path, replacing
 
 SUFFIXES = ('.webp',)
 SIZE = (300, 480)  # height and width, pixels
@@ -60,7 +61,7 @@ class Shot(NamedTuple):
 def moving_picture(
     id: str, seconds: float = SECONDS, size: tuple[int, int] = SIZE
 ) -> list[np.ndarray]:
-    """Draws an environment under its best policy; see `acting.best`.
+    """Draws an environment under its best policy; see `named_policies.best`.
 
     Args:
       id: of the environment.
@@ -75,7 +76,7 @@ def moving_picture(
     """
     id = suite.find(id).id
     environment = suite.make(id)
-    _, policy = acting.best(environment, id)
+    _, policy = named_policies.best(environment, id)
     seeds, begin = ([SCENES[id][0]], SCENES[id][1]) if id in SCENES else (SEEDS, 0.0)
     best: Shot | None = None
     for seed in seeds:

@@ -9,9 +9,9 @@ import numpy as np
 
 from trl_suite import suite
 from trl_suite import terrain as terrains
-from trl_suite.terrain.generators import LIMITS
+from trl_suite.rendering.web_scene import load_viser
+from trl_suite.terrain.planar.generators import LIMITS
 from trl_suite.viewing.session import PUSHES, Session
-from trl_suite.viewing.web_scene import load_viser
 
 if TYPE_CHECKING:
     from trl_suite.viewing.browser import Browser, Loaded

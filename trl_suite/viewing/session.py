@@ -10,11 +10,11 @@ import dm_env
 import mujoco
 import numpy as np
 
-from trl_suite import errors
+from trl_suite.util import errors
 from trl_suite.viewing.frames import Frames
 
 if TYPE_CHECKING:
-    from trl_suite.environment import Environment
+    from trl_suite.environments.environment import Environment
 
 Policy = Callable[[dm_env.TimeStep], np.ndarray]
 

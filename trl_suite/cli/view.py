@@ -1,0 +1,98 @@
+"""`trl-suite view`: dm_control's viewer, or one in the web browser, with a policy that acts.
+
+Steps that last longer than 1/30 s (gaits, plans of footsteps) are shown frame by frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import warnings
+from typing import TYPE_CHECKING, Any
+
+from trl_suite import rendering
+from trl_suite.cli import engine
+from trl_suite.environments import named_policies as acting
+from trl_suite.viewing.frames import Frames
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+
+INSTEAD = 'without one, look at it in a web browser (--browser), from another machine too'
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Opens a window, and returns when it is closed; or serves web browsers until interrupted."""
+    if arguments.browser:
+        in_browser(arguments)
+        return
+    check_screen()
+    suite = engine.load()
+    environment = suite.make(arguments.id, {'random': arguments.seed})
+    name = arguments.policy
+    if name == 'best':
+        name, _ = acting.best(environment, arguments.id)
+
+    def policy() -> rendering.Policy:
+        return acting.policy(name, environment, arguments.id, arguments.seed)
+
+    policy()(environment.reset())  # what cannot act says so before a window opens
+    environment.random_state.seed(arguments.seed)
+    view(environment, policy(), f'{suite.find(arguments.id).id}: {name}')
+
+
+def in_browser(arguments: argparse.Namespace) -> None:
+    """Shows an environment to web browsers until a keyboard interrupt."""
+    viewer = engine.load('trl_suite.viewing.browser').Browser(
+        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port
+    )
+    print(f'{viewer.url} shows it; Ctrl+C ends this', flush=True)
+    viewer.run()
+
+
+def check_screen() -> None:
+    """Makes sure that a window can be opened, and lets dm_control draw by way of GLFW.
+
+    Raises:
+      RuntimeError: there is no screen, or none that GLFW can use; the message says what to do.
+    """
+    if sys.platform == 'linux' and not (
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    ):
+        raise RuntimeError(
+            'a window needs a screen, but neither DISPLAY nor WAYLAND_DISPLAY is set; ' + INSTEAD
+        )
+    import glfw  # dm_control brings it
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        if not glfw.init():
+            reason = ' '.join(str(each.message) for each in caught) or 'it does not say why'
+            raise RuntimeError(f'a window needs a screen that GLFW can use ({reason}); {INSTEAD}')
+    # dm_control draws windows with no other library. It reads the variable when it is imported.
+    os.environ['MUJOCO_GL'] = 'glfw'
+    render = sys.modules.get('dm_control._render')
+    if render is not None and getattr(render, 'BACKEND', None) != 'glfw':
+        importlib.reload(render)
+
+
+def view(environment: Environment, policy: rendering.Policy, title: str) -> None:
+    """Shows an environment until the window is closed.
+
+    Args:
+      environment: begins a new episode.
+      policy: time step -> action.
+      title: of the window.
+
+    Raises:
+      RuntimeError: no window can be opened.
+    """
+    from trl_suite.viewing.window import Window
+
+    frames: Any = environment
+    if hasattr(environment.task, 'watch'):
+        frames = Frames(environment, policy)
+        policy = frames.policy
+    Window(environment, title).launch(frames, policy)

@@ -1,0 +1,37 @@
+"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps."""
+
+from trl_suite.rendering.drawing import Policy, check_gl, frame, frames, no_gl, replay, watching
+from trl_suite.rendering.pictures import (
+    CONTROL_FPS,
+    IMAGE_SUFFIXES,
+    REPLAY_SUFFIXES,
+    STRIP_MARGIN,
+    VIDEO_SUFFIXES,
+    Video,
+    film_strip,
+    height_map,
+    plot_terrain,
+    spread,
+    video,
+)
+
+__all__ = [
+    'CONTROL_FPS',
+    'IMAGE_SUFFIXES',
+    'REPLAY_SUFFIXES',
+    'STRIP_MARGIN',
+    'VIDEO_SUFFIXES',
+    'Policy',
+    'Video',
+    'check_gl',
+    'film_strip',
+    'frame',
+    'frames',
+    'height_map',
+    'no_gl',
+    'plot_terrain',
+    'replay',
+    'spread',
+    'video',
+    'watching',
+]  # fmt: skip

@@ -1,0 +1,235 @@
+"""Pictures without a screen: frames, videos, film strips, plots of terrain, height maps.
+
+    from trl_suite import suite
+    from trl_suite import rendering
+
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'random': 1})
+    environment.reset()
+    image = rendering.frame(environment, ghost=True)  # (480, 640, 3) uint8
+
+    policy = lambda time_step: environment.task.clip_action(0)
+    rendering.video(rendering.frames(environment, policy, steps=90), 'rollout.mp4')
+    rendering.replay(environment, policy, 'rollout.html')  # looked at from all sides
+
+Drawing needs an OpenGL library, chosen by the environment variable MUJOCO_GL before Python starts:
+egl or osmesa without a screen, glfw with one. What becomes of frames, and pictures that need no
+OpenGL, are `trl_suite.rendering.pictures`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import operator
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite.util import errors
+
+if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
+    from dm_control import composer
+
+    from trl_suite.rendering.replays import Replay
+    from trl_suite.util.files import Path
+
+
+Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
+
+
+def frame(
+    environment: composer.Environment,
+    height: int = 480,
+    width: int = 640,
+    camera: str | int = 'side',
+    ghost: bool = False,
+) -> np.ndarray:
+    """Draws the current state, and what the task marks: places, goals, directions.
+
+    Args:
+      environment: any composer environment, after `reset`.
+      height: pixels.
+      width: pixels.
+      camera: name of a camera, short ('side', 'front') or full ('biped2d/side'), or its number; -1
+        is a camera that looks at the whole model.
+      ghost: also draw the reference clip, translucent and set back a little to the side. It walks
+        its own way from the start of the episode, so the distance between the two shows.
+
+    Returns:
+      The picture, shape (height, width, 3), uint8.
+
+    Raises:
+      ValueError: unknown camera, a size that is not positive or above the model's limit, or a ghost
+        where the task has no reference clip.
+      RuntimeError: there is no OpenGL to draw with; the message names MUJOCO_GL and its choices.
+    """
+    physics = environment.physics
+    limits = physics.model.vis.global_
+    for name, size, limit in (
+        ('height', height, limits.offheight),
+        ('width', width, limits.offwidth),
+    ):
+        if not 0 < operator.index(size) <= limit:
+            raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
+    from trl_suite.rendering import overlays
+
+    drawn = overlays.of_task(environment.task, ghost)
+    camera_id = _camera(physics, camera)
+    check_gl(physics)
+
+    def add(physics: Any, scene: Any) -> None:
+        for overlay in drawn:
+            overlay(physics, scene)
+
+    return physics.render(height, width, camera_id, scene_callback=add if drawn else None)
+
+
+def frames(
+    environment: composer.Environment, policy: Policy, steps: int = 256, **options: Any
+) -> Iterator[np.ndarray]:
+    """Runs a policy from a reset on, over ends of episodes, and draws every state.
+
+    Where a step lasts longer than 1/30 s (gaits), every 1/30 s is drawn instead of every state.
+
+    Args:
+      environment: is reset and stepped.
+      policy: time step -> action; not asked at the end of an episode.
+      steps: control steps.
+      **options: of `frame`.
+
+    Yields:
+      One picture per state: steps of them, one more for every reset.
+    """
+    within: list[np.ndarray] = []
+
+    def look() -> None:
+        within.append(frame(environment, **options))
+
+    time_step = environment.reset()
+    yield frame(environment, **options)
+    for _ in range(steps):
+        if time_step.last():
+            time_step = environment.reset()
+            yield frame(environment, **options)
+        within.clear()
+        with watching(environment, look) as watched:
+            time_step = environment.step(policy(time_step))
+        if not watched:
+            look()
+        yield from within
+
+
+def replay(
+    environment: composer.Environment,
+    policy: Policy,
+    path: Path | None = None,
+    steps: int = 256,
+    ghost: bool = False,
+) -> Replay:
+    """Runs a policy from a reset on, over ends of episodes, and records it as a page.
+
+    The page shows the episodes from all sides, with a slider of time, and needs no network. It needs
+    no OpenGL to be made.
+
+    Args:
+      environment: is reset and stepped.
+      policy: time step -> action.
+      path: where to write it, .html; not written if None.
+      steps: control steps.
+      ghost: also show the reference clip.
+
+    Returns:
+      The recording, which notebooks show; see `trl_suite.rendering.replays.Replay` for its errors.
+    """
+    from trl_suite.rendering.replays import Replay
+
+    time_step = environment.reset()
+    with Replay(environment, path, ghost=ghost) as recording:
+        recording.add(jump=True)
+        for _ in range(steps):
+            if time_step.last():
+                time_step = environment.reset()
+                recording.add(jump=True)
+            with watching(environment, recording.add) as watched:
+                time_step = environment.step(policy(time_step))
+            if not watched:
+                recording.add()
+    return recording
+
+
+@contextlib.contextmanager
+def watching(environment: composer.Environment, look: Callable[[], None]) -> Iterator[bool]:
+    """Has `look` called every 1/30 s where steps last longer; yields whether that is so."""
+    task: Any = environment.task
+    watched = hasattr(task, 'watch')
+    if watched:
+        task.watch = look
+    try:
+        yield watched
+    finally:
+        if watched:
+            task.watch = None
+
+
+def _camera(physics: Any, camera: str | int) -> int:
+    names = [physics.model.id2name(i, 'camera') for i in range(physics.model.ncam)]
+    if not isinstance(camera, str):
+        if not -1 <= operator.index(camera) < len(names):
+            raise ValueError(f'camera is {camera}; expected -1 to {len(names) - 1}')
+        return int(camera)
+    if camera and camera in names:
+        return names.index(camera)
+    found = [i for i, name in enumerate(names) if name and name.rpartition('/')[2] == camera]
+    if len(found) > 1:
+        raise ValueError(f'several cameras are named {camera!r}: {[names[i] for i in found]}')
+    if not found:
+        known = {*filter(None, names), *(n.rpartition('/')[2] for n in names if n)}
+        raise ValueError(errors.unknown('camera', camera, known))
+    return found[0]
+
+
+def check_gl(physics: Any) -> None:
+    """Makes the drawing context at the first picture."""
+    try:
+        _use_chosen_library()
+        _ = physics.contexts
+    # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
+    except Exception as error:
+        raise RuntimeError(no_gl(error)) from error
+
+
+def _use_chosen_library() -> None:
+    """Lets dm_control take the library that MUJOCO_GL names now, if the one it took cannot draw.
+
+    dm_control reads the variable when it is imported. Who imports it before this package, as sorted
+    imports do, leaves it with GLFW, also where there is no screen.
+    """
+    render = sys.modules.get('dm_control._render')
+    if getattr(render, 'BACKEND', None) != 'glfw' or _screen():
+        return
+    if os.environ.get('MUJOCO_GL') not in ('egl', 'osmesa'):
+        # GLFW itself would warn, and leave a half-made context that fails once more at exit.
+        raise RuntimeError('GLFW finds no screen')
+    assert render is not None
+    importlib.reload(render)
+
+
+def _screen() -> bool:
+    return sys.platform != 'linux' or bool(
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    )
+
+
+def no_gl(error: Exception) -> str:
+    """Returns the sentence for a machine on which nothing can be drawn."""
+    set_to = os.environ.get('MUJOCO_GL')
+    state = 'is not set' if set_to is None else f'is {set_to!r}'
+    reason = str(error).strip().partition('\n')[0].rstrip('.')
+    return (
+        f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
+        'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
+        'disable (no pictures). `trl-suite doctor` tells which can draw here'
+    )
