@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from trl_suite import rendering, suite
+from trl_suite.adapters.gym import flat as flat_info
 from trl_suite.gym import SuiteEnv, SuiteVectorEnv
-from trl_suite.gym import flat as flat_info
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'

@@ -41,7 +41,7 @@ class MovingTest(FolderTest):
         smooth = moving._smooth(path)
         self.assertEqual(smooth.shape, path.shape)
         np.testing.assert_allclose(np.diff(smooth[10:-10, 0]), 1, atol=1e-2)
-        self.assertLess(np.abs(smooth[10:-10, 2]).max(), 0.02)
+        self.assertLess(np.abs(smooth[10:-10, 2]).max(), 0.05)  # of 0.1
 
     def test_no_obstacle_hides_the_character(self):
         environment, shot = shot_of(FOREST, 1.0)
@@ -73,6 +73,7 @@ class MovingTest(FolderTest):
             self.assertEqual((saved.n_frames, saved.info['loop']), (7, 0))
             self.assertEqual(saved.size, SIZE[::-1])
             saved.seek(1)
+            saved.load()
             self.assertEqual(saved.info['duration'], 67)
 
     def test_every_environment_has_one(self):
