@@ -188,6 +188,7 @@ def every_row(id_):
         def test_specs(self):
             spec = self.environment.action_spec()
             self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
+            self.assertEqual((spec.minimum.shape, spec.maximum.shape), (spec.shape,) * 2)
             self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
 
         def test_blocks(self):

@@ -1,9 +1,12 @@
 """Pictures show what is there, files are whole or absent, and failures say what to do."""
 
+import contextlib
+import io
 import itertools
 import os
 import subprocess
 import sys
+import time
 from unittest import mock
 
 import imageio.v3 as iio
@@ -202,6 +205,21 @@ class VideoTest(FolderTest):
         self.assertEqual(frames.shape, (12, 32, 48, 3))
         np.testing.assert_allclose(frames.mean((1, 2, 3)), 10 * np.arange(12), atol=4)
         self.assert_only('a.mp4')
+
+    def test_progress(self):
+        """Who waits for longer than a second sees how many pictures there are."""
+
+        def slowly():
+            for image in numbered(3):
+                time.sleep(0.6)
+                yield image
+
+        with contextlib.redirect_stderr(io.StringIO()) as shown:
+            rendering.video(numbered(3), self.folder / 'a.gif')
+            self.assertEqual(shown.getvalue(), '')
+            shown.isatty = lambda: True
+            rendering.video(slowly(), self.folder / 'a.gif')
+        self.assertRegex(shown.getvalue(), r'\d+picture ')
 
     def test_gif(self):
         path = self.folder / 'a.gif'
@@ -449,7 +467,6 @@ class MissingPartsTest(FolderTest):
         program = f"""
 import numpy as np
 from trl_suite import rendering, suite
-from trl_suite.rendering import overlays
 environment = suite.make({GAPS!r})
 environment.reset()
 environment.step(np.zeros(11))
@@ -471,7 +488,6 @@ except RuntimeError as error:
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite
-from trl_suite.rendering import overlays
 environment = suite.make({GAPS!r})
 environment.reset()
 print(rendering.frame(environment).std() > 10)
