@@ -6,6 +6,7 @@ from setuptools import find_packages, setup
 
 TORCH = 'torch>=2.5,<2.14'
 BVH = 'pybvh>=0.9,<1'
+VISER = 'viser>=1.1,<2'
 
 setup(
     name='trl_suite',
@@ -61,6 +62,7 @@ setup(
     ],
     extras_require={
         'video': ['imageio[ffmpeg]', 'matplotlib'],
+        'viewer': [VISER],
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
@@ -78,9 +80,11 @@ setup(
             'hypothesis>=6',
             'imageio[ffmpeg]',
             'matplotlib',
+            'playwright>=1.50',  # drives Chromium, which the tests look for on the system
             'scipy',
             BVH,
             TORCH,
+            VISER,
         ],
         'notebooks': [  # to run and store those of colab/
             'ipykernel',

@@ -139,7 +139,7 @@ def home() -> str:
         'trl_suite',
         'The Terrain RL Simulator (Berseth, Peng, van de Panne 2018) on MuJoCo: locomotion over random '
         'terrain, in the style of `dm_control.suite`.',
-        '![Six environments of the suite](pictures/suite.jpg)',
+        '![Six environments of the suite](pictures/suite.webp)',
         table(
             ('reference, generated from the code', ''),
             (

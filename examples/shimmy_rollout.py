@@ -5,10 +5,12 @@ For programs that use Shimmy to wrap dm_control. The suite's own Gymnasium inter
 `pip install 'trl_suite[shimmy]'`.
 """
 
+# First: without a screen it lets dm_control, which Shimmy imports, draw by EGL.
+from trl_suite import suite  # isort: split
+
 import gymnasium
 from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
-from trl_suite import suite
 from trl_suite.util.program import begin_script
 
 

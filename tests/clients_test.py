@@ -5,9 +5,11 @@ import importlib
 import importlib.util
 import io
 import math
+import os
 import pathlib
 import re
 import runpy
+import subprocess
 import sys
 import unittest
 from unittest import mock
@@ -156,6 +158,15 @@ class TorchRLTest(parameterized.TestCase):
                 if terminated or truncated:
                     observation, _ = single.reset()
 
+    def test_one_process_per_simulation(self):
+        from torchrl.envs import GymEnv
+
+        environment = GymEnv(f'trl_suite.gym:trl_suite/{GAPS}', num_envs=2)
+        self.addCleanup(environment.close)
+        found = environment.rollout(40, break_when_any_done=False)
+        self.assertEqual(found['next', 'reward'].shape, (2, 40, 1))
+        self.assertGreater(int(found['next', 'done'].sum()), 0)
+
     def test_code_of_the_page_runs(self):
         names = run_page('torchrl')
         self.assertEqual(names['simulations'].batch_size, (16,))
@@ -201,6 +212,21 @@ class ShimmyTest(parameterized.TestCase):
         expected = suite.make(FLAT, {'random': 1}).reset().observation
         for name, block in run_page('shimmy')['observation'].items():
             np.testing.assert_array_equal(block, expected[name])
+
+    def test_page_draws_without_a_screen(self):
+        page = (ROOT / 'docs' / 'clients.md').read_text(encoding='utf-8')
+        (code,) = (
+            found
+            for found in re.findall('```python\n(.*?)```', page, re.DOTALL)
+            if 'shimmy' in found
+        )
+        nothing = ('MUJOCO_GL', 'PYOPENGL_PLATFORM', 'DISPLAY', 'WAYLAND_DISPLAY')
+        variables = {name: value for name, value in os.environ.items() if name not in nothing}
+        code += '\nprint(env.unwrapped._env.physics.render(9, 9).shape)'
+        found = subprocess.run(
+            [sys.executable, '-c', code], env=variables, capture_output=True, text=True, check=False
+        )
+        self.assertIn('(9, 9, 3)', found.stdout, found.stderr)
 
     def test_example_runs(self):
         out = output('shimmy_rollout')

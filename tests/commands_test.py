@@ -191,7 +191,7 @@ class GalleryTest(CommandTest):
             ('families', len(suite.TASKS_BY_DOMAIN)),
         ):  # fmt: skip
             self.assertLen([path for path in paths if path.startswith(f'{folder}/')], count, folder)
-        self.assertIn('suite.jpg', paths)
+        self.assertIn('suite.webp', paths)
         self.assertIn('terrains/gaps.png', paths)
         self.assertIn('terrains/plane.jpg', paths)
         self.assertLen([item for item in items if item.source], 2 * shipped)

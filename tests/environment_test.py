@@ -188,6 +188,7 @@ def every_environment(id_):
         def test_action_spec_is_minus_1_to_1(self):
             spec = self.environment.action_spec()
             self.assertEqual(len(spec.name.split('\t')), spec.shape[0])
+            self.assertEqual((spec.minimum.shape, spec.maximum.shape), (spec.shape,) * 2)
             self.assertTrue((spec.minimum == -1).all() and (spec.maximum == 1).all())
 
         def test_observation_blocks_have_the_expected_sizes(self):

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from trl_suite import rendering, suite
+from trl_suite.adapters.gym import flat as flat_info
 from trl_suite.gym import SuiteEnv, SuiteVectorEnv
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -26,6 +27,11 @@ SMALL = {'height': 48, 'width': 64}
 LONG = ('gait', 'goal_navigation', 'soccer')  # rules of tasks whose steps last many control steps
 # Two for each Box: unbounded values are declared without bounds.
 UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
+
+
+def terms(info):
+    """Returns the reward terms in the info of an environment."""
+    return [value for name, value in info.items() if name.startswith('reward_')]
 
 
 def python(code, **variables):
@@ -94,13 +100,14 @@ def every_id(id_):
                 if not any(known in str(each.message) for known in UNAVOIDABLE)
             ]
             self.assertEqual(others, [])
-            self.assertIsNone(self.env.spec.max_episode_steps)  # else there would be two limits
+            self.assertEqual(self.env.spec.max_episode_steps, spec.step_limit)
+            self.assertIsNone(self.env.unwrapped.environment.step_limit)  # else there were two
 
         def test_episode_of_a_seed_is_that_of_the_suite(self):
             env = self.env
             env.reset(seed=1)  # earlier episodes have no effect
             observation, info = env.reset(seed=7)
-            self.assertEqual(set(info['reward_terms'].values()), {0.0})
+            self.assertEqual(set(terms(info)), {0.0})
             theirs = suite.make(id_, {'random': 7}, {'flat_observation': True})
             flat = [theirs.reset().observation['observations']]
             ours = [observation]
@@ -113,8 +120,8 @@ def every_id(id_):
                 ours.append(observation)
                 self.assertEqual(reward, time_step.reward)
                 self.assertEqual(terminated or truncated, time_step.last())
-                self.assertEqual(info, theirs.info)
-                self.assertAlmostEqual(sum(info['reward_terms'].values()), reward, delta=1e-12)
+                self.assertEqual(info, flat_info(theirs.info))
+                self.assertAlmostEqual(sum(terms(info)), reward, delta=1e-12)
             self.assertEqual(ours[0].dtype, np.float32)
             np.testing.assert_array_equal(ours, np.array(flat, np.float32))
 
@@ -410,6 +417,24 @@ class VectorTest(Same, parameterized.TestCase):
             _, _, terminated, over, _ = own.step(action[0])
             self.assertEqual((terminated, over), (our[2][0], our[3][0]))
         self.assertEqual(count, expected)
+
+    def test_one_limit(self):
+        """That of `gymnasium.make` replaces that of the row, as of Gymnasium's own environments."""
+        id_ = f'trl_suite/{FLAT}'
+        self.assertEqual(gymnasium.make(id_).spec.max_episode_steps, 256)
+        longer = gymnasium.make(id_, max_episode_steps=999)
+        self.assertEqual(longer.spec.max_episode_steps, 999)
+        self.assertIsNone(longer.unwrapped.environment.step_limit)
+        for steps, expected in ((None, 256), (999, 999), (-1, None), (9, 9)):
+            options = {} if steps is None else {'max_episode_steps': steps}
+            self.assertEqual(SuiteEnv(FLAT, **options).environment.step_limit, expected)
+            envs = gymnasium.make_vec(id_, 2, num_threads=1, **options)
+            self.assertEqual(envs.environment.step_limit, expected)
+
+    def test_time_aware(self):
+        env = gymnasium.wrappers.TimeAwareObservation(gymnasium.make(f'trl_suite/{FLAT}'))
+        env.reset(seed=1)
+        self.assertEqual(env.step(np.zeros(env.action_space.shape, np.float32))[0][-1], 1)
 
     @parameterized.parameters(0, 2.5, -3)
     def test_invalid_max_episode_steps_are_rejected(self, steps):

@@ -561,6 +561,20 @@ class TerrainTest(Folder):
         again = terrain.PlanarGround(heights(0.5), 0)
         self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
 
+    @parameterized.parameters(
+        (terrain.register, lambda parameters, length, rng: None),
+        (terrain.register3d, lambda parameters, rng: None),
+    )
+    def test_a_type_may_be_registered_again_by_the_same_function(self, register, other):
+        for _ in range(2):
+
+            @register(f'{register.__name__}_again', {'ToothW': 1.0})
+            def teeth(*arguments):
+                raise NotImplementedError
+
+        with self.assertRaisesRegex(ValueError, 'exists; pass replace=True to replace it'):
+            register(f'{register.__name__}_again')(other)
+
     def test_another_lambda_of_the_same_name_is_rejected(self):
         for factor in (1.0, 2.0):
             with (

@@ -1,9 +1,12 @@
 """Frames show the current state, files are complete or absent, errors name remedies."""
 
+import contextlib
+import io
 import itertools
 import os
 import subprocess
 import sys
+import time
 from unittest import mock
 
 import imageio.v3 as iio
@@ -14,7 +17,7 @@ from dm_control import composer
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.rendering import drawing
+from trl_suite.rendering import overlays
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -102,7 +105,7 @@ class GhostTest(parameterized.TestCase):
 
         def look(physics, scene):
             before = scene.ngeom
-            drawing._ghost(environment.task)(physics, scene)
+            overlays.ghost(environment.task)(physics, scene)
             for geom in scene.geoms[before : scene.ngeom]:
                 shown[geom.objid] = np.array(geom.pos), np.array(geom.rgba)
 
@@ -114,7 +117,7 @@ class GhostTest(parameterized.TestCase):
         ]  # fmt: skip
         self.assertCountEqual(shown, looks)
         for i, (position, colour) in shown.items():
-            beside = np.array([0, drawing.GHOST_BEHIND, -lift])
+            beside = np.array([0, overlays.GHOST_BEHIND, -lift])
             character = environment.physics.data.geom_xpos[i]
             np.testing.assert_allclose(position, character + beside, atol=1e-5)
             self.assertLess(colour[3], 1)
@@ -202,6 +205,21 @@ class VideoTest(FolderTest):
         self.assertEqual(frames.shape, (12, 32, 48, 3))
         np.testing.assert_allclose(frames.mean((1, 2, 3)), 10 * np.arange(12), atol=4)
         self.assert_only('a.mp4')
+
+    def test_progress(self):
+        """Who waits for longer than a second sees how many pictures there are."""
+
+        def slowly():
+            for image in numbered(3):
+                time.sleep(0.6)
+                yield image
+
+        with contextlib.redirect_stderr(io.StringIO()) as shown:
+            rendering.video(numbered(3), self.folder / 'a.gif')
+            self.assertEqual(shown.getvalue(), '')
+            shown.isatty = lambda: True
+            rendering.video(slowly(), self.folder / 'a.gif')
+        self.assertRegex(shown.getvalue(), r'\d+picture ')
 
     def test_gif(self):
         path = self.folder / 'a.gif'
@@ -415,7 +433,7 @@ class SpatialTest(FolderTest):
         )
         environment.reset()
         colours = []
-        ghost = drawing._ghost(environment.task)
+        ghost = overlays.ghost(environment.task)
 
         def look(physics, scene):
             before = scene.ngeom
@@ -428,7 +446,7 @@ class SpatialTest(FolderTest):
         environment.physics.render(48, 64, scene_callback=look)
         self.assertEqual({alpha for mover, alpha in colours if mover}, {0.0})
         shown = {round(alpha, 6) for mover, alpha in colours if not mover}
-        self.assertEqual(shown, {drawing.GHOST_COLOUR[3]})
+        self.assertEqual(shown, {overlays.GHOST_COLOUR[3]})
 
     def test_maps_of_terrain(self):
         for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
@@ -498,7 +516,6 @@ class MissingPartsTest(FolderTest):
         program = f"""
 import numpy as np
 from trl_suite import rendering, suite
-from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 environment.step(np.zeros(11))
@@ -520,7 +537,6 @@ except RuntimeError as error:
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite
-from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 print(rendering.frame(environment).std() > 10)

@@ -12,6 +12,7 @@ from absl.testing import absltest, parameterized
 from trl_suite import suite
 from trl_suite.cli import view
 from trl_suite.environments.environment import Environment
+from trl_suite.viewing import frames
 
 GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
@@ -72,9 +73,7 @@ class CommandTest(cli_test.CommandTest):
     def test_a_missing_screen_is_an_error(self):
         nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}
         with mock.patch.dict('os.environ', nothing), mock.patch('sys.platform', 'linux'):
-            self.assert_refused(
-                'neither DISPLAY nor WAYLAND_DISPLAY .* trl-suite rollout', 'view', GAPS
-            )
+            self.assert_refused('neither DISPLAY nor WAYLAND_DISPLAY .*--browser', 'view', GAPS)
         with (
             mock.patch.dict('os.environ', {'DISPLAY': ':1', 'MUJOCO_GL': 'egl'}),
             mock.patch(
@@ -82,7 +81,7 @@ class CommandTest(cli_test.CommandTest):
             ),
         ):
             self.assert_refused(
-                r'GLFW can use \(Failed to open display :1\); .* --video', 'view', GAPS
+                r'GLFW can use \(Failed to open display :1\); .*--browser', 'view', GAPS
             )
 
 
@@ -96,36 +95,36 @@ class FramesTest(parameterized.TestCase):
             asked.append(random.uniform(-0.1, 0.1, expected.action_spec().shape))
             return asked[-1]
 
-        frames = view.Frames(environment, policy)
-        time_step, end, times = frames.reset(), expected.reset(), [0.0]
+        played = frames.Frames(environment, policy)
+        time_step, end, times = played.reset(), expected.reset(), [0.0]
         for step in range(3):
-            while len(asked) <= step or frames._left:
-                time_step = frames.step(frames.policy(time_step))
-                times.append(frames.physics.data.time)
+            while len(asked) <= step or played._left:
+                time_step = played.step(played.policy(time_step))
+                times.append(played.physics.data.time)
             self.assertLen(asked, step + 1)
             end = expected.step(asked[-1])
             self.assertEqual((time_step.reward, time_step.discount), (end.reward, end.discount))
             for block, value in end.observation.items():
                 np.testing.assert_array_equal(time_step.observation[block], value)
-            np.testing.assert_array_equal(frames.physics.data.qpos, expected.physics.data.qpos)
+            np.testing.assert_array_equal(played.physics.data.qpos, expected.physics.data.qpos)
         passed = np.diff(times)
         self.assertGreater(len(passed), 25)
         self.assertBetween(passed.min(), -1e-9, FRAME)
         self.assertLess(passed.max(), FRAME + 1e-9)
 
     def test_a_reset_within_a_step(self):
-        frames = view.Frames(suite.make(DOG, {'random': 2}), lambda time_step: np.zeros(29))
-        time_step = frames.reset()
+        played = frames.Frames(suite.make(DOG, {'random': 2}), lambda time_step: np.zeros(29))
+        time_step = played.reset()
         for _ in range(3):
-            time_step = frames.step(frames.policy(time_step))
+            time_step = played.step(played.policy(time_step))
         self.assertTrue(time_step.mid())
-        self.assertNotEmpty(frames._left)
-        self.assertTrue(frames.reset().first())
-        self.assertEqual(frames.physics.data.time, 0)
-        self.assertLess(frames.step(np.zeros(29)) and frames.physics.data.time, 1.01 * FRAME)
+        self.assertNotEmpty(played._left)
+        self.assertTrue(played.reset().first())
+        self.assertEqual(played.physics.data.time, 0)
+        self.assertLess(played.step(np.zeros(29)) and played.physics.data.time, 1.01 * FRAME)
 
     def test_only_long_steps(self):
-        for id_, kind in ((DOG, view.Frames), (GAPS, Environment)):
+        for id_, kind in ((DOG, frames.Frames), (GAPS, Environment)):
             environment = suite.make(id_)
             with mock.patch.object(window, 'Window') as shown:
                 view.view(environment, lambda time_step: np.zeros(29), 'a title')

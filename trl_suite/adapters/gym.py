@@ -10,8 +10,8 @@ Gymnasium 1 does not register third-party environments automatically: without th
 must name the module, as in 'trl_suite.adapters.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. An
 environment without an id is wrapped explicitly, e.g.
 `SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the
-environment's step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward),
-'fell', 'diverged', 'distance' (m).
+environment's step limit truncates it; `info` has 'fell', 'diverged', 'distance' (m), and one entry
+'reward_NAME' per reward term: their sum is the reward.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from numpy.typing import DTypeLike
 from trl_suite import rendering, suite
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.vector import VectorEnvironment
-from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.registry import catalogue
+from trl_suite.registry.spec import EnvSpec
 from trl_suite.util import errors
 
 try:
@@ -67,8 +68,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
           flat_observation: return all blocks concatenated as one vector, else a dict of blocks.
           task_kwargs: as for `suite.load`.
           dtype: of observations and actions, float32 or float64.
-          max_episode_steps: truncate after this number of steps, if the environment's own limit is
-            not smaller. `gymnasium.make` uses its own wrapper for this.
+          max_episode_steps: truncate after this number of steps, instead of the step limit of the id;
+            -1 for never. If `task_kwargs` has a 'step_limit', the smaller one counts.
           render_mode: 'rgb_array', or None for no rendering.
           render_kwargs: options of `trl_suite.rendering.frame`.
 
@@ -80,9 +81,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
             spec = suite.find(environment) if isinstance(environment, str) else environment
-            environment = suite.build_environment(
-                spec, limited(spec, task_kwargs, max_episode_steps), {}
-            )
+            environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
         elif task_kwargs or max_episode_steps is not None:
             raise ValueError(
                 'task_kwargs and max_episode_steps cannot change an environment that is already made'
@@ -105,7 +104,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         super().reset(seed=seed)
         time_step = self.environment.reset()
         self._running = True
-        return self._observation(time_step.observation), self.environment.info
+        return self._observation(time_step.observation), flat(self.environment.info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
         """Applies one action, clipped to [-1, 1]; raises `ResetNeeded` if no episode is running."""
@@ -117,7 +116,8 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
         terminated = last and time_step.discount == 0
         self._running = not last
         observation, truncated = self._observation(time_step.observation), last and not terminated
-        return observation, float(time_step.reward), terminated, truncated, self.environment.info
+        info = flat(self.environment.info)
+        return observation, float(time_step.reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Draws the current state, (h, w, 3) uint8; None if render_mode is None."""
@@ -175,7 +175,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         spec = suite.find(environment) if isinstance(environment, str) else environment
-        options = limited(spec, task_kwargs, max_episode_steps)
+        options = limited(task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
             spec, num_envs, num_threads, options.pop('random', None),
             autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
@@ -203,7 +203,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         observation = self.environment.reset(env_ids, seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        return observation, masked(self.environment.info, env_ids)
+        return observation, masked(flat(self.environment.info), env_ids)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Steps every simulation; arguments and errors are those of `VectorEnvironment.step`."""
@@ -213,10 +213,10 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if ended.any():  # and reset in the same step
             finals = iterate(self.observation_space, info.pop('final_observation'))
             last = (each if end else None for each, end in zip(finals, ended, strict=True))
-            result = masked({'final_info': info}, ended)
+            result = {'final_info': masked(flat(info), ended), '_final_info': ended.copy()}
             result |= {'final_obs': np.fromiter(last, object), '_final_obs': ended}
             info = self.environment.info
-        result |= masked(info, np.ones(self.num_envs, bool))
+        result |= masked(flat(info), np.ones(self.num_envs, bool))
         return observation, reward, terminated, truncated, result
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -237,14 +237,21 @@ def metadata(task: Any) -> Info:
     return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
 
 
-def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
-    """Options whose step limit is the smaller of the spec's and Gymnasium's (None or -1: none)."""
+def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
+    """Options whose step limit is the smaller of theirs and Gymnasium's, by default that of the id.
+
+    Gymnasium's is None if it is not given, and -1 for none.
+    """
     options = dict(task_kwargs or {})
-    if max_episode_steps is None or max_episode_steps == -1:
+    if max_episode_steps is None:
         return options
+    if max_episode_steps == -1:
+        return {'step_limit': None, **options}
     if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
-        raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
-    own = options.get('step_limit', spec.step_limit)
+        raise ValueError(
+            f'max_episode_steps is {max_episode_steps}; expected a positive integer, or -1'
+        )
+    own = options.get('step_limit')
     options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
     return options
 
@@ -269,22 +276,34 @@ def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, shape, dtype)
 
 
+def flat(info: Info) -> Info:
+    """Info without a dict in it, which few programs understand: 'reward_NAME' for each term."""
+    rest = {name: value for name, value in info.items() if name != 'reward_terms'}
+    terms = info.get('reward_terms', {})
+    return {**rest, **{f'reward_{name}': value for name, value in terms.items()}}
+
+
+def unlimited(environment: str, **options: Any) -> SuiteEnv:
+    """Makes what `gymnasium.make` wraps: the limit is in its specification, and its wrapper cuts."""
+    return SuiteEnv(environment, max_episode_steps=-1, **options)
+
+
 def masked(info: Info, env_ids: np.ndarray) -> Info:
     """Info in Gymnasium's format: 0 in other simulations, and for each key the mask '_key'."""
     result: Info = {}
     for name, value in info.items():
-        result[name] = masked(value, env_ids) if isinstance(value, dict) else value.copy()
-        if not isinstance(value, dict):
-            result[name][~env_ids] = 0
+        result[name] = value.copy()
+        result[name][~env_ids] = 0
         result[f'_{name}'] = env_ids.copy()
     return result
 
 
-for _id in suite.ALL_IDS:
+for _id, _spec in catalogue.BY_ID.items():
     if f'trl_suite/{_id}' not in gymnasium.registry:
         gymnasium.register(
             f'trl_suite/{_id}',
-            entry_point='trl_suite.adapters.gym:SuiteEnv',
+            entry_point='trl_suite.adapters.gym:unlimited',
             vector_entry_point='trl_suite.adapters.gym:SuiteVectorEnv',
             kwargs={'environment': _id},
+            max_episode_steps=_spec.step_limit,
         )

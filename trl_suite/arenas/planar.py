@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import boxes
-from trl_suite.arenas import scene as stage
+from trl_suite.arenas import boxes, scene
 from trl_suite.arenas.boxes import Boxes
 from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
@@ -23,6 +22,7 @@ ADVANCE = 6.0  # m; window centres are multiples of it
 PROBES = 6  # random windows from which the size of the pool of boxes is estimated
 LINE_PROBES = 10  # windows to each side, 240 m, for that estimate if ground is a function of x
 SPARE = 1.3  # factor on the largest number of boxes in these windows
+EDGE = 0.82  # brightness of the edges of the ground, and so of its sides
 COARSEST = 0.1  # m; largest tolerance for merging pieces if the pool is too small
 
 _BEHIND, _AHEAD, _ADVANCE = (round(length / SPACING) for length in (BEHIND, AHEAD, ADVANCE))
@@ -45,12 +45,14 @@ class PlanarArena(composer.Arena):
     `PlanarGround`; height and slope queries use its arrays, not the collision geometry.
     """
 
-    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+    def _build(  # type: ignore[override]
+        self, terrain: Terrain, name: str = 'arena', look: scene.Look = scene.OLIVE
+    ) -> None:
         super()._build(name=name)
         self.terrain = terrain
         root = self._mjcf_root
-        stage.prepare(root)
-        _paint(root)
+        scene.prepare(root, look)
+        _paint(root, look)
         self.boxes = [
             # In the world body: the engine tests all geoms of any other body in every substep.
             root.worldbody.add(
@@ -279,13 +281,14 @@ def _pool_size(terrain: Terrain) -> int:
     return round(SPARE * most) + PROBES
 
 
-def _paint(root: mjcf.RootElement) -> None:
+def _paint(root: mjcf.RootElement, look: scene.Look) -> None:
     """Adds the texture and the material of the ground."""
+    light, dark = look.ground
     # The checker spans the width of the ground once, and its edge has the colour of the sides, so
     # that sides of overlapping tilted boxes cannot be told apart.
     root.asset.add(
         'texture', name='ground', type='2d', builtin='checker', mark='edge', width=256, height=256,
-        rgb1=(0.47, 0.52, 0.44), rgb2=(0.42, 0.47, 0.40), markrgb=(0.36, 0.38, 0.33),
+        rgb1=light, rgb2=dark, markrgb=[EDGE * part for part in dark],
     )  # fmt: skip
     root.asset.add(
         'material', name='ground', texture='ground', texuniform=True, reflectance=0, specular=0,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import scene as stage
+from trl_suite.arenas import scene
 from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
@@ -45,13 +45,15 @@ class SpatialArena(composer.Arena):
     other body in every substep, or most of them if that body also has an infinite plane.
     """
 
-    def _build(self, terrain: Terrain, name: str = 'arena') -> None:  # type: ignore[override]
+    def _build(  # type: ignore[override]
+        self, terrain: Terrain, name: str = 'arena', look: scene.Look = scene.OLIVE
+    ) -> None:
         super()._build(name=name)
         self.terrain = terrain
         self.capacity = holds = capacity(terrain)
         root = self._mjcf_root
-        stage.prepare(root)
-        _paint(root)
+        scene.prepare(root, look)
+        _paint(root, look)
         # Parts of the ground do not collide with each other: moving boxes pass through them.
         common = {
             'friction': FRICTION, 'solref': SOLREF, 'solimp': SOLIMP, 'condim': 3, 'contype': 1,
@@ -405,10 +407,10 @@ def _write_boxes(
             geom_rgba[geom, channel] = shades[shade, channel]
 
 
-def _paint(root: mjcf.RootElement) -> None:
+def _paint(root: mjcf.RootElement, look: scene.Look) -> None:
     """Adds the textures and materials of the ground."""
     colours = {
-        'ground': ((0.47, 0.52, 0.44), (0.42, 0.47, 0.40)),
+        'ground': look.ground,
         'block': ((0.55, 0.53, 0.47), (0.51, 0.49, 0.43)),
         'belt': ((0.34, 0.38, 0.44), (0.42, 0.46, 0.52)),
         'mover': ((0.66, 0.50, 0.30), (0.61, 0.46, 0.27)),

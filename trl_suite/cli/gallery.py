@@ -10,7 +10,9 @@ from trl_suite.viewing import gallery
 
 def run(arguments: argparse.Namespace) -> int:
     """Makes pictures, and returns 1 if any failed."""
-    written, failed = gallery.make(arguments.output, arguments.filter, arguments.overwrite)
+    written, failed = gallery.make(
+        arguments.output, arguments.filter, arguments.overwrite, moves=arguments.moving
+    )
     for path, error in failed.items():
         print(f'{path}: {" ".join(str(error).split())}', file=sys.stderr)
     noun = 'picture' if len(written) == 1 else 'pictures'

@@ -3,7 +3,8 @@
     trl-suite list --domain plaid --tag original
     trl-suite info PD_Dog2D_Gaps_Terrain-v0
     trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy clip --video dog.mp4 --ghost
-    trl-suite view PD_Dog2D_Gaps_Terrain-v0 --policy clip
+    trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy reference --html dog.html
+    trl-suite view PD_Dog2D_Gaps_Terrain-v0 --browser
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
@@ -109,6 +110,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--steps', type=_positive, default=256, help='control steps')
     add_policy(command, 'random')
     command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
+    command.add_argument(
+        '--html', type=pathlib.Path, metavar='FILE', help='an .html replay, seen from all sides'
+    )
     command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
     command.add_argument('--columns', type=_positive, default=8, help='pictures in the strip')
     command.add_argument('--trajectory', type=pathlib.Path, metavar='FILE', help='an .npz')
@@ -116,15 +120,19 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--size', type=_size, default='640x480', metavar='WxH', help='in pixels')
     command.add_argument('--camera', default='side', help='name of a camera')
 
-    command = add(
-        'view', "open dm_control's viewer, in which a policy acts; F1 there shows the keys"
-    )
+    command = add('view', "show a policy that acts: in dm_control's viewer, or in a web browser")
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     command.add_argument(
         '--policy', default='best', type=_best_or_policy, metavar='POLICY',
         help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that exists',
     )  # fmt: skip
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+    command.add_argument(
+        '--browser', action='store_true',
+        help="serve web browsers, with many controls; without it, F1 shows dm_control's keys",
+    )  # fmt: skip
+    command.add_argument('--host', default='127.0.0.1', help='address that --browser listens on')
+    command.add_argument('--port', type=_positive, default=8080, help='the first that it tries')
 
     command = add('evaluate', 'run a policy for whole episodes, and summarise them')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
@@ -215,6 +223,9 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         '--filter', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
     )
     command.add_argument('--overwrite', action='store_true', help='replace existing pictures')
+    command.add_argument(
+        '--moving', action='store_true', help='only animated pictures of environments'
+    )
     return parser
 
 

@@ -27,6 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Runs a policy, writes the requested files, and prints a line per episode and per file."""
     for path, suffixes in (
         (arguments.video, rendering.VIDEO_SUFFIXES),
+        (arguments.html, rendering.REPLAY_SUFFIXES),
         (arguments.strip, rendering.IMAGE_SUFFIXES),
         (arguments.trajectory, ('.npz',)),
     ):
@@ -42,24 +43,29 @@ def run(arguments: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
 
+        replay = arguments.html and stack.enter_context(
+            engine.load('trl_suite.rendering.replays').Replay(
+                environment, arguments.html, ghost=arguments.ghost
+            )
+        )
+
         def picture() -> np.ndarray:
             return rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
 
-        watched = video and stack.enter_context(
-            rendering.watching(environment, lambda: video.add(picture()))
-        )
+        def look(first: bool = False) -> None:
+            if video:
+                video.add(picture())
+            if replay:
+                replay.add(jump=first)
+
+        watched = (video or replay) and stack.enter_context(rendering.watching(environment, look))
         for done, time_step, action in _run(environment, policy, arguments.steps):
             record.add(time_step, action)
-            into_strip = arguments.strip is not None and done in in_strip
-            into_video = video and (time_step.first() or not watched)
-            if not (into_video or into_strip):
-                continue
-            image = picture()
-            if into_video:
-                video.add(image)
-            if into_strip:
-                in_strip.discard(done)  # the initial state of the next episode has the same number
-                pictures.append(image)
+            if time_step.first() or not watched:
+                look(time_step.first())
+            if arguments.strip is not None and done in in_strip:
+                in_strip.discard(done)  # the start that follows an end has the same number
+                pictures.append(picture())
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
     if arguments.trajectory is not None:
@@ -68,7 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
                 part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
             )
     print(record.summary())
-    for path in (arguments.video, arguments.strip, arguments.trajectory):
+    for path in (arguments.video, arguments.html, arguments.strip, arguments.trajectory):
         if path is not None:
             print(path)
 

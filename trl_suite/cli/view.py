@@ -1,4 +1,4 @@
-"""`trl-suite view`: dm_control's viewer for an environment that is controlled by a policy.
+"""`trl-suite view`: a viewer for an environment that is controlled by a policy.
 
 Steps that last longer than 1/30 s (gaits, footstep plans) are shown frame by frame.
 """
@@ -6,28 +6,28 @@ Steps that last longer than 1/30 s (gaits, footstep plans) are shown frame by fr
 from __future__ import annotations
 
 import argparse
-import collections
 import importlib
 import os
 import sys
 import warnings
 from typing import TYPE_CHECKING, Any
 
-import dm_env
-import numpy as np
-
 from trl_suite import rendering
 from trl_suite.cli import engine
 from trl_suite.environments import named_policies as acting
+from trl_suite.viewing.frames import Frames
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
-INSTEAD = 'without one, write a video: trl-suite rollout ID --video FILE.mp4'
+INSTEAD = 'without one, look at it in a web browser (--browser), from another machine too'
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Opens a window, and returns when it is closed."""
+    """Opens a window, and returns when it is closed; or serves web browsers until interrupted."""
+    if arguments.browser:
+        in_browser(arguments)
+        return
     check_screen()
     suite = engine.load()
     environment = suite.make(arguments.id, {'random': arguments.seed})
@@ -41,6 +41,15 @@ def run(arguments: argparse.Namespace) -> None:
     policy()(environment.reset())  # errors of the policy are raised before a window opens
     environment.random_state.seed(arguments.seed)
     view(environment, policy(), f'{suite.find(arguments.id).id}: {name}')
+
+
+def in_browser(arguments: argparse.Namespace) -> None:
+    """Shows an environment to web browsers until a keyboard interrupt."""
+    viewer = engine.load('trl_suite.viewing.browser').Browser(
+        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port
+    )
+    print(f'{viewer.url} shows it; Ctrl+C ends this', flush=True)
+    viewer.run()
 
 
 def check_screen() -> None:
@@ -87,52 +96,3 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
         frames = Frames(environment, policy)
         policy = frames.policy
     Window(environment, title).launch(frames, policy)
-
-
-class Frames(dm_env.Environment):
-    """An environment whose long steps are shown frame by frame, 1/30 s each.
-
-    A step is simulated as a whole and then played back: every step of this environment sets the
-    simulation to the state of the next frame, the last one to the state after the step. Actions
-    take effect, and the policy is called, only when no frame is left.
-    """
-
-    def __init__(self, environment: Environment, policy: rendering.Policy) -> None:
-        self._environment, self._policy = environment, policy
-        self._left: collections.deque[dict[str, Any]] = collections.deque()
-        self._action = np.zeros(environment.action_spec().shape)
-
-    def policy(self, time_step: dm_env.TimeStep) -> np.ndarray:
-        """Returns the policy's action, or during playback the action of the current step."""
-        if not self._left:
-            self._action = self._policy(time_step)
-        return self._action
-
-    def reset(self) -> dm_env.TimeStep:
-        self._left.clear()
-        self._end = self._environment.reset()
-        return self._end
-
-    def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        environment = self._environment
-        if not self._left:
-            with rendering.watching(
-                environment, lambda: self._left.append(environment.get_state())
-            ):
-                self._end = environment.step(action)
-            self._left.append(environment.get_state())
-        environment.set_state(self._left.popleft())
-        if self._left:
-            return dm_env.transition(0.0, environment.observation())
-        return self._end
-
-    def observation_spec(self) -> Any:
-        return self._environment.observation_spec()
-
-    def action_spec(self) -> Any:
-        return self._environment.action_spec()
-
-    @property
-    def physics(self) -> Any:
-        """The simulation that the viewer shows."""
-        return self._environment.physics

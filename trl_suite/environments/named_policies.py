@@ -83,17 +83,23 @@ def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Polic
     return lambda time_step: np.clip(task.clip_action(0), -1, 1)
 
 
-def best(environment: Environment, id: str) -> tuple[str, Policy]:
-    """Returns name and policy of the first of `POLICIES` that works in an environment.
+def available(environment: Environment, id: str, seed: int = 0) -> dict[str, Policy]:
+    """Returns the policies that work in an environment, by name, in the order of `POLICIES`.
 
-    A policy that raises an error in the first state is skipped: 'clip' does with torque control.
+    A policy that raises an error in the first state is skipped: 'clip' does with torque control. The
+    environment is reset.
     """
-    time_step = environment.reset()
+    time_step, found = environment.reset(), {}
     for name in POLICIES:
         try:
-            found = policy(name, environment, id)
-            found(time_step)
-            return name, found
+            made = policy(name, environment, id, seed)
+            made(time_step)
+            found[name] = made
         except (ValueError, FileNotFoundError):
             continue
-    raise AssertionError('the zero policy always acts')
+    return found
+
+
+def best(environment: Environment, id: str) -> tuple[str, Policy]:
+    """Returns name and policy of the first that an environment has; see `available`."""
+    return next(iter(available(environment, id).items()))

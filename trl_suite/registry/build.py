@@ -8,7 +8,7 @@ from typing import Any
 
 from trl_suite import characters, motion, policies
 from trl_suite import terrain as terrains
-from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.registry.task_types import TASK_TYPES
@@ -125,7 +125,8 @@ def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
         )
     kind: Any = motion.Clip if type_ is None else type_.motion
     tracked = None if kind is None or spec.clip is None else _motion(spec, kind)
-    arena = (SpatialArena if character.spatial else PlanarArena)(ground)
+    make_arena = SpatialArena if character.spatial else PlanarArena
+    arena = make_arena(ground, look=scene.LOOKS.get(spec.domain, scene.OLIVE))
     return Parts(characters.make(character), arena, tracked, spec.actuation)
 
 

@@ -1,9 +1,10 @@
 """Rendering without a screen: frames, videos, film strips, plots of terrain, height maps."""
 
-from trl_suite.rendering.drawing import Policy, frame, frames, markers, no_gl, watching
+from trl_suite.rendering.drawing import Policy, check_gl, frame, frames, no_gl, replay, watching
 from trl_suite.rendering.pictures import (
     CONTROL_FPS,
     IMAGE_SUFFIXES,
+    REPLAY_SUFFIXES,
     STRIP_MARGIN,
     VIDEO_SUFFIXES,
     Video,
@@ -17,17 +18,19 @@ from trl_suite.rendering.pictures import (
 __all__ = [
     'CONTROL_FPS',
     'IMAGE_SUFFIXES',
+    'REPLAY_SUFFIXES',
     'STRIP_MARGIN',
     'VIDEO_SUFFIXES',
     'Policy',
     'Video',
+    'check_gl',
     'film_strip',
     'frame',
     'frames',
     'height_map',
-    'markers',
     'no_gl',
     'plot_terrain',
+    'replay',
     'spread',
     'video',
     'watching',

@@ -9,6 +9,7 @@
 
     policy = lambda time_step: environment.task.clip_action(0)
     rendering.video(rendering.frames(environment, policy, steps=90), 'rollout.mp4')
+    rendering.replay(environment, policy, 'rollout.html')  # looked at from all sides
 
 Rendering needs an OpenGL library, chosen by the environment variable MUJOCO_GL before Python
 starts: egl or osmesa without a screen, glfw with one. `trl_suite.rendering.pictures` writes frames
@@ -32,10 +33,11 @@ from trl_suite.util import errors
 if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
 
+    from trl_suite.rendering.replays import Replay
+    from trl_suite.util.files import Path
+
 
 Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
-GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
-GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
 
 
 def frame(
@@ -72,22 +74,17 @@ def frame(
     ):
         if not 0 < operator.index(size) <= limit:
             raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
-    if ghost and getattr(environment.task, 'reference_pose', None) is None:
-        raise ValueError(
-            f'the task {type(environment.task).__name__} has no reference clip to draw as a ghost'
-        )
+    from trl_suite.rendering import overlays
+
+    drawn = overlays.of_task(environment.task, ghost)
     camera_id = _camera(physics, camera)
-    _check_gl(physics)
-    task: Any = environment.task
-    additions = [_ghost(task)] if ghost else []
-    if hasattr(task, 'markers'):
-        additions.append(markers(task))
+    check_gl(physics)
 
     def add(physics: Any, scene: Any) -> None:
-        for addition in additions:
-            addition(physics, scene)
+        for overlay in drawn:
+            overlay(physics, scene)
 
-    return physics.render(height, width, camera_id, scene_callback=add if additions else None)
+    return physics.render(height, width, camera_id, scene_callback=add if drawn else None)
 
 
 def frames(
@@ -125,6 +122,44 @@ def frames(
         yield from within
 
 
+def replay(
+    environment: composer.Environment,
+    policy: Policy,
+    path: Path | None = None,
+    steps: int = 256,
+    ghost: bool = False,
+) -> Replay:
+    """Runs a policy from a reset on, over ends of episodes, and records it as a page.
+
+    The page shows the episodes from all sides, with a slider of time, and needs no network. It needs
+    no OpenGL to be made.
+
+    Args:
+      environment: is reset and stepped.
+      policy: time step -> action.
+      path: where to write it, .html; not written if None.
+      steps: control steps.
+      ghost: also show the reference clip.
+
+    Returns:
+      The recording, which notebooks show; see `trl_suite.rendering.replays.Replay` for its errors.
+    """
+    from trl_suite.rendering.replays import Replay
+
+    time_step = environment.reset()
+    with Replay(environment, path, ghost=ghost) as recording:
+        recording.add(jump=True)
+        for _ in range(steps):
+            if time_step.last():
+                time_step = environment.reset()
+                recording.add(jump=True)
+            with watching(environment, recording.add) as watched:
+                time_step = environment.step(policy(time_step))
+            if not watched:
+                recording.add()
+    return recording
+
+
 @contextlib.contextmanager
 def watching(environment: composer.Environment, look: Callable[[], None]) -> Iterator[bool]:
     """Calls `look` every 1/30 s if steps last longer than that; yields whether they do."""
@@ -156,7 +191,7 @@ def _camera(physics: Any, camera: str | int) -> int:
     return found[0]
 
 
-def _check_gl(physics: Any) -> None:
+def check_gl(physics: Any) -> None:
     """Creates the rendering context for the first frame."""
     try:
         _use_chosen_library()
@@ -198,54 +233,3 @@ def no_gl(error: Exception) -> str:
         'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
         'disable (no pictures). `trl-suite doctor` tells which can draw here'
     )
-
-
-def _ghost(task: Any) -> Callable[[Any, Any], None]:
-    """Returns a scene callback that adds the reference pose."""
-    import mujoco
-
-    def add(physics: Any, scene: Any) -> None:
-        # Separate data of the same model: neither the model nor the simulation changes.
-        model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
-        addresses = task.figure.pose_qpos
-        data.qpos[addresses] = task.reference_pose(0)
-        mujoco.mj_kinematics(model, data)
-        before = scene.ngeom
-        mujoco.mjv_addGeoms(
-            model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC,
-            scene,
-        )  # fmt: skip
-        root = model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == addresses[0])[0]]
-        for geom in scene.geoms[before : scene.ngeom]:
-            # Moving boxes have no ghosts.
-            own = model.body_rootid[model.geom_bodyid[geom.objid]] == model.body_rootid[root]
-            geom.pos[1] += GHOST_BEHIND
-            geom.rgba = GHOST_COLOUR if own else np.zeros(4)
-            geom.matid = -1
-
-    return add
-
-
-def markers(task: Any) -> Callable[[Any, Any], None]:
-    """Returns a scene callback that adds a task's markers."""
-    import mujoco
-
-    def add(physics: Any, scene: Any) -> None:
-        for marker in task.markers(0):
-            if scene.ngeom == scene.maxgeom:
-                return
-            scene.ngeom += 1
-            geom = scene.geoms[scene.ngeom - 1]
-            cosine, sine = np.cos(marker.yaw), np.sin(marker.yaw)
-            if marker.shape == 'arrow':  # arrows point along their z axis
-                axes = np.array([[0, -sine, cosine], [0, cosine, sine], [-1, 0, 0]])
-            else:
-                axes = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-            mujoco.mjv_initGeom(
-                geom, getattr(mujoco.mjtGeom, f'mjGEOM_{marker.shape.upper()}'),
-                np.array(marker.size, float), np.array(marker.position, float), axes.ravel(),
-                np.array(marker.colour, np.float32),
-            )  # fmt: skip
-            geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-
-    return add

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tqdm.auto
 
 from trl_suite import terrain as terrains
 from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
@@ -33,6 +34,7 @@ MOST_DRAWS = 100  # in one plot
 MAP_POINTS = 400  # largest number of points along each axis of such a plot
 VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
+REPLAY_SUFFIXES = ('.html',)
 
 
 def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:
@@ -40,7 +42,7 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
 
     Args:
       frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as
-        `rendering.frames`.
+        `rendering.frames`. Their number is shown while writing takes longer than 1 s.
       path: file to write; .mp4 (h264) or .gif.
       fps: frames per second; 30 is real time. In a .gif each frame lasts a multiple of 1/100 s.
 
@@ -50,7 +52,8 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
       OSError: the file cannot be written.
     """
     with Video(path, fps) as writer:
-        for image in frames:
+        # disable=None: no bar where stderr is not a terminal; a notebook always has one.
+        for image in tqdm.auto.tqdm(frames, unit='picture', delay=1, disable=None):
             writer.add(image)
 
 

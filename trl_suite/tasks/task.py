@@ -280,8 +280,10 @@ class Task(composer.Task):
         return bool(self.failed[0])
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
+        # Bounds of each number, as dm_control's own have them.
+        bound = np.ones(len(self.action_map))
         return specs.BoundedArray(
-            (len(self.action_map),), float, -1.0, 1.0, name='\t'.join(self.action_map.names)
+            bound.shape, float, -bound, bound, name='\t'.join(self.action_map.names)
         )
 
     @property

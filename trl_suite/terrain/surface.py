@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import GENERATORS, Parameters, register_line
+from trl_suite.terrain.planar.generators import GENERATORS, Parameters, check_new, register_line
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util.compiled import compiled_loop
@@ -85,12 +85,8 @@ def from_function(
             raise ValueError(f'the function {function!r} has no name; pass name=')
     arguments = _arguments(function)
     taken = GENERATORS if arguments == 1 else GENERATORS3D
-    known = _functions.get((arguments, name))
-    # A notebook's cell that is run again. Whether two lambdas are the same cannot be decided.
-    again = known is not None and _place(known) == _place(function)
-    again &= not _place(function)[1].endswith('<lambda>')
-    if name in taken and known is not function and not again and not replace:
-        raise ValueError(f'terrain type {name!r} exists; pass replace=True to replace it')
+    existing = taken[name].function if name in taken else None
+    check_new(name, _functions.get((arguments, name), existing), function, replace)
     _check_answer(name, function, arguments)
     _functions[arguments, name] = function
     _register(name, function, arguments)
@@ -99,11 +95,6 @@ def from_function(
 
 
 _functions: dict[tuple[int, str], HeightFunction] = {}
-
-
-def _place(function: HeightFunction) -> tuple[str, str]:
-    """Module and qualified name of a function."""
-    return getattr(function, '__module__', ''), getattr(function, '__qualname__', repr(function))
 
 
 def _arguments(function: HeightFunction) -> int:

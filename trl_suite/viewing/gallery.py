@@ -3,9 +3,10 @@
     trl-suite gallery --output gallery --filter '*Dog2D*'
 
 Files in the folder: environments/ID.jpg, a film strip; curves/ID.png, for shipped policies;
-terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg.
-Each has at most about 40 kB, except the last one and some maps. Existing files are kept, unless
-`--overwrite` is given or the policy that they show has been replaced.
+terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.webp. Each
+has at most about 40 kB, except the last one and some maps. With --moving, instead of these: moving/ID.webp,
+4 s of each environment. Existing files are kept, unless `--overwrite` is given or the policy that they show
+has been replaced.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import files, resources
+from trl_suite.viewing import moving
 
 LARGEST = 40_000  # bytes of a picture
 QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, tried until the file is small enough
@@ -64,12 +66,12 @@ FAMILIES = {
     'deeploco': ('PD_Biped3D_HLC_Soccer-v0', 12.0),
 }
 SUITE = (
-    (('PD_Biped2D_Walls_Terrain-v0', 3.0), ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 0.7),
-     ('FSM_Raptor2D_Terrain_Cliffs-v0', 2.0)),
-    (('FSM_Goat2D_Terrain_Variable_Steps-v0', 1.0), ('PD_Biped3D_HLC_Forest-v0', 5.0),
-     ('PD_Biped3D_HLC_Soccer-v0', 12.0)),
+    ('PD_Biped2D_Walls_Terrain-v0', 'PD_Dog2D_Slopes_Mixed_Terrain-v0',
+     'FSM_Raptor2D_Terrain_Cliffs-v0'),
+    ('FSM_Goat2D_Terrain_Variable_Steps-v0', 'PD_Biped3D_HLC_Forest-v0',
+     'PD_Biped3D_HLC_Soccer-v0'),
 )  # fmt: skip
-SUITE_SIZE, SUITE_LARGEST = (240, 320), 120_000  # pixels of each picture; bytes
+SUITE_SIZE, SUITE_SECONDS = (200, 320), 4.0  # pixels of each picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,32 +80,49 @@ class Item:
 
     Attributes:
       path: path in the folder, with / between parts.
-      draw: function that returns the picture, (h, w, 3) uint8.
-      source: digest of the policy that it shows, '' if none.
+      draw: function that returns the picture, (h, w, 3) uint8, or a sequence of such if it moves.
+      source: digest of what it shows, '' if that does not change.
       largest: largest number of bytes.
     """
 
     path: str
-    draw: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+    draw: Callable[[], Any] = dataclasses.field(repr=False)
     source: str = ''
     largest: int = LARGEST
 
 
 def items() -> Iterator[Item]:
-    """Yields all pictures of the gallery."""
-    yield Item('suite.jpg', together, largest=SUITE_LARGEST)
+    """Yields all pictures of the gallery that do not move, and that of the suite."""
+    yield Item(
+        'suite.webp', functools.partial(moving.side_by_side, SUITE, SUITE_SECONDS, SUITE_SIZE)
+    )
     for name, scene in FAMILIES.items():
         yield Item(f'families/{name}.jpg', functools.partial(moment, *scene))
     for name in characters.CHARACTERS:
         yield Item(character_path(name), functools.partial(character, name))
     for name in (*terrains.PRESETS, *terrains.PRESETS3D):
         yield Item(terrain_path(name), functools.partial(terrain, name))
-    shipped = policies.available()
     for id in catalogue.BY_ID:
-        policy = _digest(f'{id}.npz') if id in shipped else ''
-        yield Item(strip_path(id), functools.partial(film_strip, id), policy)
+        yield Item(strip_path(id), functools.partial(film_strip, id), _policy_digest(id))
         if record(id):
             yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
+
+
+def moving_items() -> Iterator[Item]:
+    """Yields the moving pictures of all environments."""
+    for id in catalogue.BY_ID:
+        draw = functools.partial(moving.moving_picture, id)
+        yield Item(moving_path(id), draw, _policy_digest(id))
+
+
+def _policy_digest(id: str) -> str:
+    """Returns a digest of the policy that is shipped for an environment, '' if none is."""
+    return _digest(f'{id}.npz') if id in policies.available() else ''
+
+
+def moving_path(id: str) -> str:
+    """Returns where the moving picture of an environment lies, below the folder."""
+    return f'moving/{id}.webp'
 
 
 def character_path(name: str) -> str:
@@ -139,7 +158,11 @@ def _digest(name: str) -> str:
 
 
 def make(
-    folder: files.Path, only: str = '*', again: bool = False, progress: bool = True
+    folder: files.Path,
+    only: str = '*',
+    again: bool = False,
+    progress: bool = True,
+    moves: bool = False,
 ) -> tuple[list[pathlib.Path], dict[str, Exception]]:
     """Makes the pictures that are missing, or that show a policy that has been replaced.
 
@@ -148,6 +171,7 @@ def make(
       only: shell-style pattern of paths in the folder; `*` is added on both sides.
       again: whether to replace existing pictures.
       progress: whether to show a progress bar.
+      moves: make the animated pictures of environments instead of the others.
 
     Returns:
       Paths of written files; and errors by path in the folder. An error does not stop the others.
@@ -159,7 +183,8 @@ def make(
       OSError: the folder cannot be created.
     """
     folder = pathlib.Path(folder)
-    chosen = [item for item in items() if fnmatch.fnmatch(item.path, f'*{only}*')]
+    choices = moving_items() if moves else items()
+    chosen = [item for item in choices if fnmatch.fnmatch(item.path, f'*{only}*')]
     if not chosen:
         raise ValueError(
             f'no picture matches {only!r}; expected a part of an id or the name of a character, as '
@@ -244,14 +269,6 @@ def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarr
     return _draw(id, {round(time / FRAME)}, size)[-1]
 
 
-def together() -> np.ndarray:
-    """Renders frames of several environments, in rows."""
-    rows = [[moment(*scene, SUITE_SIZE) for scene in row] for row in SUITE]
-    strips = [rendering.film_strip(row, columns=len(row)) for row in rows]
-    margin = np.full((rendering.STRIP_MARGIN, *strips[0].shape[1:]), 255, np.uint8)
-    return np.concatenate([part for strip in strips for part in (margin, strip)][1:])
-
-
 def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
     """Renders the frames `wanted` of an episode, by number; they are FRAME apart."""
     camera = scene(id)[-1]
@@ -324,13 +341,13 @@ def curve(id: str) -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
+def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
     """Writes a small picture: a .png with a palette, or a .jpg of the best quality that fits.
 
     Args:
-      image: (h, w, 3) uint8.
+      image: (h, w, 3) uint8; for an animated .webp a sequence of such.
       path: file to write.
-      source: digest of the policy that it shows, stored in the file.
+      source: digest of what it shows, stored in the file.
       largest: number of bytes that a .jpg should not exceed; the lowest quality may exceed it.
 
     Raises:
@@ -339,7 +356,10 @@ def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = L
     """
     from PIL import Image, PngImagePlugin
 
-    path = files.check_path(path, ('.png', '.jpg'))
+    path = files.check_path(path, ('.png', '.jpg', *moving.SUFFIXES))
+    if path.suffix in moving.SUFFIXES:
+        moving.save(image, path, source)
+        return
     picture, content = Image.fromarray(image), io.BytesIO()
     if path.suffix == '.png':
         notes = PngImagePlugin.PngInfo()
@@ -360,6 +380,6 @@ def _source(path: pathlib.Path) -> str:
     from PIL import Image
 
     with contextlib.suppress(OSError), Image.open(path) as image:
-        kept = image.info.get('comment', '')
+        kept = image.info.get('comment') or image.info.get('xmp', '')
         return kept.decode() if isinstance(kept, bytes) else kept
     return ''

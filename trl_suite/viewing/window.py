@@ -9,8 +9,8 @@ import numpy as np
 from dm_control.mujoco import wrapper
 from dm_control.viewer import application, viewer
 
-from trl_suite import rendering
 from trl_suite.environments.environment import Environment
+from trl_suite.rendering import overlays
 
 AZIMUTH, ELEVATION = 90.0, -8.0  # degrees; from the right of a character that walks along x
 DISTANCE = 4.0  # m; of the camera
@@ -39,9 +39,8 @@ class Window(application.Application):
             self._viewer.camera.settings = following(self._shown)
 
     def _before_drawing(self, model: Any, data: Any, scene: Any) -> None:
-        task: Any = self._shown.task
-        if hasattr(task, 'markers'):
-            rendering.markers(task)(None, scene.ptr)
+        for overlay in overlays.of_task(self._shown.task):
+            overlay(self._shown.physics, scene.ptr)
         if model.nhfield and not np.array_equal(model.hfield_data, self._field):
             self._field = model.hfield_data.copy()
             drawn = self._renderer._mujoco_context

@@ -29,7 +29,7 @@ import math
 import numbers
 import types
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -170,20 +170,49 @@ def register(
     Args:
       type_name: the `Type` in terrain files.
       defaults: the names of all its parameters, with their defaults.
-      replace: whether an existing type of that name may be replaced.
+      replace: whether another function's type of that name may be replaced; what is written in
+        the same place, as a notebook's cell that is run again, always may.
 
     Raises:
       ValueError: the name is taken, or a default is invalid (see `check`).
     """
-    if type_name in _generators and not replace:
-        raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
     checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
 
     def add(function: Function) -> Function:
+        known = _generators.get(type_name)
+        check_new(type_name, known and known.function, function, replace)
         _generators[type_name] = Generator(function, checked)
         return function
 
     return add
+
+
+def check_new(
+    type_name: str, known: Callable[..., Any] | None, function: Callable[..., Any], replace: bool
+) -> None:
+    """Checks that a terrain type may be registered.
+
+    Args:
+      type_name: of the type.
+      known: the function that is registered already, if any.
+      function: the one that is to be.
+      replace: whether the user wants it replaced in any case.
+
+    Raises:
+      ValueError: the name belongs to a function that is written elsewhere. Of a lambda nobody knows
+        where it is written.
+    """
+    if known is None or known is function or replace:
+        return
+    places = [
+        (getattr(each, '__module__', ''), getattr(each, '__qualname__', '<lambda>'))
+        for each in (known, function)
+    ]
+    if places[0] != places[1] or places[0][1].endswith('<lambda>'):
+        raise ValueError(
+            f'terrain type {type_name!r} exists; pass replace=True to replace it, or choose another '
+            'name'
+        )
 
 
 def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:

@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import _NONE, Parameters, check
+from trl_suite.terrain.planar.generators import _NONE, Parameters, check, check_new
 from trl_suite.terrain.spatial import noise
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, GridFunction, Layout, Movers, boxes
 from trl_suite.terrain.spatial.trail import AMPLITUDE, FREQUENCY, Trail
@@ -96,11 +96,11 @@ def register3d(
 
     Arguments and errors are those of `register`.
     """
-    if type_name in _generators and not replace:
-        raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
     checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
 
     def add(function: Function3D) -> Function3D:
+        known = _generators.get(type_name)
+        check_new(type_name, known and known.function, function, replace)
         _generators[type_name] = Generator3D(function, checked)
         return function
 

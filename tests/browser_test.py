@@ -1,0 +1,311 @@
+"""The viewer in the web browser and replays: what they draw, and what a real browser shows of it."""
+
+import contextlib
+import io
+import shutil
+import time
+import unittest
+
+import imageio.v3 as iio
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from helpers import FolderTest
+
+from trl_suite import rendering, suite
+from trl_suite.rendering import overlays, replays, web_scene
+from trl_suite.viewing import browser, session
+
+DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
+HILLS, SOCCER = 'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Soccer-v0'
+BELTS = 'PD_Biped3D_HLC_Conveyors-v0'
+FRAME = 1 / 30  # s
+CHROMIUM = next(
+    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), ''
+)
+# Without a sandbox, as containers need it, and with WebGL on the processor.
+FLAGS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+PATIENCE = 120_000  # ms; on a busy machine drawing by the processor is slow
+
+
+def zero(environment):
+    action = np.zeros(environment.action_spec().shape)
+    return lambda time_step: action
+
+
+class SessionTest(parameterized.TestCase):
+    @parameterized.parameters(DOG, GOAT, SOCCER)
+    def test_frames_are_those_of_the_environment(self, id_):
+        """Of every frame of a second: 1/30 s or less has passed; steps end as they do without."""
+        environment, expected = (suite.make(id_, {'random': 2}) for _ in range(2))
+        act = zero(expected)
+        shown = session.Session(environment, act)
+        expected.reset()
+        total = time_passed = 0.0
+        while not shown.time_step.last() and time_passed < 1:
+            passed = shown.advance()
+            time_passed += passed
+            self.assertBetween(passed, 0, FRAME + 1e-9)
+            if shown.is_between_steps:
+                total += expected.step(act(None)).reward
+                np.testing.assert_array_equal(
+                    environment.physics.data.qpos, expected.physics.data.qpos
+                )
+                self.assertEqual(shown.total, total)
+        self.assertAlmostEqual(environment.physics.data.time, time_passed)
+        self.assertGreater(time_passed, 0.2)
+        moment = shown.history[-1]
+        self.assertLen(moment.rewards, len(shown.reward_names))
+        np.testing.assert_allclose(
+            moment.rewards[1:].sum(), moment.rewards[0] * (len(moment.rewards) > 1)
+        )
+        self.assertLen(moment.torques, len(shown.joint_axes))
+        self.assertEqual(shown.status()['episode'], '1')
+
+    def test_a_seed_repeats_an_episode(self):
+        environment = suite.make(DOG, {'random': 5})
+        shown = session.Session(environment, zero(environment), seed=3)
+        expected = suite.make(DOG, {'random': 3})
+        for _ in range(2):
+            np.testing.assert_array_equal(
+                shown.time_step.observation['terrain'], expected.reset().observation['terrain']
+            )
+            expected.random_state.seed(3)
+            shown.reset(3)
+        self.assertEqual(shown.episode, 1)
+        shown.reset()
+        self.assertEqual(shown.episode, 2)
+
+    @parameterized.parameters(
+        (DOG, 'forward', (2, 0, 0)), (DOG, 'left', (0, 0, 0)), (GOAT, 'up', (0, 0, 2)),
+        (SOCCER, 'left', (0, 2, 0)),
+    )  # fmt: skip
+    def test_a_push_moves_the_whole_body(self, id_, direction, change):
+        environment = suite.make(id_, {'random': 2})
+        shown = session.Session(environment, zero(environment))
+        shown.advance()
+        model, data = environment.physics.model.ptr, environment.physics.data.ptr
+        root = environment.task.figure.links[0]
+
+        def velocity():
+            mujoco.mj_subtreeVel(model, data)
+            return data.subtree_linvel[root].copy()
+
+        shown.push(direction, 2.0)
+        while not shown.is_between_steps:
+            shown.advance()
+        before = velocity()
+        shown._apply_push()
+        np.testing.assert_allclose(velocity() - before, change, atol=1e-9)
+        shown.advance()
+        with self.assertRaisesRegex(ValueError, "unknown direction 'forwards'; did you mean 'forw"):
+            shown.push('forwards', 1.0)
+
+
+class SceneTest(parameterized.TestCase):
+    @parameterized.parameters(DOG, 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Steps_Terrain-v0')
+    def test_planar_ground_is_that_of_the_arena(self, id_):
+        environment = suite.make(id_, {'random': 4})
+        environment.reset()
+        arena = environment.task.arena
+        mesh = web_scene._planar_ground(arena.ground)
+        # Upper corners of the pieces that the mesh consists of, from its upper triangles.
+        tops = mesh.triangles[mesh.face_normals[:, 2] > 0.1]
+        first, last = tops[:, :, 0].min(1), tops[:, :, 0].max(1)
+        self.assertAlmostEqual(first.min(), -6.0)
+        self.assertAlmostEqual(last.max(), 18.0)
+        middles = 0.5 * (first + last)
+        heights = 0.5 * (tops[:, :, 2].min(1) + tops[:, :, 2].max(1))
+        found = arena.height(middles[None])[0]
+        long = last - first > 0.02  # not beside a vertical face, which ends within a cell
+        self.assertGreater(long.sum(), 5)
+        np.testing.assert_allclose(heights[long], found[long], atol=1e-6)
+
+    def test_height_field_is_that_of_the_arena(self):
+        environment = suite.make(HILLS, {'random': 4})
+        environment.reset()
+        model, data = environment.physics.model.ptr, environment.physics.data.ptr
+        field = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[0])
+        mesh = web_scene._height_field(model, data, field)
+        near = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(1) < 10]
+        heights = environment.task.arena.height(near[None, :, 0], near[None, :, 1])[0]
+        np.testing.assert_allclose(near[:, 2], heights, atol=1e-5)
+        self.assertGreater((mesh.face_normals[:, 2] > 0).mean(), 0.999)
+
+    @parameterized.parameters((DOG, {'box', 'tube', 'sphere'}), (SOCCER, {'box', 'sphere', 'cone'}))
+    def test_shapes_of_what_mujoco_draws(self, id_, expected):
+        environment = suite.make(id_, {'random': 4})
+        environment.reset()
+        server = web_scene.start_server('127.0.0.1', 0)
+        self.addCleanup(web_scene.stop_server, server)
+        scene = web_scene.WebScene(server, environment)
+        scene.update(overlays.of_task(environment.task))
+        self.assertLessEqual(expected, {name.partition('_')[0] for name in scene._handles})
+        # The character is in the middle.
+        spheres = scene._handles['sphere'].batched_positions
+        self.assertLess(np.linalg.norm(spheres.mean(0)), 1.5)
+        model = environment.physics.model
+        capsules = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)).sum()
+        if 'tube' in expected:
+            self.assertLen(scene._handles['tube'].batched_positions, capsules)
+
+    @parameterized.parameters(DOG, HILLS)
+    def test_samples_lie_where_they_are_observed(self, id_):
+        environment = suite.make(id_, {'random': 4})
+        observed = environment.reset().observation['terrain']
+        task = environment.task
+        samples = overlays.terrain_samples(task, environment.physics)
+        self.assertLen(samples, len(observed))
+        x, y, _ = environment.physics.data.xpos[task.figure.links[0]]
+        at = ([[x]], [[y]]) if task.arena.terrain.spatial else ([[x]],)
+        under = task.arena.height(*map(np.array, at)).item()
+        np.testing.assert_allclose(samples[:, 2] - under, observed, atol=1e-9)
+
+
+class ReplayTest(FolderTest):
+    @parameterized.parameters(DOG, GOAT, HILLS, SOCCER, BELTS)
+    def test_ten_seconds_take_no_more_than_3_mb(self, id_):
+        environment = suite.make(id_, {'random': 1})
+        random = np.random.default_rng(0)
+        path = self.folder / 'replay.html'
+        environment.reset()
+        states = 0
+        with replays.Replay(environment, path) as recording:
+
+            def add():
+                nonlocal states
+                states += 1
+                recording.add()
+
+            time_step = environment.reset()
+            while states < 300:
+                with rendering.watching(environment, add) as watched:
+                    action = random.uniform(-0.2, 0.2, environment.action_spec().shape)
+                    time_step = environment.step(action)
+                if not watched or time_step.first():
+                    add()
+        self.assertLess(path.stat().st_size, 3e6)
+        self.assertEqual(path.read_text(encoding='utf-8'), recording.html)
+
+    def test_by_the_command(self):
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            from trl_suite import cli
+
+            arguments = ('rollout', DOG, '--steps', '5', '--html', str(self.folder / 'dog.html'))
+            self.assertEqual(cli.main(arguments), 0)
+        self.assertIn('dog.html', printed.getvalue())
+        self.assertNotIn('viser', printed.getvalue())
+
+    def test_in_a_notebook(self):
+        environment = suite.make(DOG, {'random': 1})
+        recording = rendering.replay(environment, zero(environment), steps=3)
+        self.assertStartsWith(recording._repr_html_(), '<iframe srcdoc="&lt;!')
+
+    def test_refusals(self):
+        environment = suite.make(GOAT, {'random': 1})
+        environment.reset()
+        with self.assertRaisesRegex(ValueError, "unknown suffix '.mp4'; expected .html"):
+            replays.Replay(environment, self.folder / 'goat.mp4')
+        with self.assertRaisesRegex(ValueError, 'no reference clip to draw as a ghost'):
+            replays.Replay(environment, ghost=True)
+        with self.assertRaisesRegex(ValueError, 'fps is 0; expected a positive number'):
+            replays.Replay(environment, fps=0)
+        with (
+            self.assertRaisesRegex(ValueError, 'a replay of no states'),
+            replays.Replay(environment, self.folder / 'goat.html'),
+        ):
+            pass
+        self.assertEmpty(list(self.folder.iterdir()))
+
+
+@unittest.skipUnless(CHROMIUM, 'needs Chromium: apt install chromium')
+class ChromiumTest(FolderTest):
+    """In a real browser, without a screen."""
+
+    def setUp(self):
+        super().setUp()
+        from playwright.sync_api import sync_playwright
+
+        chromium = self.enterContext(sync_playwright()).chromium
+        self.chromium = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.chromium.close)
+        self.messages = []
+
+    def open(self, address, **options):
+        """Opens a page of its own; what it complains about is kept."""
+        context = self.chromium.new_context(viewport={'width': 640, 'height': 400}, **options)
+        page = context.new_page()
+        page.set_default_timeout(PATIENCE)
+        page.on('console', lambda message: self.messages.append((message.type, message.text)))
+        page.on('pageerror', lambda error: self.messages.append(('error', str(error))))
+        page.on('request', lambda request: self.messages.append(('request', request.url)))
+        page.goto(address)
+        page.wait_for_selector('canvas')
+        return page
+
+    def wait_for(self, condition, what):
+        end = time.monotonic() + PATIENCE / 1000
+        while not condition():
+            self.assertLess(time.monotonic(), end, what)
+            time.sleep(0.2)
+
+    def picture(self, page):
+        return iio.imread(page.screenshot())[..., :3].astype(int)
+
+    def wait_until_drawn(self, page):
+        """Waits for the ground, which fills the lower part: as long as it is white, nothing is there."""
+        self.wait_for(lambda: self.picture(page)[230:330].std() > 10, 'nothing is drawn')
+        return self.picture(page)
+
+    def wait_until_it_moves(self, page):
+        first = self.wait_until_drawn(page)
+        self.wait_for(
+            lambda: (np.abs(self.picture(page) - first)[100:300] > 20).mean() > 0.005,
+            'the picture stays as it is',
+        )
+
+    def assert_quiet(self, *allowed):
+        self.assertEmpty([text for kind, text in self.messages if kind == 'error'])
+        for kind, text in self.messages:
+            if kind == 'request':
+                self.assertStartsWith(text, ('data:', 'blob:', *allowed))
+
+    def test_a_replay_without_a_network(self):
+        environment = suite.make(DOG, {'random': 1})
+        policy = suite.reference_policy(DOG)
+        path = self.folder / 'dog.html'
+        rendering.replay(environment, lambda step: policy(step.observation), path, steps=90)
+        page = self.open(path.as_uri(), offline=True)
+        self.wait_until_it_moves(page)
+        self.assert_quiet('file:')
+
+    def test_the_viewer(self):
+        viewer = browser.Browser(DOG, port=0).start()
+        self.addCleanup(viewer.stop)
+        page = self.open(viewer.url)
+        self.wait_until_it_moves(page)
+        page.get_by_role('button', name='Pause').click()
+        self.wait_for(lambda: not viewer.playing, 'it goes on')
+        before = viewer.session.environment.physics.data.time
+        page.get_by_role('button', name='One frame').click()
+        self.wait_for(
+            lambda: viewer.session.environment.physics.data.time > before, 'there is no frame'
+        )
+        page.get_by_role('button', name='Play').click()
+        self.wait_for(lambda: viewer.playing, 'it does not go on')
+        # Another environment, with another policy, for two who look.
+        other = self.open(viewer.url)
+        page.get_by_label('Environment').click()
+        page.get_by_label('Environment').fill(SOCCER)
+        page.get_by_role('option', name=SOCCER, exact=True).click()
+        self.wait_for(lambda: viewer.session.environment.task.arena.terrain.spatial, 'no soccer')
+        other.get_by_label('Policy', exact=True).click()
+        other.get_by_role('option', name='scripted').click()
+        self.wait_for(lambda: viewer._loaded.policy == 'scripted', 'another policy acts')
+        for each in (page, other):
+            self.wait_until_drawn(each)
+        self.assert_quiet(viewer.url)
+
+
+if __name__ == '__main__':
+    absltest.main()

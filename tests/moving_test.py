@@ -1,0 +1,91 @@
+"""Moving pictures: what is in view, and the files."""
+
+import numpy as np
+from absl.testing import absltest, parameterized
+from helpers import FolderTest
+from PIL import Image
+
+from trl_suite import suite
+from trl_suite.environments import named_policies
+from trl_suite.rendering.web_scene import root_body
+from trl_suite.viewing import gallery, moving
+
+DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
+FOREST = 'PD_Biped3D_HLC_Forest-v0'
+SIZE = (90, 144)
+SECONDS = 0.4
+
+
+def shot_of(id_, seconds=SECONDS):
+    environment = suite.make(id_)
+    _, policy = named_policies.best(environment, id_)
+    return environment, moving._take(environment, policy, 1, 0.0, seconds)
+
+
+class MovingTest(FolderTest):
+    @parameterized.parameters(DOG, GOAT)
+    def test_states_are_a_thirtieth_of_a_second_apart(self, id_):
+        environment, shot = shot_of(id_)
+        self.assertLen(shot.states, round(SECONDS / moving.FRAME) + 1)
+        times = []
+        for state, root in zip(shot.states, shot.root, strict=True):
+            environment.set_state(state)
+            times.append(environment.physics.data.time)
+            found = environment.physics.data.xpos[root_body(environment)]
+            np.testing.assert_allclose(found, root, atol=1e-12)
+        np.testing.assert_allclose(np.diff(times), moving.FRAME, atol=1e-3)
+
+    def test_the_camera_follows_evenly(self):
+        x = np.arange(60.0)
+        path = np.stack([x, 0 * x, 0.1 * (-1.0) ** x], axis=1)
+        smooth = moving._smooth(path)
+        self.assertEqual(smooth.shape, path.shape)
+        np.testing.assert_allclose(np.diff(smooth[10:-10, 0]), 1, atol=1e-2)
+        self.assertLess(np.abs(smooth[10:-10, 2]).max(), 0.05)  # of 0.1
+
+    def test_no_obstacle_hides_the_character(self):
+        environment, shot = shot_of(FOREST, 1.0)
+        environment.set_state(shot.states[0])
+        root = shot.root[0]
+        boxes = environment.task.arena.surroundings.boxes[0].position
+        nearest = np.argmin(np.linalg.norm(boxes - root[:2], axis=1))
+        beyond = np.append(root[:2] + 3 * (boxes[nearest] - root[:2]), root[2])
+        self.assertGreater(moving._hidden(environment, beyond), 0.9)
+        azimuth, elevation = np.deg2rad(
+            moving._free_view(environment, shot, shot.root, distance=4.0)
+        )
+        level = np.cos(elevation)
+        eye = root - 4 * np.array(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        )
+        self.assertLess(moving._hidden(environment, eye), 0.2)
+
+    @parameterized.parameters(DOG, FOREST)
+    def test_pictures(self, id_):
+        images = moving.moving_picture(id_, SECONDS, SIZE)
+        self.assertLen(images, 7)
+        self.assertEqual(images[0].shape, (*SIZE, 3))
+        self.assertGreater(np.abs(np.diff(np.array(images, int), axis=0)).max(), 50)
+        path = self.folder / 'a.webp'
+        gallery.save(images, path, 'digest')
+        self.assertEqual(gallery._source(path), 'digest')
+        with Image.open(path) as saved:
+            self.assertEqual((saved.n_frames, saved.info['loop']), (7, 0))
+            self.assertEqual(saved.size, SIZE[::-1])
+            saved.seek(1)
+            saved.load()
+            self.assertEqual(saved.info['duration'], 67)
+
+    def test_every_environment_has_one(self):
+        paths = [item.path for item in gallery.moving_items()]
+        self.assertEqual(paths, [f'moving/{id_}.webp' for id_ in suite.ALL_IDS])
+
+    def test_refusals(self):
+        with self.assertRaisesRegex(ValueError, 'a moving picture of no pictures'):
+            moving.save([], self.folder / 'a.webp')
+        with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'; expected .webp"):
+            moving.save([np.zeros((9, 9, 3), np.uint8)], self.folder / 'a.gif')
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,102 @@
+"""Replays: episodes as one HTML file that is looked at from all sides, without a network.
+
+viser's own recording is what it holds: the viewer of `trl-suite view --browser` with the messages
+that it was sent, so that both look the same and no page of our own has to be kept.
+"""
+
+from __future__ import annotations
+
+import html
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite.rendering import overlays, web_scene
+from trl_suite.rendering.pictures import REPLAY_SUFFIXES
+from trl_suite.util.files import Path, check_path, replacing
+
+if TYPE_CHECKING:
+    from dm_control import composer
+
+
+class Replay:
+    """A recording of an environment to which states are added one by one.
+
+    Used as a context manager, inside which the environment must not be closed. The file appears at
+    the end, and not at all after an exception. In a notebook the object shows itself.
+
+    Attributes:
+      html: the page, once the context has been left.
+    """
+
+    def __init__(
+        self,
+        environment: composer.Environment,
+        path: Path | None = None,
+        fps: float = 30.0,
+        ghost: bool = False,
+    ) -> None:
+        """Starts a recording.
+
+        Args:
+          environment: any composer environment, after `reset`.
+          path: where to write it, .html; not written if None.
+          fps: states per second; 30 is real time, as for `rendering.video`.
+          ghost: also show the reference clip, as `rendering.frame` does.
+
+        Raises:
+          ValueError: another suffix, an fps that is not positive, or a ghost where the task has no
+            reference clip.
+          ImportError: the extra 'viewer' is not installed.
+          OSError: the file cannot be written.
+        """
+        self._path = None if path is None else check_path(path, REPLAY_SUFFIXES)
+        if not 0 < fps < np.inf:
+            raise ValueError(f'fps is {fps}; expected a positive number')
+        self._overlays = overlays.of_task(environment.task, ghost)
+        web_scene.load_viser()
+        self._environment, self._seconds = environment, 1 / fps
+        self._recording: Any = None
+        self.html = ''
+
+    def __enter__(self) -> Replay:
+        self._server = web_scene.start_server('127.0.0.1', 0)
+        self._scene = web_scene.WebScene(self._server, self._environment)
+        return self
+
+    def add(self, jump: bool = False) -> None:
+        """Adds the current state.
+
+        Args:
+          jump: whether the view does so too, as at the start of an episode.
+        """
+        if self._recording is not None:
+            self._recording.insert_sleep(self._seconds)
+        self._scene.update(self._overlays, jump=jump)
+        if self._recording is None:  # it begins with everything there is
+            self._recording = self._server.get_scene_serializer()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None and self._recording is None:
+                raise ValueError('a replay of no states')
+            if kind is None:
+                self._recording.insert_sleep(self._seconds)
+                self.html = self._recording.as_html()
+                if self._path is not None:
+                    with replacing(self._path) as part:
+                        part.write_text(self.html, encoding='utf-8')
+        finally:
+            web_scene.stop_server(self._server)
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.html)}" width="100%" height="400" '
+            'style="border: none"></iframe>'
+        )

@@ -1,0 +1,422 @@
+"""A simulation drawn by a viser server: the geoms that MuJoCo's renderer would draw, as meshes.
+
+`mujoco.mjv_updateScene` lists what there is to draw, overlays append to the list, and geoms of one
+shape become one batched mesh, so that a frame is a handful of messages. Terrain that is posed anew
+needs no special case. The package `mjviser` builds static geometry once and follows the first body
+that moves; here both change while an episode goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import io
+import socket
+from collections.abc import Iterable, Iterator
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+import trimesh
+
+from trl_suite.arenas import PlanarArena
+from trl_suite.arenas.boxes import HALF_WIDTH
+from trl_suite.arenas.scene import PARKED
+from trl_suite.rendering.overlays import Overlay
+from trl_suite.terrain import SPACING
+from trl_suite.terrain.planar.windows import PlanarWindows
+
+LIFT = 0.1  # share of a difference in height that the view follows per frame
+ROOM = 2000  # geoms of overlays and decoration
+TILE = 1.0  # m; edge of the squares of the ground, by which speeds can be seen
+SHADES = (1.0, 0.88)  # of the squares
+PLANE = 60.0  # m; half side of what is drawn of a plane without end
+DEPTH = 1.0  # m; of planar ground below its lowest point
+FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are not in use
+SECTIONS = 24  # of round shapes
+GAMMA = 2.2  # colours of batched meshes are linear ones, those of MuJoCo are not
+SHAFT, TIP = 0.8, 0.2  # share of the length of an arrow
+SAMPLE_COLOUR, SAMPLE_SIZE = (242, 64, 38), 0.05  # of observed terrain; m
+CAMERA = np.array([0.0, -4.0, 1.0])  # m; from the character
+FIELD_OF_VIEW = 0.8  # rad
+
+_ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1)
+
+
+def load_viser() -> Any:
+    """Imports viser.
+
+    Raises:
+      ImportError: the extra 'viewer' is not installed.
+    """
+    try:
+        return importlib.import_module('viser')
+    except ImportError as error:
+        raise ImportError(
+            "viser is needed for this and missing; pip install 'trl_suite[viewer]'"
+        ) from error
+
+
+def start_server(host: str, port: int) -> Any:
+    """Starts a viser server that prints nothing.
+
+    Args:
+      host: address that it listens on; '127.0.0.1' is reached from this machine only.
+      port: the first that is tried; 0 takes any that is free.
+
+    Raises:
+      ImportError: the extra 'viewer' is not installed.
+      OSError: nothing can listen on this address.
+    """
+    viser = load_viser()
+    with socket.socket() as probe:  # viser would wait forever
+        probe.bind((host, 0))
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host, port, verbose=False)
+    return server
+
+
+def stop_server(server: Any) -> None:
+    """Stops a viser server without a message."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+class WebScene:
+    """What a viser server shows of an environment.
+
+    Attributes:
+      option: which decoration of MuJoCo's is drawn, e.g. contact forces; a `mujoco.MjvOption`.
+      follow: whether the character stays in the middle of the view.
+    """
+
+    def __init__(self, server: Any, environment: Any) -> None:
+        """Clears the scene of a server.
+
+        Args:
+          server: a `viser.ViserServer`.
+          environment: any composer environment whose model is not compiled again.
+        """
+        self.option, self.follow = mujoco.MjvOption(), True
+        self._server, self._physics = server, environment.physics
+        model = self._model = environment.physics.model.ptr
+        self._scene = mujoco.MjvScene(model, maxgeom=2 * model.ngeom + ROOM)
+        self._perturbation, self._camera = mujoco.MjvPerturb(), mujoco.MjvCamera()
+        self._colours = _material_colours(model)
+        self._is_ground = np.asarray(model.body_weldid[model.geom_bodyid] == 0)
+        self._root = root_body(environment)
+        arena = getattr(environment.task, 'arena', None)
+        self._profile = arena.ground if isinstance(arena, PlanarArena) else None
+        self._focus = np.full(3, np.nan)  # what the view follows
+        self._handles: dict[str, Any] = {}
+        self._laid: list[np.ndarray] = []  # what the meshes of the ground were made from
+        with server.atomic():
+            server.scene.reset()
+            server.scene.set_up_direction('+z')
+            server.initial_camera.position = CAMERA
+            server.initial_camera.look_at = np.zeros(3)
+            server.initial_camera.fov = FIELD_OF_VIEW
+
+    def update(
+        self,
+        overlays: Iterable[Overlay] = (),
+        samples: np.ndarray | None = None,
+        jump: bool = False,
+    ) -> None:
+        """Draws the current state.
+
+        Args:
+          overlays: what else is drawn.
+          samples: points where the terrain is observed, (k, 3) m.
+          jump: whether the view goes to the character at once, as at the start of an episode.
+        """
+        data = self._physics.data.ptr
+        mujoco.mjv_updateScene(
+            self._model, data, self.option, self._perturbation, self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL, self._scene,
+        )  # fmt: skip
+        for overlay in overlays:
+            overlay(self._physics, self._scene)
+        root = np.array(data.xpos[self._root])
+        if jump or np.isnan(self._focus[0]):
+            self._focus = root
+        self._focus = self._focus + (root - self._focus) * (1.0, 1.0, LIFT)
+        # Everything is moved by its own message: clients apply the position of a common parent at
+        # another time than what is below it, and the character would shake.
+        offset = -self._focus if self.follow else np.zeros(3)
+        with self._server.atomic():
+            self._draw_shapes(offset)
+            self._draw_ground(offset)
+            if samples is not None:
+                self._draw_samples(samples + offset)
+            elif 'samples' in self._handles:
+                self._handles['samples'].visible = False
+
+    def look_at_character(self, client: Any) -> None:
+        """Puts the camera of a client beside the character."""
+        middle = np.zeros(3) if self.follow else self._focus
+        client.camera.position, client.camera.look_at = middle + CAMERA, middle
+
+    def _draw_shapes(self, offset: np.ndarray) -> None:
+        batches: dict[str, list[tuple[Any, ...]]] = {}
+        for shape, *instance in _instances(
+            self._scene, self._model, self._colours, self._is_ground, self._focus[2] + FAR_BELOW
+        ):
+            name = shape if instance[-1][3] >= 1 else f'{shape}_clear'
+            batches.setdefault(name, []).append(tuple(instance))
+        for name, batch in batches.items():
+            positions, axes, sizes, colours = (
+                np.array(part, float) for part in zip(*batch, strict=True)
+            )
+            values = {
+                'batched_positions': positions + offset, 'batched_wxyzs': _quaternions(axes),
+                'batched_scales': sizes, 'batched_colors': _bytes(colours[:, :3] ** GAMMA),
+            }  # fmt: skip
+            if name.endswith('_clear'):
+                values['batched_opacities'] = colours[:, 3]
+            if name in self._handles:
+                _assign(self._handles[name], visible=True, **values)
+                continue
+            mesh = _mesh(name.removesuffix('_clear'), self._model)
+            self._handles[name] = self._server.scene.add_batched_meshes_simple(
+                f'/{name}', mesh.vertices, mesh.faces, lod='off',
+                flat_shading=not name.startswith(('sphere', 'tube')), **values,
+            )  # fmt: skip
+        for name, handle in self._handles.items():
+            if name not in batches and not name.startswith(('ground', 'samples')):
+                handle.visible = False
+
+    def _draw_ground(self, offset: np.ndarray) -> None:
+        """Moves the ground, after making meshes of what of it has been laid anew."""
+        model, data = self._model, self._physics.data.ptr
+        # A finite part of planes is drawn, which moves by whole pairs of squares.
+        middle = np.round(self._focus / (2 * TILE)) * 2 * TILE
+        ground = self._is_ground
+        planes = (model.geom_type[ground] == mujoco.mjtGeom.mjGEOM_PLANE).any()
+        sources = [
+            data.geom_xpos[ground], data.geom_xmat[ground], model.geom_size[ground],
+            model.hfield_data, middle[:2] if planes else np.zeros(2),
+        ]  # fmt: skip
+        if not self._laid or not all(map(np.array_equal, sources, self._laid)):
+            self._laid = [source.copy() for source in sources]
+            kept = set()
+            lowest = self._focus[2] + FAR_BELOW
+            if self._profile is None:
+                meshes = _ground(model, data, ground, middle, lowest)
+            else:  # one surface rather than boxes that overlap
+                meshes = {int(model.geom_matid[ground][0]): _planar_ground(self._profile)}
+            for material, mesh in meshes.items():
+                kept.add(f'ground_{material}')
+                self._handles[f'ground_{material}'] = self._server.scene.add_batched_meshes_trimesh(
+                    f'/ground_{material}', _tiled(mesh, self._colours[material]),
+                    batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), lod='off', cast_shadow=False,
+                    batched_positions=offset[None],
+                )  # fmt: skip
+            for name, handle in self._handles.items():
+                if name.startswith('ground') and name not in kept:
+                    handle.visible = False
+        for name, handle in self._handles.items():
+            if name.startswith('ground'):
+                handle.batched_positions = offset[None]
+
+    def _draw_samples(self, points: np.ndarray) -> None:
+        points = points.astype(np.float32)
+        if 'samples' in self._handles:
+            _assign(self._handles['samples'], visible=True, points=points)
+        else:
+            self._handles['samples'] = self._server.scene.add_point_cloud(
+                '/samples', points, SAMPLE_COLOUR, point_size=SAMPLE_SIZE, point_shape='circle',
+                precision='float32',
+            )  # fmt: skip
+
+
+def _assign(handle: Any, **values: Any) -> None:
+    for name, value in values.items():
+        setattr(handle, name, value)
+
+
+def root_body(environment: Any) -> int:
+    """Returns the number of the character's root body; of a task without, of the first that moves."""
+    model, figure = environment.physics.model, getattr(environment.task, 'figure', None)
+    if figure is None:
+        return int(np.flatnonzero(model.body_weldid)[0])
+    joint = np.flatnonzero(model.jnt_qposadr == figure.pose_qpos[0])[0]
+    return int(model.jnt_bodyid[joint])
+
+
+def _instances(
+    scene: Any, model: Any, material_colours: np.ndarray, is_ground: np.ndarray, lowest: float
+) -> Iterator[tuple[Any, ...]]:
+    """Yields shape, position, axes, scales and colour of what a scene consists of.
+
+    The ground is left out, as is what lies below the lowest height, m.
+    """
+    kinds, of_model = mujoco.mjtGeom, int(mujoco.mjtObj.mjOBJ_GEOM)
+    for geom in scene.geoms[: scene.ngeom]:
+        position, colour, kind = geom.pos.copy(), geom.rgba.copy(), geom.type
+        if colour[3] == 0 or position[2] < lowest:
+            continue
+        if geom.objtype == of_model and is_ground[geom.objid]:
+            continue
+        axes, size = geom.mat.copy(), geom.size.copy()
+        if geom.matid >= 0:
+            colour *= material_colours[geom.matid]
+        if kind == kinds.mjGEOM_BOX:
+            yield 'box', position, axes, size, colour
+        elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
+            yield 'sphere', position, axes, size, colour
+        elif kind == kinds.mjGEOM_CYLINDER:
+            yield 'cylinder', position, axes, size, colour
+        elif kind == kinds.mjGEOM_CAPSULE:
+            end, ball = size[2] * axes[:, 2], np.full(3, size[0])
+            yield 'tube', position, axes, size, colour
+            yield 'sphere', position + end, axes, ball, colour
+            yield 'sphere', position - end, axes, ball, colour
+        elif kind in _ARROWS:
+            half, along, width = 0.5 * SHAFT * size[2], axes[:, 2], size[0]
+            yield 'cylinder', position + half * along, axes, (width, width, half), colour
+            tip = (2 * width, 2 * width, TIP * size[2])
+            yield 'cone', position + 2 * half * along, axes, tip, colour
+        elif kind == kinds.mjGEOM_MESH:
+            yield f'mesh_{model.geom_dataid[geom.objid]}', position, axes, np.ones(3), colour
+
+
+@functools.cache
+def _shape(name: str) -> trimesh.Trimesh:
+    """Returns a mesh of size 1."""
+    if name == 'box':
+        return trimesh.creation.box(extents=(2, 2, 2))
+    if name == 'sphere':
+        return trimesh.creation.icosphere(subdivisions=3)
+    if name == 'cylinder':
+        return trimesh.creation.cylinder(1.0, 2.0, SECTIONS)
+    if name == 'cone':
+        return trimesh.creation.cone(1.0, 1.0, sections=SECTIONS)
+    return trimesh.creation.annulus(0.999, 1.0, 2.0, sections=SECTIONS)  # a tube
+
+
+def _mesh(name: str, model: Any) -> trimesh.Trimesh:
+    kind, _, number = name.partition('_')
+    if kind != 'mesh':
+        return _shape(name)
+    mesh = model.mesh(int(number))
+    vertices = slice(int(mesh.vertadr[0]), int(mesh.vertadr[0] + mesh.vertnum[0]))
+    faces = slice(int(mesh.faceadr[0]), int(mesh.faceadr[0] + mesh.facenum[0]))
+    return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
+
+
+def _ground(
+    model: Any, data: Any, is_ground: np.ndarray, middle: np.ndarray, lowest: float
+) -> dict[int, trimesh.Trimesh]:
+    """Returns the geoms of the ground in world coordinates, one mesh per material."""
+    parts: dict[int, list[trimesh.Trimesh]] = {}
+    for geom in np.flatnonzero(is_ground):
+        kind, place = model.geom_type[geom], data.geom_xpos[geom]
+        if place[2] < lowest:
+            continue
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+            corners = PLANE * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+            corners = corners + np.array([middle[0], middle[1], place[2]])
+            mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+        elif kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+            mesh = _height_field(model, data, int(geom))
+        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+            axes = data.geom_xmat[geom].reshape(3, 3)
+            box = _shape('box')
+            # Corners of their own for each face, so that each is flat.
+            corners = (box.vertices * model.geom_size[geom])[box.faces.ravel()] @ axes.T + place
+            mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+        else:
+            continue
+        parts.setdefault(int(model.geom_matid[geom]), []).append(mesh)
+    return {
+        material: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
+        for material, meshes in parts.items()
+    }
+
+
+def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
+    """Returns the window of a planar ground: its profile, as wide as the boxes of the physics."""
+    heights, vertical = ground.heights[0], ground.vertical[0]
+    x = (ground.start[0] + np.arange(len(heights))) * SPACING
+    # Vertical faces stand in the middle of their cells.
+    face = np.flatnonzero(vertical[1:])
+    middle = 0.5 * (x[face] + x[face + 1])
+    x, z = (
+        np.insert(line, np.repeat(face + 1, 2), np.stack(pair, 1).ravel())
+        for line, *pair in ((x, middle, middle), (heights, heights[face], heights[face + 1]))
+    )
+    slope = np.diff(z) / np.maximum(np.diff(x), 1e-9)
+    kept = np.concatenate([[True], np.abs(np.diff(slope)) > 1e-6, [True]])
+    x, z = x[kept], z[kept]
+    bottom = np.full(len(x), z.min() - DEPTH)
+    front, back = -HALF_WIDTH, HALF_WIDTH
+    strips = [((front, z), (back, z)), ((front, bottom), (front, z)), ((back, z), (back, bottom))]
+    corners = []
+    for (y_right, z_right), (y_left, z_left) in strips:
+        right = np.stack([x, np.full(len(x), y_right), z_right], 1)
+        left = np.stack([x, np.full(len(x), y_left), z_left], 1)
+        # Two triangles for each piece, with corners of their own, so that each is flat.
+        corners.append(
+            np.stack([right[:-1], right[1:], left[1:], right[:-1], left[1:], left[:-1]], 1)
+        )
+    vertices = np.concatenate(corners).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3), process=False)
+
+
+def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
+    """Returns the surface of a height field in world coordinates."""
+    field = int(model.geom_dataid[geom])
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    start = int(model.hfield_adr[field])
+    x, y, z, _ = model.hfield_size[field]
+    heights = z * model.hfield_data[start : start + rows * columns]
+    across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+    local = np.stack([across.ravel(), along.ravel(), heights], axis=1)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, above = corner + 1, corner + columns
+    faces = np.concatenate(
+        [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
+    )
+    turned = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    return trimesh.Trimesh(turned.astype(np.float32), faces, process=False)
+
+
+def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
+    """Paints the ground with squares of the world's x and y; sides with stripes."""
+    from PIL import Image
+
+    shades = np.array(SHADES)[np.array([[0, 1], [1, 0]])]
+    pixels = np.kron(shades[..., None] * colour[:3], np.ones((32, 32, 1)))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(_bytes(pixels)), metallicFactor=0.0, roughnessFactor=1.0
+    )
+    mesh.visual = trimesh.visual.TextureVisuals(mesh.vertices[:, :2] / (2 * TILE), material)
+    return mesh
+
+
+def _material_colours(model: Any) -> np.ndarray:
+    """Returns the mean colour of each material, white as the last for none, (materials + 1, 4)."""
+    colours = np.ones((model.nmat + 1, 4))
+    colours[:-1] = model.mat_rgba
+    textures = model.mat_texid[:, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
+    for i in np.flatnonzero(textures >= 0):
+        texture = model.tex(int(textures[i]))
+        start, channels = int(texture.adr[0]), int(texture.nchannel[0])
+        count = int(texture.width[0] * texture.height[0]) * channels
+        pixels = model.tex_data[start : start + count].reshape(-1, channels)
+        colours[i, :3] *= pixels[:, :3].mean(0) / 255
+    return colours
+
+
+def _quaternions(axes: np.ndarray) -> np.ndarray:
+    """Returns unit quaternions wxyz, (k, 4), of rotation matrices (k, 3, 3)."""
+    found = np.empty((len(axes), 4))
+    for quaternion, matrix in zip(found, axes.reshape(-1, 9).astype(float), strict=True):
+        mujoco.mju_mat2Quat(quaternion, matrix)
+    return found.astype(np.float32)
+
+
+def _bytes(colours: np.ndarray) -> np.ndarray:
+    return (255 * np.clip(colours, 0, 1)).round().astype(np.uint8)

@@ -1,0 +1,271 @@
+"""A viewer in the web browser, on any environment: `trl-suite view ID --browser`.
+
+    from trl_suite.viewing import browser
+
+    viewer = browser.Browser('PD_Dog2D_Gaps_Terrain-v0').start()
+    viewer  # shows itself in a notebook; else open viewer.url
+    viewer.stop()
+
+Several browsers may look at one viewer at the same time. It listens on this machine only unless told
+otherwise; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import queue
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import mujoco
+
+from trl_suite import suite
+from trl_suite.environments import named_policies
+from trl_suite.environments.environment import Environment
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.rendering import overlays, web_scene
+from trl_suite.viewing import panel
+from trl_suite.viewing.session import FRAME, Policy, Session
+
+HOST, PORT = '127.0.0.1', 8080
+IDLE = 0.01  # s; between two looks at what was asked for
+PLOT_INTERVAL = 0.25  # s
+PLAN, CLIP, SAMPLES = 'plan and goal', 'reference clip', 'observed terrain'
+DECORATION = {  # drawn by MuJoCo
+    'contacts': mujoco.mjtVisFlag.mjVIS_CONTACTPOINT,
+    'contact forces': mujoco.mjtVisFlag.mjVIS_CONTACTFORCE,
+    'joint axes': mujoco.mjtVisFlag.mjVIS_JOINT,
+    'centres of mass': mujoco.mjtVisFlag.mjVIS_COM,
+}
+
+
+class Loaded(NamedTuple):
+    """An environment with all policies that fit it, and which of them acts."""
+
+    spec: EnvSpec
+    environment: Environment
+    policies: dict[str, Policy]
+    policy: str
+
+
+class Browser:
+    """A viewer that web browsers show. Its methods may be called from any thread.
+
+    Attributes:
+      url: where it is.
+      session: the environment and the policy that acts.
+      playing: whether time passes.
+      speed: how fast; 1 is real time.
+      shown: what is drawn beside the bodies, by name.
+    """
+
+    session: Session
+
+    def __init__(
+        self,
+        spec: str | EnvSpec,
+        policy: str = 'best',
+        seed: int = 0,
+        host: str = HOST,
+        port: int = PORT,
+    ) -> None:
+        """Opens the viewer; time passes in `run` or after `start`.
+
+        Args:
+          spec: an id, an alias, or what `suite.combine` returns.
+          policy: 'best', one of `named_policies.POLICIES`, or an .npz file.
+          seed: of the environment, and of random actions.
+          host: address to listen on; '0.0.0.0' lets every machine of the network in.
+          port: the first that is tried, then the next ones.
+
+        Raises:
+          ValueError: an unknown id or policy, or a policy that does not fit.
+          FileNotFoundError: there is no such file.
+          ImportError: the extra 'viewer' is not installed.
+          OSError: nothing can listen on this address.
+        """
+        web_scene.load_viser()
+        self.playing, self.speed, self.seed = True, 1.0, seed
+        self.shown = {PLAN: True, CLIP: False, SAMPLES: False, **dict.fromkeys(DECORATION, False)}
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._stopped = threading.Event()
+        self._thread: threading.Thread | None = None
+        loaded = self._load(spec, policy)  # before a server that an error would leave behind
+        self._uploads = tempfile.TemporaryDirectory(prefix='trl_suite_')
+        self._server = web_scene.start_server(host, port)
+        self.url = f'http://{host}:{self._server.get_port()}'
+        self._panel = panel.Panel(self._server, self)
+        self._show(loaded)
+
+    def run(self) -> None:
+        """Lets time pass until `stop` or a keyboard interrupt, then closes the viewer."""
+        due = plotted = 0.0
+        try:
+            while not self._stopped.is_set():
+                self._serve()
+                now = time.perf_counter()
+                if not self.playing or now < due:
+                    time.sleep(IDLE if not self.playing else min(due - now, IDLE))
+                    continue
+                passed = self.session.advance() or FRAME
+                self._draw()
+                # Where frames take longer than they last, time goes slower; none is left out.
+                due = max(now, due) + passed / self.speed
+                if now - plotted > PLOT_INTERVAL:
+                    plotted = now
+                    self._panel.plot(self.session)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            web_scene.stop_server(self._server)
+            self._uploads.cleanup()
+
+    def start(self) -> Browser:
+        """Lets time pass in a thread of its own, and returns the viewer."""
+        self._thread = threading.Thread(target=self.run, daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Ends `run`, or what `start` has started."""
+        self._stopped.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" width="100%" height="600" style="border: none"></iframe>'
+
+    # What can be asked for: it is done between two frames, by the thread in which time passes.
+
+    def play(self, playing: bool) -> None:
+        """Lets time pass, or stops it."""
+        self._ask(lambda: setattr(self, 'playing', playing))
+
+    def step(self) -> None:
+        """Stops time, and goes on by one frame."""
+
+        def step() -> None:
+            self.playing = False
+            self.session.advance()
+            self._redraw()
+
+        self._ask(step)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begins the next episode, or the first one of a seed."""
+
+        def reset() -> None:
+            self.seed = self.seed if seed is None else seed
+            self.session.reset(seed)
+            self._redraw()
+
+        self._ask(reset)
+
+    def push(self, direction: str, speed: float) -> None:
+        """Pushes the character; see `Session.push`."""
+        self._ask(lambda: self.session.push(direction, speed))
+
+    def show(self, name: str, shown: bool) -> None:
+        """Shows or hides one of `shown`."""
+
+        def show() -> None:
+            self.shown[name] = shown
+            self._draw()
+
+        self._ask(show)
+
+    def follow(self, followed: bool) -> None:
+        """Keeps the character in the middle, or leaves the view to the users."""
+
+        def follow() -> None:
+            self._scene.follow = followed
+            self._draw()
+            for client in self._server.get_clients().values():
+                self._scene.look_at_character(client)
+
+        self._ask(follow)
+
+    def choose_environment(self, spec: str | EnvSpec) -> None:
+        """Shows another environment, with its best policy."""
+
+        def choose() -> None:
+            self._panel.report({'loading': str(spec)}, self.playing)
+            self._show(self._load(spec, 'best'))
+
+        self._ask(choose)
+
+    def choose_terrain(self, terrain: str | Mapping[str, Any]) -> None:
+        """Puts the character on another terrain, what `terrain.load` takes."""
+
+        def choose() -> None:
+            spec, _, _, policy = self._loaded
+            self._show(self._load(spec.with_terrain(terrain), policy))
+
+        self._ask(choose)
+
+    def choose_policy(self, name: str) -> None:
+        """Lets another policy act, from the first episode of the seed on."""
+
+        def choose() -> None:
+            spec, environment, policies, _ = self._loaded
+            if name not in policies:
+                policies[name] = named_policies.policy(name, environment, spec.id, self.seed)
+            self._show(Loaded(spec, environment, policies, name))
+
+        self._ask(choose)
+
+    def upload_policy(self, name: str, content: bytes) -> None:
+        """Lets a policy act that was sent as an .npz file."""
+        path = pathlib.Path(self._uploads.name) / pathlib.Path(name).name
+        path.write_bytes(content)
+        self.choose_policy(str(path))
+
+    # How it is done.
+
+    def _ask(self, work: Callable[[], None]) -> None:
+        self._requests.put(work)
+
+    def _serve(self) -> None:
+        while not self._requests.empty():
+            try:
+                self._requests.get()()
+            except (ValueError, OSError, RuntimeError) as error:
+                self._panel.tell(' '.join(str(error).split()))
+
+    def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
+        spec = suite.find(spec) if isinstance(spec, str) else spec
+        environment = suite.build_environment(spec, {'random': self.seed}, {})
+        policies = named_policies.available(environment, spec.id, self.seed)
+        if policy == 'best':
+            policy = next(iter(policies))
+        elif policy not in policies:
+            policies[policy] = named_policies.policy(policy, environment, spec.id, self.seed)
+        return Loaded(spec, environment, policies, policy)
+
+    def _show(self, loaded: Loaded) -> None:
+        self._loaded = loaded
+        self.session = Session(loaded.environment, loaded.policies[loaded.policy], self.seed)
+        self._scene = web_scene.WebScene(self._server, loaded.environment)
+        self._panel.show(loaded, self.session)
+        self._redraw()
+
+    def _draw(self) -> None:
+        task: Any = self.session.environment.task
+        drawn, samples = [], None
+        if self.shown[PLAN] and overlays.has_markers(task):
+            drawn.append(overlays.markers(task))
+        if self.shown[CLIP] and overlays.has_ghost(task):
+            drawn.append(overlays.ghost(task))
+        if self.shown[SAMPLES] and overlays.observes_terrain(task):
+            samples = overlays.terrain_samples(task, self.session.environment.physics)
+        for name, flag in DECORATION.items():
+            self._scene.option.flags[flag] = self.shown[name]
+        self._scene.update(drawn, samples, jump=self.session.time_step.first())
+        self._panel.report(self.session.status(), self.playing)
+
+    def _redraw(self) -> None:
+        self._draw()
+        self._panel.plot(self.session)

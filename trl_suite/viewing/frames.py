@@ -1,0 +1,68 @@
+"""Long steps, of gaits and of plans of footsteps, played back in frames of 1/30 s."""
+
+from __future__ import annotations
+
+import collections
+from typing import TYPE_CHECKING, Any
+
+import dm_env
+import numpy as np
+
+from trl_suite import rendering
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+
+
+class Frames(dm_env.Environment):
+    """An environment whose long steps are shown frame by frame, 1/30 s each.
+
+    A step is simulated as a whole and then played back: every step of this environment puts the
+    simulation into the state of the next frame, the last one into that from which it goes on. Actions
+    count, and the policy is asked, only where no frame is left.
+    """
+
+    def __init__(self, environment: Environment, policy: rendering.Policy) -> None:
+        self._environment, self._policy = environment, policy
+        self._left: collections.deque[dict[str, Any]] = collections.deque()
+        self._action = np.zeros(environment.action_spec().shape)
+
+    def policy(self, time_step: dm_env.TimeStep) -> np.ndarray:
+        """Returns the action that is due, of a step that is being played back the one it had."""
+        if not self._left:
+            self._action = self._policy(time_step)
+        return self._action
+
+    @property
+    def is_within_step(self) -> bool:
+        """Whether frames of a step are left."""
+        return bool(self._left)
+
+    def reset(self) -> dm_env.TimeStep:
+        self._left.clear()
+        self._end = self._environment.reset()
+        return self._end
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        environment = self._environment
+        if not self._left:
+            with rendering.watching(
+                environment, lambda: self._left.append(environment.get_state())
+            ):
+                self._end = environment.step(action)
+            self._left.append(environment.get_state())
+        environment.set_state(self._left.popleft())
+        if self._left:
+            return dm_env.transition(0.0, environment.observation())
+        return self._end
+
+    def observation_spec(self) -> Any:
+        return self._environment.observation_spec()
+
+    def action_spec(self) -> Any:
+        return self._environment.action_spec()
+
+    @property
+    def physics(self) -> Any:
+        """The simulation, as the viewer draws it."""
+        return self._environment.physics

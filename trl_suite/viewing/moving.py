@@ -1,0 +1,248 @@
+"""Moving pictures of environments: some seconds under the best policy, with the character in view."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from dm_control.mujoco import engine
+
+from trl_suite import rendering, suite
+from trl_suite.environments import named_policies
+from trl_suite.environments.environment import Environment
+from trl_suite.rendering import overlays
+from trl_suite.rendering.web_scene import root_body
+from trl_suite.util.files import Path, check_path, replacing
+
+SUFFIXES = ('.webp',)
+SIZE = (300, 480)  # height and width, pixels
+SAMPLES, SHADOWS = 4, 4096  # per pixel, and of shadows, so that edges are smooth
+FRAME = 1 / 30  # s; between two moments
+STRIDE = 2  # moments per picture: 15 pictures per second
+SECONDS = 4.0
+SEEDS = range(1, 7)  # tried one after the other until an episode lasts
+# Seed and begin, s, of episodes that show what an environment is about, where first seconds do not.
+SCENES = {
+    'PD_Biped3D_HLC_Soccer-v0': (8, 8.0),
+    'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0),
+    'PD_Biped3D_HLC_Conveyors-v0': (2, 23.0),
+    'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 11.0),
+}
+# From where it is seen, the most wanted first: azimuth from the heading and elevation, degrees.
+PLANAR_VIEWS = ((74.0, -12.0),)
+SPATIAL_VIEWS = (
+    (50.0, -20.0), (-50.0, -20.0), (130.0, -20.0), (-130.0, -20.0), (20.0, -25.0), (50.0, -42.0),
+    (-50.0, -42.0), (0.0, -50.0), (90.0, -65.0),
+)  # fmt: skip
+VIEW_COST = 0.02  # share of the time hidden that a view may save before a less wanted one is taken
+LOOKS = 8  # moments at which it is tried whether obstacles hide the character
+FILL = 0.5  # of the picture's height or width by the character
+SMOOTH = 15  # moments; spread of the average that the camera follows
+QUALITY = 70  # of WebP
+
+
+class Shot(NamedTuple):
+    """An episode to be drawn.
+
+    Attributes:
+      states: of the environment, `FRAME` apart.
+      root: where the character's root was, (moments, 3) m.
+      lasted: whether the episode did not fail.
+    """
+
+    states: list[dict[str, Any]]
+    root: np.ndarray
+    lasted: bool
+
+
+def moving_picture(
+    id: str, seconds: float = SECONDS, size: tuple[int, int] = SIZE
+) -> list[np.ndarray]:
+    """Draws an environment under its best policy; see `named_policies.best`.
+
+    Args:
+      id: of the environment.
+      seconds: how long; less if all episodes that are tried fail before.
+      size: height and width, pixels.
+
+    Returns:
+      Pictures `STRIDE` * `FRAME` apart, each (height, width, 3) uint8.
+
+    Raises:
+      RuntimeError: there is no OpenGL to draw with.
+    """
+    id = suite.find(id).id
+    environment = suite.make(id)
+    _, policy = named_policies.best(environment, id)
+    seeds, begin = ([SCENES[id][0]], SCENES[id][1]) if id in SCENES else (SEEDS, 0.0)
+    best: Shot | None = None
+    for seed in seeds:
+        shot = _take(environment, policy, seed, begin, seconds)
+        if best is None or len(shot.states) > len(best.states):
+            best = shot
+        if shot.lasted:
+            break
+    assert best is not None
+    return _draw(environment, best, size)
+
+
+def side_by_side(
+    rows: Sequence[Sequence[str]], seconds: float, size: tuple[int, int]
+) -> list[np.ndarray]:
+    """Draws several environments at once, in rows, as long as the shortest lasts.
+
+    Arguments, but for the rows of ids, and errors are those of `moving_picture`.
+    """
+    grid = [[moving_picture(id, seconds, size) for id in row] for row in rows]
+    count = min(len(images) for row in grid for images in row)
+    return [
+        np.concatenate([np.concatenate([images[k] for images in row], axis=1) for row in grid])
+        for k in range(count)
+    ]
+
+
+def save(images: Sequence[np.ndarray], path: Path, source: str = '') -> None:
+    """Writes pictures of `moving_picture` as an animated WebP that plays for ever, in real time.
+
+    Args:
+      images: (h, w, 3) uint8 each.
+      path: where to; .webp.
+      source: digest of what they show, which is kept in the file.
+
+    Raises:
+      ValueError: no pictures, or another suffix.
+      OSError: the file cannot be written.
+    """
+    from PIL import Image
+
+    path = check_path(path, SUFFIXES)
+    if not images:
+        raise ValueError('a moving picture of no pictures')
+    first, *others = map(Image.fromarray, images)
+    content = io.BytesIO()
+    first.save(
+        content, 'webp', save_all=True, append_images=others, loop=0, quality=QUALITY, method=4,
+        duration=round(1000 * STRIDE * FRAME), xmp=source.encode(),
+    )  # fmt: skip
+    with replacing(path) as part:
+        part.write_bytes(content.getvalue())
+
+
+def _take(
+    environment: Environment,
+    policy: Callable[[Any], np.ndarray],
+    seed: int,
+    begin: float,
+    seconds: float,
+) -> Shot:
+    """Runs an episode, and keeps its states from a time on, s."""
+    states: list[dict[str, Any]] = []
+    root, body = [], root_body(environment)
+    count, first, last = 0, round(begin / FRAME), round((begin + seconds) / FRAME)
+
+    def look() -> None:
+        nonlocal count
+        if first <= count <= last:
+            states.append(environment.get_state())
+            root.append(environment.physics.data.xpos[body].copy())
+        count += 1
+
+    environment.random_state.seed(seed)
+    time_step = environment.reset()
+    look()
+    with rendering.watching(environment, look) as watched:
+        while count <= last and not time_step.last():
+            time_step = environment.step(policy(time_step))
+            if not watched:
+                look()
+    return Shot(states, np.array(root), not time_step.last() or time_step.discount > 0)
+
+
+def _draw(environment: Environment, shot: Shot, size: tuple[int, int]) -> list[np.ndarray]:
+    physics, task = environment.physics, environment.task
+    environment.set_state(shot.states[0])
+    figure = _extent(environment)
+    height, width = size
+    view = np.tan(0.5 * np.deg2rad(physics.model.vis.global_.fovy))
+    distance = 0.5 / (view * FILL) * max(figure[2], max(figure[:2]) * height / width)
+    middle = _smooth(shot.root)
+    azimuth, elevation = _free_view(environment, shot, middle, distance)
+    drawn = overlays.of_task(task)
+
+    def add(physics: Any, scene: Any) -> None:
+        for overlay in drawn:
+            overlay(physics, scene)
+
+    # Read when the context is made, by the first picture.
+    quality = physics.model.vis.quality
+    quality.offsamples, quality.shadowsize = SAMPLES, SHADOWS
+    physics.model.vis.global_.offheight, physics.model.vis.global_.offwidth = size
+    rendering.check_gl(physics)
+    camera = engine.MovableCamera(physics, height, width, scene_callback=add)
+    images = []
+    for state, place in zip(shot.states[::STRIDE], middle[::STRIDE], strict=True):
+        environment.set_state(state)
+        camera.set_pose(place, distance, azimuth, elevation)
+        images.append(camera.render().copy())
+    return images
+
+
+def _extent(environment: Environment) -> np.ndarray:
+    """Returns the size of the box around the character, along x, y, z, (3,) m."""
+    model, data = environment.physics.model, environment.physics.data
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[root_body(environment)]
+    places, radii = data.geom_xpos[own], model.geom_rbound[own, None]
+    return (places + radii).max(0) - (places - radii).min(0)
+
+
+def _smooth(path: np.ndarray) -> np.ndarray:
+    """Returns a weighted average of each place and those before and after it, (k, 3) m."""
+    offsets = np.arange(-3 * SMOOTH, 3 * SMOOTH + 1)
+    weights = np.exp(-0.5 * (offsets / SMOOTH) ** 2)
+    weights /= weights.sum()
+    # Beyond the ends it goes on as it began and ended.
+    pace = (path[-1] - path[0]) / max(1, len(path) - 1)
+    before = path[0] + offsets[offsets < 0, None] * pace
+    after = path[-1] + offsets[offsets > 0, None] * pace
+    longer = np.concatenate([before, path, after])
+    return np.stack([np.convolve(column, weights, 'valid') for column in longer.T], axis=1)
+
+
+def _free_view(
+    environment: Environment, shot: Shot, middle: np.ndarray, distance: float
+) -> tuple[float, float]:
+    """Returns azimuth and elevation, degrees, from which no obstacle hides the character."""
+    if not environment.task.arena.terrain.spatial:
+        return PLANAR_VIEWS[0]
+    travelled = shot.root[-1] - shot.root[0]
+    heading = np.rad2deg(np.arctan2(travelled[1], travelled[0]))
+    views = [(heading + azimuth, elevation) for azimuth, elevation in SPATIAL_VIEWS]
+    cost = VIEW_COST * np.arange(len(views))
+    moments = rendering.spread(len(shot.states), LOOKS)
+    for k in moments:
+        environment.set_state(shot.states[k])
+        for i, (azimuth, elevation) in enumerate(views):
+            a, e = np.deg2rad([azimuth, elevation])
+            ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+            cost[i] += _hidden(environment, middle[k] - distance * ahead) / len(moments)
+    return views[int(cost.argmin())]
+
+
+def _hidden(environment: Environment, eye: np.ndarray) -> float:
+    """Returns which part of the character's links cannot be seen from a place."""
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    root = root_body(environment)
+    own = np.flatnonzero(model.body_rootid == model.body_rootid[root])
+    geom, hidden = np.zeros(1, np.int32), 0
+    for link in own:
+        ray = data.xpos[link] - eye
+        mujoco.mj_ray(model, data, eye, ray, None, 1, -1, geom)
+        hit = (
+            geom[0] >= 0
+            and model.body_rootid[model.geom_bodyid[geom[0]]] != model.body_rootid[root]
+        )
+        hidden += bool(hit)
+    return hidden / len(own)
