@@ -801,7 +801,7 @@ class ActionMapTest(parameterized.TestCase):
 
     def test_no_muscles(self):
         for name in NAMES:
-            with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; those who have"):
+            with self.assertRaisesRegex(ValueError, f"'{name}' has no muscles; these have"):
                 actuation.add(characters.make(name), 'muscle', TIMESTEP)
 
 
