@@ -1085,7 +1085,7 @@ class OptionTest(parameterized.TestCase):
         ({'start_phases': (-0.1,)}, 'start_phases is'), ({'substeps': 5}, 'substeps is 5'),
         ({'controller': 'PD_Biped3D_LLC_Genral_Step-v0'}, 'did you mean'),
         ({'start_phase': 0.1}, "unknown option.*'start_phases'"),
-        ({'goal_distance': 5}, 'goal_distance is 5; expected the least'),
+        ({'goal_distance': 5}, 'goal_distance is 5; expected minimum'),
         ({'goal_distance': (5, 3)}, 'goal_distance is'), ({'step_length': 0}, 'step_length is 0'),
         ({'goal_distance': (5, 1e9)}, 'goal_distance is .*; expected at most 100 m'),
         ({'step_length': 'long'}, "step_length is 'long'; expected a number"),
