@@ -195,7 +195,7 @@ def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
         learnt(spec),
         *rules,
         *about,
-        '## Differs from the original\n\n'
+        '## Differences from the original\n\n'
         + '\n'.join(f'- {describe.escape(text)}' for text in describe.differences_of(spec))
         + '\n\nReasons are in [Differences from the original](../differences.md).',
     )

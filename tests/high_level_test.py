@@ -772,17 +772,17 @@ class ControllerTest(FolderTest):
         (lambda n: np.zeros((n, 16)), r'shape \(1, 16\); expected \(1, 17\)'),
         (lambda n: np.zeros((n, 18)), r'shape \(1, 18\)'), (lambda n: np.zeros(17), r'shape \(17,\)'),
         (lambda n: np.zeros((n + 1, 17)), r'shape \(2, 17\)'), (lambda n: np.zeros(()), r'shape \(\)'),
-        (lambda n: np.full((n, 17), np.nan), 'no finite action for simulation 0'),
-        (lambda n: np.full((n, 17), np.inf), 'no finite action for simulation 0'),
-        (lambda n: None, r'no numbers|shape'), (lambda n: 'left', 'no numbers'),
-        (lambda n: [[1, 2], [3]], 'no numbers'),
+        (lambda n: np.full((n, 17), np.nan), 'an action that is not finite for observation 0'),
+        (lambda n: np.full((n, 17), np.inf), 'an action that is not finite for observation 0'),
+        (lambda n: None, r'not return numbers|shape'), (lambda n: 'left', 'not return numbers'),
+        (lambda n: [[1, 2], [3]], 'not return numbers'),
     )  # fmt: skip
     def test_invalid_actions_of_a_controller_are_rejected(self, answer, message):
         def crooked(observation):
             return answer(len(observation))
 
         environment, _ = started(PLANE, controller=crooked)
-        with self.assertRaisesRegex(ValueError, f'controller crooked gives .*({message})'):
+        with self.assertRaisesRegex(ValueError, f'controller crooked .*({message})'):
             environment.step(AHEAD)
 
     def test_errors_name_the_simulation(self):
@@ -1085,7 +1085,7 @@ class OptionTest(parameterized.TestCase):
         ({'start_phases': (-0.1,)}, 'start_phases is'), ({'substeps': 5}, 'substeps is 5'),
         ({'controller': 'PD_Biped3D_LLC_Genral_Step-v0'}, 'did you mean'),
         ({'start_phase': 0.1}, "unknown option.*'start_phases'"),
-        ({'goal_distance': 5}, 'goal_distance is 5; expected the least'),
+        ({'goal_distance': 5}, 'goal_distance is 5; expected minimum'),
         ({'goal_distance': (5, 3)}, 'goal_distance is'), ({'step_length': 0}, 'step_length is 0'),
         ({'goal_distance': (5, 1e9)}, 'goal_distance is .*; expected at most 100 m'),
         ({'step_length': 'long'}, "step_length is 'long'; expected a number"),

@@ -114,7 +114,7 @@ def combine(
     """Returns the `EnvSpec` of a combination, which `VectorEnvironment` and Gymnasium accept.
 
     Args:
-      character: name in `trl_suite.characters.CHARACTERS`, or a `CharacterSpec` of the user's own.
+      character: name in `trl_suite.characters.CHARACTERS`, or a custom `CharacterSpec`.
       actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'. Not for the task
         'gait', whose controller computes the torques.
       terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; planar for a

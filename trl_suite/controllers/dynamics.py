@@ -69,10 +69,10 @@ def skeleton(character: Character, world: World) -> Skeleton:
     # MuJoCo stores the lower triangle by rows, in the order of its own degrees of freedom, so that
     # either of a pair may be the row.
     places = np.full((model.nv, model.nv), -1)
-    for env_id in range(model.nv):
-        start = model.M_rowadr[env_id]
-        for k in range(start, start + model.M_rownnz[env_id]):
-            places[env_id, model.M_colind[k]] = places[model.M_colind[k], env_id] = k
+    for row in range(model.nv):
+        start = model.M_rowadr[row]
+        for k in range(start, start + model.M_rownnz[row]):
+            places[row, model.M_colind[k]] = places[model.M_colind[k], row] = k
     joint, body = model.dof_jntid[dof].astype(int), model.dof_bodyid[dof].astype(int)
     hinge = np.arange(len(names)) >= 2  # all but root_x and root_z
     moves = np.zeros((model.nbody, len(names)), bool)
@@ -111,12 +111,12 @@ def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndar
     rest = -2 * np.arctan2(model.body_quat[:, 2], model.body_quat[:, 0])
     coefficients = np.zeros((len(joints), len(skeleton.dof)))
     constants = np.zeros(len(joints))
-    for env_id, joint in enumerate(joints):
+    for row, joint in enumerate(joints):
         body = skeleton.body[3 + joint]
-        coefficients[env_id] = skeleton.moves[body]
-        coefficients[env_id, 3 + joint] = 0.0
+        coefficients[row] = skeleton.moves[body]
+        coefficients[row, 3 + joint] = 0.0
         while body:
-            constants[env_id] += rest[body]
+            constants[row] += rest[body]
             body = model.body_parentid[body]
     return coefficients, constants
 
@@ -128,10 +128,10 @@ def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndar
 def write_inertia(i: int, skeleton: Skeleton, M: np.ndarray, out: np.ndarray) -> None:
     """Writes the joint-space inertia into out[i], (D, D)."""
     count = len(skeleton.dof)
-    for env_id in range(count):
+    for row in range(count):
         for column in range(count):
-            entry = skeleton.entry[env_id, column]
-            out[i, env_id, column] = M[i, entry] if entry >= 0 else 0.0
+            entry = skeleton.entry[row, column]
+            out[i, row, column] = M[i, entry] if entry >= 0 else 0.0
 
 
 @compiled
@@ -160,19 +160,19 @@ def weight(
 
 @compiled
 def write_jacobian(
-    i: int, body: int, x: float, z: float, env_id: int, skeleton: Skeleton, xanchor: np.ndarray,
+    i: int, body: int, x: float, z: float, row: int, skeleton: Skeleton, xanchor: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes d(x, z) / d(degrees of freedom) of a point of a body to two rows of out[i], (., D).
 
-    The rows are `env_id` and the next one. The columns of slides other than those of the root are
+    The rows are `row` and the next one. The columns of slides other than those of the root are
     0.
     """
     for k in range(len(skeleton.dof)):
         joint, moves = skeleton.joint[k], skeleton.moves[body, k]
-        out[i, env_id, k] = -(z - xanchor[i, joint, 2]) if moves else 0.0
-        out[i, env_id + 1, k] = x - xanchor[i, joint, 0] if moves else 0.0
-    out[i, env_id, 0] = out[i, env_id + 1, 1] = 1.0
+        out[i, row, k] = -(z - xanchor[i, joint, 2]) if moves else 0.0
+        out[i, row + 1, k] = x - xanchor[i, joint, 0] if moves else 0.0
+    out[i, row, 0] = out[i, row + 1, 1] = 1.0
 
 
 @compiled
@@ -184,9 +184,9 @@ def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
     """
     for k in range(n):
         pivot = k
-        for env_id in range(k + 1, n):
-            if abs(matrix[i, env_id, k]) > abs(matrix[i, pivot, k]):
-                pivot = env_id
+        for row in range(k + 1, n):
+            if abs(matrix[i, row, k]) > abs(matrix[i, pivot, k]):
+                pivot = row
         if pivot != k:
             for column in range(k, n):
                 kept = matrix[i, k, column]
@@ -196,13 +196,13 @@ def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
             vector[i, k] = vector[i, pivot]
             vector[i, pivot] = kept
         inverse = 1.0 / matrix[i, k, k]
-        for env_id in range(k + 1, n):
-            factor = matrix[i, env_id, k] * inverse
+        for row in range(k + 1, n):
+            factor = matrix[i, row, k] * inverse
             if factor == 0.0:
                 continue
             for column in range(k + 1, n):
-                matrix[i, env_id, column] -= factor * matrix[i, k, column]
-            vector[i, env_id] -= factor * vector[i, k]
+                matrix[i, row, column] -= factor * matrix[i, k, column]
+            vector[i, row] -= factor * vector[i, k]
     for k in range(n - 1, -1, -1):
         x = vector[i, k]
         for column in range(k + 1, n):

@@ -326,18 +326,18 @@ def put_down(
     body: PlanarBody, ground: PlanarWindows, qpos: np.ndarray, qvel: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes poses and velocities of characters placed at x = 0; see `PlanarFigure.place`."""
-    for env_id in range(len(env_ids)):
-        i = env_ids[env_id]
-        height = poses[env_id, 1] + planar_ground.height(i, 0.0, ground)
+    for row in range(len(env_ids)):
+        i = env_ids[row]
+        height = poses[row, 1] + planar_ground.height(i, 0.0, ground)
         lift = 0.0
         for k in range(extents.shape[2]):
-            centre, half = extents[env_id, 0, k], extents[env_id, 1, k]
+            centre, half = extents[row, 0, k], extents[row, 1, k]
             level = planar_ground.height(i, centre - half, ground)
             level = max(level, planar_ground.height(i, centre, ground))
             level = max(level, planar_ground.height(i, centre + half, ground))
-            depth = level - (height + extents[env_id, 2, k])
+            depth = level - (height + extents[row, 2, k])
             lift = max(lift, depth + CLEARANCE)
-        poses[env_id, 0], poses[env_id, 1] = 0.0, height + lift
+        poses[row, 0], poses[row, 1] = 0.0, height + lift
         for k in range(len(body.qpos)):
-            qpos[i, body.qpos[k]] = poses[env_id, k]
-            qvel[i, body.dof[k]] = rates[env_id, k]
+            qpos[i, body.qpos[k]] = poses[row, k]
+            qvel[i, body.dof[k]] = rates[row, k]

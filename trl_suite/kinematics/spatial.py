@@ -312,34 +312,34 @@ class Corners(NamedTuple):
 
 @compiled
 def put_down(
-    i: int, env_id: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
+    i: int, row: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
     measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
-    """Places the character of simulation i, from row `env_id` of poses, rates and spawns.
+    """Places the character of simulation i, from row `row` of poses, rates and spawns.
 
     See `SpatialFigure.place`.
     """
     body, physics, ground = measured.body, measured.state, measured.ground
     for k in range(len(body.qpos)):
-        physics.qpos[i, body.qpos[k]] = poses[env_id, k]
+        physics.qpos[i, body.qpos[k]] = poses[row, k]
     for k in range(len(body.dof)):
-        physics.qvel[i, body.dof[k]] = rates[env_id, k]
-    angle = spawns[env_id, 2]
+        physics.qvel[i, body.dof[k]] = rates[row, k]
+    angle = spawns[row, 2]
     cosine, sine = math.cos(angle), math.sin(angle)
-    x, y = poses[env_id, 0], poses[env_id, 1]
-    x, y = spawns[env_id, 0] + (cosine * x - sine * y), spawns[env_id, 1] + (sine * x + cosine * y)
+    x, y = poses[row, 0], poses[row, 1]
+    x, y = spawns[row, 0] + (cosine * x - sine * y), spawns[row, 1] + (sine * x + cosine * y)
     see_movers(i, physics.qpos, ground)
-    z = poses[env_id, 2] + spatial_ground.height(i, x, y, ground)
+    z = poses[row, 2] + spatial_ground.height(i, x, y, ground)
     columns = body.qpos
     physics.qpos[i, columns[0]], physics.qpos[i, columns[1]] = x, y
     physics.qpos[i, columns[2]] = z
     half_cosine, half_sine = math.cos(angle / 2), math.sin(angle / 2)
-    q_w, q_x, q_y, q_z = poses[env_id, 3], poses[env_id, 4], poses[env_id, 5], poses[env_id, 6]
+    q_w, q_x, q_y, q_z = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
     physics.qpos[i, columns[3]] = half_cosine * q_w - half_sine * q_z
     physics.qpos[i, columns[4]] = half_cosine * q_x - half_sine * q_y
     physics.qpos[i, columns[5]] = half_cosine * q_y + half_sine * q_x
     physics.qpos[i, columns[6]] = half_cosine * q_z + q_w * half_sine
-    v_x, v_y = rates[env_id, 0], rates[env_id, 1]
+    v_x, v_y = rates[row, 0], rates[row, 1]
     physics.qvel[i, body.dof[0]] = cosine * v_x - sine * v_y
     physics.qvel[i, body.dof[1]] = sine * v_x + cosine * v_y
     native.forward(i, engine)
@@ -366,8 +366,8 @@ def put_down_all(
     corners: Corners, measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
     """Places characters on the ground; takes packs."""
-    for env_id in range(len(env_ids)):
-        put_down(env_ids[env_id], env_id, poses, rates, spawns, corners, measured, engine)
+    for row in range(len(env_ids)):
+        put_down(env_ids[row], row, poses, rates, spawns, corners, measured, engine)
 
 
 class SpatialFigure:

@@ -55,9 +55,9 @@ def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
 
 
 @compiled_inline
-def feature(env_id: int, rest: float, column: int, tracks: TrackTable) -> float:
+def feature(row: int, rest: float, column: int, tracks: TrackTable) -> float:
     """Returns a feature, interpolated at a row and remainder from `moment`."""
-    return tracks.steps[env_id, column] * rest + tracks.table[env_id, column]
+    return tracks.steps[row, column] * rest + tracks.table[row, column]
 
 
 class SpatialReference:
@@ -131,8 +131,8 @@ class SpatialReference:
         tracks = self.tracks
         u = share * tracks.samples
         sample = np.minimum(np.floor(u), tracks.samples - 1)
-        env_id = sample.astype(np.int64) + track * (tracks.samples + 1)
-        return tracks.steps[env_id] * (u - sample)[:, None] + tracks.table[env_id]
+        row = sample.astype(np.int64) + track * (tracks.samples + 1)
+        return tracks.steps[row] * (u - sample)[:, None] + tracks.table[row]
 
 
 def _stacked(

@@ -147,7 +147,9 @@ class SpatialTask(Task):
                 'need them'
             )
         if mirrored and not phase:
-            raise ValueError('mirrored observations need the phase, which tells the stance foot')
+            raise ValueError(
+                'mirrored observations need the phase, which determines the stance foot'
+            )
         self.character, self.arena, self.motion = character, arena, motion
         self.actuation_model, self.config = actuation_model, config
         self.mirrored = mirrored

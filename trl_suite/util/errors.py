@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 
 LIKE, ALIKE = 0.6, 0.4  # `cutoff` of `difflib.get_close_matches`, for few and for many names
-FEW = 20  # up to as many names the stricter cutoff applies, since all can be listed instead
+FEW = 20  # with at most this many names the stricter cutoff applies, since all can be listed
 MANY = 40  # names; of more only some are listed
 KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # types, singular and plural in words
     bool: ((bool, np.bool_), 'True or False', 'bools'),

@@ -68,9 +68,7 @@ def comparison(
 
 
 @compiled
-def pose_error(
-    i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
-) -> float:
+def pose_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
     """Weighted sum of squared angles between rotations and squared differences of angles, rad^2."""
     error, mine = 0.0, found.features
     count = (by.angles - by.rotations) // 4
@@ -78,64 +76,60 @@ def pose_error(
         column = by.rotations + 4 * joint
         dot = square = 0.0
         for k in range(column, column + 4):
-            other = feature(env_id, rest, k, by.tracks)
+            other = feature(row, rest, k, by.tracks)
             dot += mine[i, k] * other
             square += other * other
         angle = 2 * math.acos(min(abs(dot) / math.sqrt(square), 1.0))  # the shortest rotation
         error += by.pose_weights[joint] * (angle * angle)
     for joint in range(by.rates - by.angles):
-        off = mine[i, by.angles + joint] - feature(env_id, rest, by.angles + joint, by.tracks)
+        off = mine[i, by.angles + joint] - feature(row, rest, by.angles + joint, by.tracks)
         error += by.pose_weights[count + joint] * (off * off)
     return error
 
 
 @compiled
-def rate_error(
-    i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
-) -> float:
+def rate_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
     """Weighted sum of squared differences of rates, rad^2/s^2."""
     error = 0.0
     for k in range(by.effectors - by.rates):
-        off = found.features[i, by.rates + k] - feature(env_id, rest, by.rates + k, by.tracks)
+        off = found.features[i, by.rates + k] - feature(row, rest, by.rates + k, by.tracks)
         error += by.rate_weights[k] * (off * off)
     return error
 
 
 @compiled
 def effector_error(
-    i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
+    i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement
 ) -> float:
     """Mean over end effectors of the squared distance, m^2."""
     error, count = 0.0, by.com_velocity - by.effectors
     for k in range(by.effectors, by.com_velocity):
-        off = found.features[i, k] - feature(env_id, rest, k, by.tracks)
+        off = found.features[i, k] - feature(row, rest, k, by.tracks)
         error += off * off
     return error / (count // 3)
 
 
 @compiled
 def com_error(
-    i: int, env_id: int, rest: float, turned: float, by: Comparison, found: SpatialMeasurement
+    i: int, row: int, rest: float, turned: float, by: Comparison, found: SpatialMeasurement
 ) -> float:
     """Scaled squared difference of the velocities of the centre of mass, m^2/s^2.
 
     The velocity of the reference is rotated about z by `turned`, rad.
     """
     cosine, sine = math.cos(turned), math.sin(turned)
-    x = feature(env_id, rest, by.com_velocity, by.tracks)
-    y = feature(env_id, rest, by.com_velocity + 1, by.tracks)
+    x = feature(row, rest, by.com_velocity, by.tracks)
+    y = feature(row, rest, by.com_velocity + 1, by.tracks)
     off_x = found.com_velocity[i, 0] - (cosine * x - sine * y)
     off_y = found.com_velocity[i, 1] - (sine * x + cosine * y)
-    off_z = found.com_velocity[i, 2] - feature(env_id, rest, by.com_velocity + 2, by.tracks)
+    off_z = found.com_velocity[i, 2] - feature(row, rest, by.com_velocity + 2, by.tracks)
     return rewards.COM_ERROR_FACTOR * (off_x * off_x + off_y * off_y + off_z * off_z)
 
 
 @compiled
-def height_error(
-    i: int, env_id: int, rest: float, by: Comparison, found: SpatialMeasurement
-) -> float:
+def height_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
     """Squared difference of the heights of the root, m^2."""
-    off = found.features[i, by.height] - feature(env_id, rest, by.height, by.tracks)
+    off = found.features[i, by.height] - feature(row, rest, by.height, by.tracks)
     return off * off
 
 
