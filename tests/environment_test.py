@@ -667,6 +667,7 @@ class ConstructionTest(parameterized.TestCase):
         physics = environment.physics
         freed = [weakref.ref(each) for each in (physics.model.ptr, physics.data.ptr)]
         environment.close()
+        mjcf.Physics.from_xml_string('<mujoco/>')  # dm_control keeps the last model it parsed
         gc.collect()
         self.assertEqual([each() for each in freed], [None, None])
         for look in (lambda: environment.task, lambda: environment.info, environment.action_spec):
