@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -39,6 +40,14 @@ def run(*arguments):
         except SystemExit as stop:  # argparse, after --help and --version
             status = stop.code
     return status, out.getvalue(), err.getvalue()
+
+
+@functools.cache
+def info(id_):
+    """Output of `trl-suite info` for an environment, which it has to build."""
+    status, out, err = run('info', id_)
+    assert (status, err) == (0, '')
+    return out
 
 
 class CommandTest(parameterized.TestCase):
@@ -125,7 +134,7 @@ class ListTest(CommandTest):
 class InfoTest(CommandTest):
     @parameterized.parameters(*catalogue.BY_ID)
     def test_describes_every_environment(self, id_):
-        out = self.output('info', id_)
+        out = info(id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
         rules = suite.find(id_).task_type
@@ -147,7 +156,7 @@ class InfoTest(CommandTest):
 
     def test_figures(self):
         # Sizes from the original's registry, limits from its character file.
-        out = self.output('info', GAPS)
+        out = info(GAPS)
         self.assertIn('Observation: 104 numbers', out)
         self.assertRegex(out, r'\n  terrain +0 +50 +50 +m ')
         self.assertRegex(out, r'\n  phase +99 +104 +5 ')
@@ -161,14 +170,14 @@ class InfoTest(CommandTest):
         self.assertIn('256 steps, 8.53 s', out)
 
     def test_muscles_have_peak_forces(self):
-        out = self.output('info', 'MTU_Biped2D_LLC_Imitate_Flat-v0')
+        out = info('MTU_Biped2D_LLC_Imitate_Flat-v0')
         self.assertIn('Action: 16 numbers in [-1, 1]; excitation = action_offset', out)
         self.assertRegex(out, r'\n  right_VAS +0\.505 +0\.495 +6000\n')
         self.assertRegex(out, r'\n  strain +29 +45 +16 ')
 
     def test_gaits(self):
         # Sizes, figures and rules from the original's controllers.
-        out = self.output('info', 'FSM_Dog2D_Terrain_Gaps-v0')
+        out = info('FSM_Dog2D_Terrain_Gaps-v0')
         self.assertRegex(out, r'\n  hip +\S+ +\S+ to \S+ +300 +130 +13 +the world\n')
         self.assertRegex(out, r'\n  knee +2 +-3.14 to 0 +300 +50 +5 +its parent\n')
         self.assertRegex(out, r'\n  Extend +finger touches the ground\n')
@@ -197,17 +206,15 @@ class InfoTest(CommandTest):
         self.assertRegex(out, 'one cycle, at most 1.67 s; control 600 Hz, physics 1200 Hz;.*truncated\n'
                          r'  \(discount 1\) after 256 steps')  # fmt: skip
         self.assertNotRegex(out, 'backwards|negative|stance leg')
-        out = self.output('info', 'FSM_Raptor2D_Terrain_Gaps-v0')
+        out = info('FSM_Raptor2D_Terrain_Gaps-v0')
         self.assertIn('Contact.SpineCurve 0', out)
         self.assertIn('action 0 is base action 1\n', out)
         self.assertIn('\n  0 if v is negative\n', out)
         self.assertEqual(out.count('the stance leg first'), 2)
-        self.assertIn(
-            'the root moves backwards', self.output('info', 'FSM_Biped2D_Terrain_Gaps-v0')
-        )
+        self.assertIn('the root moves backwards', info('FSM_Biped2D_Terrain_Gaps-v0'))
 
     def test_a_prismatic_joint(self):
-        out = self.output('info', 'FSM_Hopper2D_Terrain_Gaps-v0')
+        out = info('FSM_Hopper2D_Terrain_Gaps-v0')
         self.assertRegex(out, r'\n  hip +0.2 +-1.57 to 1.57 +2500 +200 +20 +the world\n')
         self.assertRegex(
             out, r'\n  leg +0.2 +-0.2 to 0.2 m +180 N +1000 N/m +20 N s/m +its parent\n'
@@ -223,7 +230,7 @@ class InfoTest(CommandTest):
 
     def test_three_dimensions(self):
         # Sizes and figures of the original's character and controller.
-        out = self.output('info', 'PD_Biped3D_LLC_General_Step-v0')
+        out = info('PD_Biped3D_LLC_General_Step-v0')
         self.assertIn('Observation: 125 numbers', out)
         for name, start, stop in (
             ('pose', 0, 57), ('velocity', 57, 105), ('phase', 105, 110), ('contact', 110, 112),
@@ -249,24 +256,24 @@ class InfoTest(CommandTest):
         self.assertIn('steps 0.5 m long, feet 0.15 m apart', out)
         self.assertIn('N(0, 0.25) rad', out)
         self.assertIn('physics 300 Hz', out)
-        out = self.output('info', 'PD_Biped3D_LLC_Symetric_Step-v0')
+        out = info('PD_Biped3D_LLC_Symetric_Step-v0')
         self.assertIn('Observation: 117 numbers', out)
         self.assertRegex(out, r'\n +110 +111 +1  rad +planned heading')
         self.assertIn('\nMirrored: ', out)
-        out = self.output('info', 'PD_Biped3D_Imitate-Stairs-v0')
+        out = info('PD_Biped3D_Imitate-Stairs-v0')
         self.assertIn('Observation: 112 numbers', out)
         self.assertRegex(out, r'\n  goal +110 +112 +2  rad, m +bearing')
         self.assertIn('\nTerrain: stairs3d (var3d_stairs)\n', out)
         self.assertIn('StepHeightMax 0.12', out)
         self.assertIn('period 1 s, 1.2 m/s', out)
         self.assertNotIn('\nPlan in the observation', out)
-        out = self.output('info', 'PD_Biped3D_FULL_Imitate-Steps-v0')
+        out = info('PD_Biped3D_FULL_Imitate-Steps-v0')
         self.assertIn('Action: 35 numbers', out)
         self.assertRegex(out, r'\n  head +106 +113 +203 +209\n')
 
     def test_high_level(self):
         # Sizes, ranges and rewards of the specification.
-        out = self.output('info', 'PD_Biped3D_HLC_DynamicsObstacles-v0')
+        out = info('PD_Biped3D_HLC_DynamicsObstacles-v0')
         self.assertIn('Observation: 2155 numbers', out)
         for name, start, stop in (
             ('surface', 0, 2048), ('pose', 2048, 2105), ('velocity', 2105, 2153),
@@ -293,7 +300,7 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'one of root, torso touches the ground in 4\s+consecutive\s+samples')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
-        out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
+        out = info('PD_Biped3D_HLC_Soccer-v0')
         self.assertIn('Observation: 116 numbers', out)
         self.assertRegex(out, r'\n  ball +107 +116 +9 ')
         self.assertRegex(out, r'distance of the goal from the ball')
@@ -398,7 +405,7 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'goal_navigation', 'completion'}),
         ):
             with self.subTest(id_):
-                out = self.output('info', id_).split('\nDifferences')[1]
+                out = info(id_).split('\nDifferences')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
     def test_unknown_ids_suggest_the_closest(self):

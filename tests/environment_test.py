@@ -1,5 +1,8 @@
 """Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
+import gc
+import weakref
+
 import dm_env
 import numpy as np
 import pytest
@@ -655,6 +658,21 @@ class ConstructionTest(parameterized.TestCase):
             environment.step(np.zeros(11))
         with self.assertRaisesRegex(RuntimeError, 'closed'):
             environment.reset()
+
+    @parameterized.parameters(*EXAMPLES)
+    def test_close_frees_the_simulation(self, id_):
+        environment = suite.make(id_, {'random': 0})
+        environment.reset()
+        environment.step(random_actions(environment, 1)[0])
+        physics = environment.physics
+        freed = [weakref.ref(each) for each in (physics.model.ptr, physics.data.ptr)]
+        environment.close()
+        mjcf.Physics.from_xml_string('<mujoco/>')  # dm_control keeps the last model it parsed
+        gc.collect()
+        self.assertEqual([each() for each in freed], [None, None])
+        for look in (lambda: environment.task, lambda: environment.info, environment.action_spec):
+            with self.assertRaisesRegex(RuntimeError, 'closed'):
+                look()
 
 
 if __name__ == '__main__':

@@ -76,6 +76,7 @@ class Environment(composer.Environment):
         # reset.
         self._mjcf_never_compiled = False
         self._parts = tuple(task.blocks.items())
+        self._action_map = task.action_map
         # Whether an entity or the user has hooks around a step; calling none of them saves time.
         self._hooked = bool(
             self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
@@ -152,16 +153,28 @@ class Environment(composer.Environment):
         return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
 
     def close(self) -> None:
-        """Frees the simulation; may be called twice."""
+        """Frees the simulation and the task; may be called twice."""
         if self._physics is not None:
             super().close()
+            # All of them lead to arrays in the model and its data, which would stay with them.
+            self._task = self._hooks = self._observation_updater = None  # type: ignore[assignment]
+
+    @property
+    def task(self) -> Task:
+        """The rules, with arrays of one simulation.
+
+        Raises:
+          RuntimeError: after `close`.
+        """
+        self._check_open()
+        return self._task
 
     def _check_open(self) -> None:
         if self._physics is None:
             raise RuntimeError('the environment is closed')
 
     def _observe(self) -> dict[str, np.ndarray]:
-        row = self._task.observation[0].copy()
+        row = self.task.observation[0].copy()
         if self._flat_observation:
             observation = {FLAT_OBSERVATION_KEY: row}
         else:
@@ -175,6 +188,9 @@ class Environment(composer.Environment):
             else:
                 observation.update(extra)
         return observation
+
+    def action_spec(self) -> specs.BoundedArray:
+        return self.task.action_spec(self._physics_proxy)
 
     def observation_spec(self) -> dict[str, specs.Array]:
         return {
@@ -191,12 +207,12 @@ class Environment(composer.Environment):
     @property
     def blocks(self) -> dict[str, slice]:
         """Slice of each observation block in the flat vector."""
-        return dict(self._task.blocks)
+        return dict(self._parts)
 
     @property
     def action_map(self) -> Any:
         """The map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`)."""
-        return self._task.action_map
+        return self._action_map
 
     @property
     def step_limit(self) -> int | None:
@@ -205,7 +221,7 @@ class Environment(composer.Environment):
     @property
     def info(self) -> dict[str, Any]:
         """Further results of the last step, by name: see the task's `info_arrays`."""
-        return self._task.info_of(0)
+        return self.task.info_of(0)
 
     # State.
 
@@ -216,7 +232,7 @@ class Environment(composer.Environment):
         that was built in the same way.
         """
         return {
-            'made_for': self._task.signature,
+            'made_for': self.task.signature,
             'world': self._task.world.get_state(0),
             'task': self._task.get_state(0),
             'random': self._random_state.get_state(),
@@ -230,7 +246,7 @@ class Environment(composer.Environment):
         Raises:
           ValueError: the state belongs to another environment; this one is unchanged.
         """
-        expected, found = self._task.signature, state.get('made_for')
+        expected, found = self.task.signature, state.get('made_for')
         if found != expected:
             raise ValueError(f'the state belongs to {found}; this environment is {expected}')
         self._task.set_state(0, state['task'])
