@@ -167,8 +167,9 @@ class Learner:
         self.settings, self.seed, self.threads = settings, seed, threads
         s, n = settings, settings.num_envs
         self.random = np.random.default_rng(seed)
+        seeds = self.random.integers(2**32, size=n).tolist()  # other ones than an evaluation's
         self.environments = VectorEnvironment(
-            id_, n, threads, seed, autoreset='disabled', step_limit=None
+            id_, n, threads, seeds, autoreset='disabled', step_limit=None
         )
         environments = self.environments
         parameters = environments.task.gait.parameters

@@ -139,14 +139,12 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
         own, default = (
             float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
         )
-        published, to_fall = PUBLISHED_DISTANCES.get(id_), '–'
-        if far := run.get('to_first_fall'):
-            low, high = far['distance_interval']
-            to_fall = f'{far["distance"]:.0f} ({low:.0f} to {high:.0f})'
+        published = PUBLISHED_DISTANCES.get(id_)
+        low, high = run['evaluation']['distance_interval']
         rows.append([
             f'`{id_}`', f'{own:.1f}', f'{default:.1f}', f'{own / default:.1f}',
-            f'{run["evaluation"]["distance"]:.1f}', f'{stored[id_]["distance"]:.1f}',
-            to_fall,
+            f'{run["evaluation"]["distance"]:.1f} ({low:.1f} to {high:.1f})',
+            f'{stored[id_]["distance"]:.1f}', f'{run["evaluation"]["speed"]:.2f}',
             f'{published}' if published else '–',
             f'{run["curve"][-1]["samples"] / 1e3:.0f} k', str(run['seed']),
         ])  # fmt: skip
@@ -252,9 +250,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         parts += [
             '## Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
-            'default gait, in the same episodes, which 256 cycles cut; *to the first fall*: mean of '
-            f'{train_all.FALL_EPISODES} episodes that only {train_all.FALL_STEPS} cycles cut, with its '
-            '95 % interval. A decision is a cycle: of `examples/search_gaits.py` one whose base actions '
+            f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which '
+            f'{catalogue.GAIT_STEP_LIMIT} cycles cut; of the mean the 95 % interval; speed in m/s. '
+            'A decision is a cycle: of `examples/search_gaits.py` one whose base actions '
             'were all tried, of `examples/learn_gaits.py` one that was taken. In 2016: the mean that the paper of Peng, Berseth and van de Panne reports for '
             'some 10 million cycles, in another simulator, as we remember it (not checked).',
             table(
@@ -265,7 +263,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'ratio',
                     'mean',
                     'default',
-                    'to the first fall',
+                    'speed',
                     '2016',
                     'decisions',
                     'seed',

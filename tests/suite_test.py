@@ -162,7 +162,7 @@ class CatalogueTest(parameterized.TestCase):
             self.assertEqual((row.domain, row.actuation, row.clip), ('terrainrl', 'gait', None))
             ground = id_.split('_', 3)[3].removesuffix('-v0')
             self.assertEqual(row.task, f'{figure[:-2]}_{ground}'.lower())
-            self.assertEqual((dict(row.options), row.step_limit), ({}, 256))
+            self.assertEqual((dict(row.options), row.step_limit), ({}, 5000))
 
     @parameterized.parameters(*list(GAITS)[::4])
     def test_what_an_id_of_a_gait_says(self, id_):
@@ -172,7 +172,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(task.character.row.name, FIGURES[id_.split('_')[1]])
         self.assertEqual(task.interface, 'parameters')
         self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity'])
-        self.assertEqual(environment.step_limit, 256)
+        self.assertEqual(environment.step_limit, 5000)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
     def test_three_dimensions(self):

@@ -224,8 +224,12 @@ _DIFFERENCES: tuple[tuple[Callable[[catalogue.Row], bool], str], ...] = (
         'faces of the terrain are exactly vertical, and every start has flat ground from -1 to 1 m',
     ),
     (
-        lambda row: not _HIGH(row),
+        lambda row: not _HIGH(row) and row.rules != 'gait',
         f'episodes are cut after {catalogue.STEP_LIMIT} steps (discount 1)',
+    ),
+    (
+        lambda row: row.rules == 'gait',
+        f'episodes are cut after {catalogue.GAIT_STEP_LIMIT} cycles (discount 1)',
     ),
     (
         _HIGH,
