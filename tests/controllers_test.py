@@ -88,6 +88,8 @@ class ParametersTest(parameterized.TestCase):
         self.assertCountEqual(controllers.available(), NAMES)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
             controllers.load('dgo')
+        with self.assertRaisesRegex(ValueError, "unknown base_actions 'orginal'.*'original'"):
+            controllers.load('dog', 'orginal')
 
     @parameterized.parameters(*COUNTS)
     def test_counts(self, name):
@@ -108,8 +110,9 @@ class ParametersTest(parameterized.TestCase):
                 self.assertStartsWith(parameter, f'{state}.')
 
     @parameterized.parameters(*FIGURES)
-    def test_base_actions(self, name):
-        gait = controllers.load(name)
+    def test_base_actions_of_the_original(self, name):
+        gait = controllers.load(name, 'original')
+        self.assertLen(gait.base_actions, len(gait.blends))
         for parameter, (value, half_range) in FIGURES[name].items():
             place = gait.place(parameter)
             self.assertAlmostEqual(gait.base_actions[0, place], value, places=6, msg=parameter)
@@ -122,9 +125,9 @@ class ParametersTest(parameterized.TestCase):
         idle = np.delete(np.arange(len(gait.names)), gait.actions)
         np.testing.assert_array_equal(gait.half_range[idle], 0)
 
-    @parameterized.parameters(*NAMES)
-    def test_actions_reach_base_actions(self, name):
-        gait = controllers.load(name)
+    @parameterized.product(name=NAMES, base_actions=('default', 'original'))
+    def test_actions_reach_base_actions(self, name, base_actions):
+        gait = controllers.load(name, base_actions)
         actions = gait.action(gait.base_actions)
         self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
         np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # none is out of reach

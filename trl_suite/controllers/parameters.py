@@ -15,7 +15,7 @@ One JSON file per character:
     absolute                 parameters whose sign does not count
     target_speed             m/s, of the reward
     sets                     name -> vector
-    base_actions             [set, set, blend]: the gaits that the papers' mixture of experts mixed
+    base_actions             [set, set, blend]: gaits to choose from; they bound the actions
     centre                   action 0: a set by name, or a base action by number
     search_scale             by name, without state: standard deviations for a search
     start                    the pose of the first instant: height of the root m, pitch rad, velocity
@@ -23,6 +23,9 @@ One JSON file per character:
 
 and, where a character is an exception:
 
+    original_base_actions    the gaits that the papers' mixture of experts mixed, where base_actions
+                             are our own
+    tuning                   by set: how it was searched, and its scores
     gravity_compensation     false: legs of a bound on the ground do not carry the weight
     forward_only             true: a root that moves backwards is a fall
     backward_reward          false: a cycle backwards earns nothing
@@ -30,7 +33,7 @@ and, where a character is an exception:
     observe_pitch            true: pitch and its rate take the place of the last link's z and its rate
 
 Source of the figures: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
-Panne (2016); the sets 'tuned' of biped2d_simbicon and goat are our own.
+Panne (2016). The sets of which 'tuning' tells are our own.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ import numpy as np
 from trl_suite import errors
 
 KINDS = ('bound', 'stride', 'hop')
+BASE_ACTIONS = ('default', 'original')
 REWARD = {'speed': 0.8, 'stumble': 0.2}
 
 
@@ -126,16 +130,25 @@ def available() -> tuple[str, ...]:
 
 
 @functools.cache
-def load(character: str) -> Parameters:
+def load(character: str, base_actions: str = 'default') -> Parameters:
     """Returns the parameters of a character's gait.
 
+    Args:
+      character: its name.
+      base_actions: 'default', or 'original': those of the papers, where the default ones are our own.
+
     Raises:
-      ValueError: the character has none.
+      ValueError: the character has no gait, or `base_actions` is neither.
     """
+    if base_actions not in BASE_ACTIONS:
+        raise ValueError(errors.unknown('base_actions', base_actions, BASE_ACTIONS))
     if character not in available():
         raise ValueError(errors.unknown('character with a gait', character, available()))
     text = (importlib.resources.files(__package__) / f'{character}.json').read_text()
-    return read(json.loads(text))
+    data = json.loads(text)
+    if base_actions == 'original':
+        data['base_actions'] = data.get('original_base_actions', data['base_actions'])
+    return read(data)
 
 
 def read(data: dict[str, Any]) -> Parameters:

@@ -9,6 +9,7 @@ from trl_suite import catalogue
 from trl_suite.describe.layout import Section, Table, section
 
 MEANINGS = {
+    'base_actions': "'default', or 'original': those of the papers, where the default ones are our own",
     'blend': "which of the terrain's parameter sets to draw from; 0 is the first, 0.5 half-way to the second",
     'centre': "pose at action 0: mean of the 'clip', working 'posture', or the 'original' map of actions",
     'controller': 'footstep controller: an id whose policy is shipped, a policy file, or a function',

@@ -17,7 +17,7 @@ from trl_suite import actuation, errors
 from trl_suite.action_map import ActionMap
 from trl_suite.arenas import PlanarTerrain
 from trl_suite.characters import Character
-from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, gaits
+from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, gaits, load
 from trl_suite.controllers.machine import GaitRules, touches
 from trl_suite.engine import World, native
 from trl_suite.kinematics.planar import (
@@ -405,6 +405,7 @@ class GaitTask(Task):
         arena: PlanarTerrain,
         *,
         interface: str = 'parameters',
+        base_actions: str = 'default',
         substeps: int = SUBSTEPS,
         spawn: str = 'intended',
         blend: float = 0.0,
@@ -419,6 +420,8 @@ class GaitTask(Task):
             default and +-1 the largest deviation of any base action. 'base_action': a step is 1/30
             s, and an action is one preference per base action, of which the largest counts when
             the next cycle begins.
+          base_actions: 'default', or 'original': those of the papers, where the default ones are our
+            own.
           substeps: physics steps per control step of 1/600 s.
           spawn: where the ground begins, see `trl_suite.terrain.Strip`.
           blend: which of the terrain's parameter sets.
@@ -436,7 +439,8 @@ class GaitTask(Task):
             raise ValueError(f'start_noise is {start_noise}; expected 0 or a positive number')
         self.character, self.arena, self.interface = character, arena, interface
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
-        self.gait = Gait(character, arena.ground_body, arena.mjcf_model)
+        parameters = load(character.row.name, base_actions)
+        self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._spawn, self._blend, self._noise = spawn, blend, float(start_noise)
         self._control_substeps = int(substeps)
         timestep = CONTROL_TIMESTEP / substeps
@@ -444,7 +448,6 @@ class GaitTask(Task):
         actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned without
             joint.damping = joint.armature = 0
-        parameters = self.gait.parameters
         if interface == 'parameters':
             names = tuple(parameters.names[i] for i in parameters.actions)
             self.action_map = ActionMap(

@@ -1,0 +1,283 @@
+"""Searches gaits that pass obstacles at which a character's other gaits fail.
+
+    python examples/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
+    python examples/tune_base_actions.py goat --terrain cliffs_rugged --alone
+    python examples/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
+
+For each terrain, in the order given, the gaits found so far run over it until they fall, and the
+states one to three cycles before these falls are kept. A gait's score in a state is how far the
+character gets if it takes that gait for one cycle (two where the legs change places each cycle) and
+the default gait in the next ones, as a share of what it usually travels in so many cycles. A set of
+gaits scores what its best one does in each state. CMA-ES (Hansen 2016, arXiv:1604.00772) searches
+the gait that, added to the set, raises this score most: what is found complements what is there.
+The scores that are stored are those in states that the search has not seen.
+
+With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
+at the end, as a share of the distance at the target speed.
+
+Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
+gaits of this file, or sets that are there, the base actions in
+`trl_suite/controllers/CHARACTER.json`. Needs `pip install 'trl_suite[tune]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cma
+import numpy as np
+import tune_gait
+
+from trl_suite import controllers, errors, files
+from trl_suite.controllers import Parameters
+
+BACK = 3  # cycles before a fall, at most, that a state is taken
+AFTER = 3  # cycles with the default gait after those with the candidate
+USUAL = 0.8  # share of the distance on flat ground that counts as all of it
+OTHERS = 0.3  # share of cycles in which another gait than the default one is taken before a fall
+HORIZON = 8.0  # s, of a gait alone
+STATES, VALIDATION = 32, 64  # in which gaits are scored that are searched, or have been found
+STARTS = 6  # noisy ones of a gait alone
+FINALISTS = 5  # the best of so many last generations, and the mean of the distribution
+FRICTION = 0.81
+DIGITS = 4
+
+
+class Obstacles:
+    """Simulations of one character on one terrain, with states from which its gaits soon fall.
+
+    Attributes:
+      default: gait that follows a candidate, (P,).
+      usual: m that the default gait travels on flat ground in so many cycles, times `USUAL`.
+    """
+
+    def __init__(self, gait: Parameters, terrain: str, default: np.ndarray, rows: int) -> None:
+        self.gait, self.default = gait, default
+        self.lead = 2 if gait.kind == 'stride' else 1
+        self.bench = tune_gait.Bench(gait.character, rows, gait.centre, terrain)
+        self.bench.environments.reset()
+        flat = tune_gait.Bench(gait.character, STARTS, gait.centre)
+        runs = tune_gait.measure(flat, default, [FRICTION])
+        flat.environments.close()
+        self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
+
+    def actions(self, vectors: np.ndarray) -> np.ndarray:
+        """Returns the actions of the simulations that mean parameters (..., P)."""
+        places = self.gait.actions
+        return (vectors - self.gait.centre)[..., places] / self.bench.half_range[places]
+
+    def collect(
+        self, vectors: np.ndarray, count: int, rng: np.random.Generator
+    ) -> list[dict[str, Any]]:
+        """Returns states soon before falls of some gaits (k, P), the first of them mostly."""
+        environments = self.bench.environments
+        environments.seed(int(rng.integers(2**32)))
+        environments.reset(list(range(count)))
+        past: list[list[dict[str, Any]]] = [[] for _ in range(count)]
+        going, back = np.ones(count, bool), rng.integers(1, BACK + 1, count)
+        action = np.zeros((environments.num_envs, len(self.gait.actions)))
+        while going.any():
+            ids = np.flatnonzero(going)
+            for i in ids.tolist():
+                past[i] = [*past[i], environments.get_state([i])][-BACK:]
+            chosen = rng.integers(len(vectors), size=len(ids)) * (rng.random(len(ids)) < OTHERS)
+            action[ids] = self.actions(vectors[chosen])
+            step = environments.step(action, ids)
+            ended = step.terminated | step.truncated
+            for i in ids[ended[ids]].tolist():
+                if len(past[i]) >= back[i]:
+                    going[i] = False
+                else:  # too early to go back
+                    environments.reset([i])
+                    past[i] = []
+        return [states[-number] for states, number in zip(past, back, strict=True)]
+
+    def scores(self, vectors: np.ndarray, states: Sequence[dict[str, Any]]) -> np.ndarray:
+        """Returns how far gaits (m, P) get from each state, as shares of the usual, (m, states)."""
+        environments, count = self.bench.environments, len(states)
+        most = environments.num_envs // count
+        found = []
+        for first in range(0, len(vectors), most):
+            part = vectors[first : first + most]
+            going = np.arange(len(part) * count)
+            for i in going.tolist():
+                environments.set_state(states[i % count], [i])
+            begin = self.position(going)
+            reached = begin.copy()
+            candidate, default = np.zeros((2, environments.num_envs, len(self.gait.actions)))
+            candidate[going] = np.repeat(self.actions(part), count, axis=0)
+            default[:] = self.actions(self.default)
+            for cycle in range(self.lead + AFTER):
+                step = environments.step(candidate if cycle < self.lead else default, going)
+                going = going[~(step.terminated | step.truncated)[going]]
+                reached[going] = self.position(going)
+                if not len(going):
+                    break
+            share = np.clip((reached - begin) / self.usual, 0, 1)
+            found.append(share.reshape(len(part), count))
+        return np.concatenate(found)
+
+    def alone(self, vectors: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        """Returns how far gaits (m, P) get when repeated from some starts, (m, starts)."""
+        n = len(vectors) * len(seeds)
+        runs = self.bench.run(
+            np.repeat(vectors, len(seeds), axis=0),
+            np.tile(seeds, len(vectors)),
+            HORIZON,
+            np.full(n, FRICTION),
+        )
+        share = runs.distance / (HORIZON * self.gait.target_speed)
+        return np.clip(share, 0, 1).reshape(len(vectors), len(seeds))
+
+    def position(self, env_ids: np.ndarray) -> np.ndarray:
+        """Returns where roots are, (m,) m."""
+        task = self.bench.task
+        return task.world.qpos[env_ids, int(task.figure.pose_qpos[0])]
+
+
+def search(
+    objective: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    gait: Parameters,
+    arguments: argparse.Namespace,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Returns gaits that came out best in late generations, and the mean of the last, (m, P)."""
+
+    def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
+        result = np.tile(start, (len(candidates), 1))
+        result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
+        result[:, gait.absolute] = np.abs(result[:, gait.absolute])
+        return result.round(DIGITS)
+
+    options = {
+        'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
+        'seed': int(rng.integers(1, 2**31)),
+    }  # fmt: skip
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(gait.actions)), arguments.sd, options)
+    finalists: list[np.ndarray] = []
+    for number in range(arguments.generations):
+        candidates = strategy.ask()
+        scores = objective(vectors(candidates))
+        strategy.tell(candidates, -scores)
+        finalists = [*finalists, candidates[scores.argmax()]][-FINALISTS:]
+        if number % 10 == 9:
+            print(f'  {number + 1:3} best {scores.max():.3f} mean {scores.mean():.3f}', flush=True)
+    return vectors([strategy.result.xfavorite, *finalists])
+
+
+def alone(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches a gait to repeat; returns it (P,), and scores of all in fresh episodes (m, starts)."""
+    seeds = rng.integers(2**32, size=(2, 4 * STARTS))
+    start = known[obstacles.alone(known, seeds[0]).mean(1).argmax()]
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return obstacles.alone(vectors, rng.integers(2**32, size=STARTS)).mean(1)
+
+    found = search(objective, start, obstacles.gait, arguments, rng)
+    chosen = found[obstacles.alone(found, seeds[0]).mean(1).argmax()]
+    return chosen, obstacles.alone(np.array([*known, chosen]), seeds[1])
+
+
+def complement(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches a gait to add; returns it (P,), and scores of all in fresh states (m, states)."""
+    states = obstacles.collect(known, STATES, rng)
+    before = obstacles.scores(known, states)
+    best = before.max(0)
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return np.maximum(obstacles.scores(vectors, states), best).mean(1)
+
+    found = search(objective, known[before.mean(1).argmax()], obstacles.gait, arguments, rng)
+    fresh = [obstacles.collect(known, VALIDATION, rng) for _ in range(2)]
+    best = obstacles.scores(known, fresh[0]).max(0)
+    chosen = found[np.maximum(obstacles.scores(found, fresh[0]), best).mean(1).argmax()]
+    return chosen, obstacles.scores(np.array([*known, chosen]), fresh[1])
+
+
+def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
+    """Makes gaits the base actions of a character, in this order."""
+    data = tune_gait.stored(character)
+    data.setdefault('tuning', {})
+    for name in names:
+        if name in found:
+            data['sets'][name] = found[name]['vector']
+            data['tuning'][name] = found[name]['tuning']
+        elif name not in data['sets']:
+            raise ValueError(errors.unknown('gait', name, [*found, *data['sets']]))
+    original = data.setdefault('original_base_actions', data['base_actions'])
+    data['base_actions'] = [[name, name, 0] for name in names]
+    used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
+    used.add(data['centre'])
+    for part in ('sets', 'tuning'):
+        data[part] = {name: value for name, value in data[part].items() if name in used}
+    return tune_gait.write(character, data)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('character', choices=controllers.available())
+    parser.add_argument('--terrain', nargs='+', default=[], help='one gait for each')
+    parser.add_argument('--alone', action='store_true', help='repeat the gait')
+    parser.add_argument('--start', nargs='+', help='sets and base actions by number; else action 0')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--sd', type=float, default=0.5, help='in search scales, at first')
+    parser.add_argument('--population', type=int, default=12)
+    parser.add_argument('--generations', type=int, default=30)
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument('--enter', nargs='+', metavar='SET', help='search nothing')
+    arguments = parser.parse_args()
+    gait = controllers.load(arguments.character)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    path = arguments.output / f'{gait.character}.json'
+    stored = json.loads(path.read_text()) if path.exists() else {}
+
+    if arguments.enter:
+        print(enter(gait.character, stored, arguments.enter))
+        return
+
+    def vector(name: str) -> np.ndarray:
+        if name in stored:
+            return np.array(stored[name]['vector'])
+        return tune_gait.vector_of(gait, name)
+
+    known = [vector(name) for name in arguments.start] if arguments.start else [gait.centre]
+    rng = np.random.default_rng(arguments.seed)
+    for terrain in arguments.terrain:
+        began = time.process_time()
+        print(gait.character, terrain, flush=True)
+        have = np.array(known)
+        rows = arguments.population * (STARTS if arguments.alone else STATES)
+        obstacles = Obstacles(gait, terrain, have[0], max(rows, 2 * VALIDATION))
+        tune = alone if arguments.alone else complement
+        chosen, scores = tune(obstacles, have, arguments, rng)
+        obstacles.bench.environments.close()
+        record = {
+            'terrain': terrain, 'search': tune.__name__,
+            'seed': arguments.seed, 'generations': arguments.generations,
+            'population': arguments.population, 'sd': arguments.sd,
+            'default': round(float(scores[0].mean()), 3),
+            'set_before': round(float(scores[:-1].max(0).mean()), 3),
+            'alone': round(float(scores[-1].mean()), 3),
+            'set_after': round(float(scores.max(0).mean()), 3),
+            'cpu_seconds': round(time.process_time() - began),
+        }  # fmt: skip
+        number = 1 + sum(name.rsplit('_', 1)[0] == terrain for name in stored)
+        stored[f'{terrain}_{number}'] = {'vector': chosen.tolist(), 'tuning': record}
+        known.append(chosen)
+        print(f'{terrain}_{number}', record, flush=True)
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(stored, indent=1))
+
+
+if __name__ == '__main__':
+    main()
