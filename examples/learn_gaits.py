@@ -44,7 +44,10 @@ class Settings:
 
     samples: float = 2e5  # cycles
     num_envs: int = 64
-    guided: float = 8e3  # first cycles, driven by the shipped policy, or by random base actions
+    start: str = ''  # id whose policy the run begins with, or a policy file; '': with none
+    guided: float = (
+        8e3  # first cycles, driven by `start`, the shipped policy or random base actions
+    )
     guide_epsilon: float = 0.15  # share of random actions in them
     begin: float = 2e3  # cycles before learning begins; they set the scales of the observation
     epsilon: float = 0.08  # share of random actions after them
@@ -79,6 +82,8 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Hopper2D_*': {'relief': 2.0},
     'FSM_Goat2D_*': {'relief': 1.6},
 }
+START_NOISE = 0.05  # standard deviations of a layer's weights
+CHOICE_ERROR = 1e-5  # actions are stored as float32
 CLIP = 5.0  # bound of what the networks see, in standard deviations
 _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
@@ -191,6 +196,10 @@ class Learner:
         )
         self.replay = Replay(int(s.capacity), len(self.columns))
         self.guide = policies.reference(id_) if id_ in policies.available() else None
+        if s.start:
+            shipped = s.start in policies.available()
+            self.guide = (policies.reference if shipped else policies.load)(s.start)
+            self.begin_with(self.guide)
         self.samples = self.updates = 0
         self.loss = 0.0
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
@@ -203,6 +212,37 @@ class Learner:
         self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
         # How often each row went back at this place, and the cycles since.
         self.tried = np.zeros((2, n), int)
+
+    def begin_with(self, policy: policies.Policy) -> None:
+        """Takes over the weights and scales of a policy that this program has trained.
+
+        The second network differs by `START_NOISE`, as two that are the same would stay the same.
+
+        Raises:
+          ValueError: its network or its choices are others.
+        """
+        line = policy.convolution
+        if line is None or not np.array_equal(policy.columns, self.columns):
+            raise ValueError(f'the network of {policy.id} sees the ground in another way')
+        if policy.choices.shape != self.choices.shape or (
+            np.abs(policy.choices - self.choices).max() > CHOICE_ERROR
+        ):
+            raise ValueError(f'{policy.id} chooses among other base actions')
+        self.mean, self.std = policy.mean.astype(float), policy.std.astype(float)
+        for number, network in enumerate(self.networks):
+            parts = [*network.filters, *network.hidden, network.last]
+            weights = [
+                *(w.transpose(2, 1, 0) for w in line.weights),
+                *(w.T for w in policy.weights),
+            ]
+            biases = [*line.biases, *policy.biases]
+            with torch.no_grad():
+                for part, weight, bias in zip(parts, weights, biases, strict=True):
+                    noise = number * START_NOISE * weight.std()
+                    noisy = weight + noise * self.random.standard_normal(weight.shape)
+                    part.weight.copy_(torch.from_numpy(noisy))
+                    part.bias.copy_(torch.tensor(bias))
+        self.targets.load_state_dict(self.networks.state_dict())
 
     def seen(self, observation: np.ndarray) -> torch.Tensor:
         """What the networks see of columns of observations."""
@@ -321,7 +361,7 @@ class Learner:
         begin, before, s = time.process_time(), self.samples, self.settings
         self.collect()
         middle = time.process_time()
-        if before < s.begin <= self.samples:
+        if before < s.begin <= self.samples and not s.start:
             self.set_scales()
         if self.samples >= s.begin:
             for _ in range(s.updates):

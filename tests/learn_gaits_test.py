@@ -90,6 +90,28 @@ class LearnTest(absltest.TestCase):
         expected = learner.choices[values.argmax(1)]
         np.testing.assert_allclose(policy(whole)[clear], expected[clear], atol=1e-6)
 
+    def test_a_run_begins_with_a_policy(self):
+        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+        for _ in range(6):
+            learner.advance()
+        with tempfile.TemporaryDirectory() as name:
+            path = f'{name}/policy.npz'
+            policies.save(learner.exported(), path)
+            settings = dataclasses.replace(TINY, start=path)
+            other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+            observation = learner.replay.before[: len(learner.replay)].astype(float)
+            with torch.no_grad():
+                seen = learner.seen(observation)
+                values = [learner.targets[0](seen), *(each(seen) for each in other.networks)]
+            np.testing.assert_allclose(values[1], values[0], atol=1e-5)
+            self.assertGreater(np.abs(values[2] - values[0]).max(), 1e-4)
+            before = other.mean.copy()
+            for _ in range(4):
+                other.advance()
+            np.testing.assert_array_equal(other.mean, before)
+        with self.assertRaisesRegex(ValueError, 'sees the ground in another way'):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, start=HOPPER), 1)
+
     def test_a_run_writes_its_policy_and_goes_on_exactly(self):
         curves = []
         with tempfile.TemporaryDirectory() as name:
