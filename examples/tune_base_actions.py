@@ -124,15 +124,15 @@ class Obstacles:
 
     def alone(self, vectors: np.ndarray, seeds: np.ndarray) -> np.ndarray:
         """Returns how far gaits (m, P) get when repeated from some starts, (m, starts)."""
-        n = len(vectors) * len(seeds)
-        runs = self.bench.run(
-            np.repeat(vectors, len(seeds), axis=0),
-            np.tile(seeds, len(vectors)),
-            HORIZON,
-            np.full(n, FRICTION),
-        )
-        share = runs.distance / (HORIZON * self.gait.target_speed)
-        return np.clip(share, 0, 1).reshape(len(vectors), len(seeds))
+        shape = len(vectors), len(seeds)
+        rows, n = self.bench.environments.num_envs, len(vectors) * len(seeds)
+        vectors, seeds = np.repeat(vectors, len(seeds), axis=0), np.tile(seeds, len(vectors))
+        found = []
+        for first in range(0, n, rows):  # the last part is filled up
+            part = np.arange(first, first + rows) % n
+            runs = self.bench.run(vectors[part], seeds[part], HORIZON, np.full(rows, FRICTION))
+            found.append(runs.distance / (HORIZON * self.gait.target_speed))
+        return np.clip(np.concatenate(found)[:n], 0, 1).reshape(shape)
 
     def position(self, env_ids: np.ndarray) -> np.ndarray:
         """Returns where roots are, (m,) m."""
@@ -153,7 +153,8 @@ def search(
         result = np.tile(start, (len(candidates), 1))
         result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
-        return result.round(DIGITS)
+        result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
+        return result
 
     options = {
         'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
@@ -205,17 +206,20 @@ def complement(
 
 
 def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
-    """Makes gaits the base actions of a character, in this order."""
+    """Makes gaits the base actions of a character, in this order; numbers are those of the original."""
     data = tune_gait.stored(character)
     data.setdefault('tuning', {})
+    original = data.setdefault('original_base_actions', data['base_actions'])
+    numbers = list(map(str, range(len(original))))
     for name in names:
         if name in found:
             data['sets'][name] = found[name]['vector']
             data['tuning'][name] = found[name]['tuning']
-        elif name not in data['sets']:
-            raise ValueError(errors.unknown('gait', name, [*found, *data['sets']]))
-    original = data.setdefault('original_base_actions', data['base_actions'])
-    data['base_actions'] = [[name, name, 0] for name in names]
+        elif name not in data['sets'] and name not in numbers:
+            raise ValueError(errors.unknown('gait', name, [*found, *data['sets'], *numbers]))
+    data['base_actions'] = [
+        original[int(name)] if name in numbers else [name, name, 0] for name in names
+    ]
     used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
     used.add(data['centre'])
     for part in ('sets', 'tuning'):
@@ -234,7 +238,12 @@ def main() -> None:
     parser.add_argument('--population', type=int, default=12)
     parser.add_argument('--generations', type=int, default=30)
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument('--enter', nargs='+', metavar='SET', help='search nothing')
+    parser.add_argument(
+        '--enter',
+        nargs='+',
+        metavar='SET',
+        help='sets, or numbers of base actions of the original, that become the base actions',
+    )
     arguments = parser.parse_args()
     gait = controllers.load(arguments.character)
     arguments.output.mkdir(parents=True, exist_ok=True)
@@ -257,7 +266,7 @@ def main() -> None:
         print(gait.character, terrain, flush=True)
         have = np.array(known)
         rows = arguments.population * (STARTS if arguments.alone else STATES)
-        obstacles = Obstacles(gait, terrain, have[0], max(rows, 2 * VALIDATION))
+        obstacles = Obstacles(gait, terrain, have[0], rows)
         tune = alone if arguments.alone else complement
         chosen, scores = tune(obstacles, have, arguments, rng)
         obstacles.bench.environments.close()
