@@ -101,7 +101,7 @@ def batch(id_: str, num_envs: int, seconds: float) -> dict[str, float]:
     environments.reset()
     rng, size = np.random.default_rng(0), len(environments.action_map)
     instrument(environments.task.world)
-    begin = environments._begin
+    begin = environments.begin
     resets = [0, 0.0]
 
     def counted(env_ids: np.ndarray) -> None:
@@ -110,7 +110,7 @@ def batch(id_: str, num_envs: int, seconds: float) -> dict[str, float]:
         resets[0] += len(env_ids)
         resets[1] += time.perf_counter() - moment
 
-    environments._begin = counted  # type: ignore[method-assign]
+    environments.begin = counted  # type: ignore[method-assign]
     actions = rng.uniform(-1, 1, (64, num_envs, size))
     for k in range(40):
         environments.step(actions[k % 64])

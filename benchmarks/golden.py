@@ -46,7 +46,13 @@ from trl_suite.vector import VectorEnvironment
 SEED = 5
 AFTER = 10  # steps that are repeated from a saved state
 SCALES = (0.1, 0.3, 1.0)  # of the actions of a batch's simulations
-LONG_STEPS = ('FSM_', '_HLC_', '/gait', '/hike', '/soccer')  # gait cycles and footsteps, to 0.5 s
+LONG_STEPS = (
+    'FSM_',
+    '_HLC_',
+    '/gait',
+    '/goal_navigation',
+    '/soccer',
+)  # gait cycles and footsteps, to 0.5 s
 FAMILIES = (
     'PD_Biped2D_Gaps_Terrain-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
     'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_LLC_Trail_Step-v0',
@@ -55,64 +61,64 @@ FAMILIES = (
 )  # fmt: skip
 OPTIONS = {  # an id, or the arguments of `suite.combine` -> options
     'PD_Biped2D_Gaps_Terrain-v0': (
-        {'terrain_samples': 0}, {'terrain_samples': 20, 'target': True}, {'substeps': 4},
-        {'centre': 'posture'}, {'centre': 'original'}, {'half_range': 0.7}, {'start_phase': 0.25},
+        {'terrain_observation': 0}, {'terrain_observation': 20, 'reference_observation': True}, {'substeps': 4},
+        {'action_offset': 'posture'}, {'action_offset': 'original'}, {'action_scale': 0.7}, {'start_phase': 0.25},
         {'start_phase': ((0.1, 0.2), (0.6, 0.9))}, {'spawn': 'upstream'}, {'time_limit': 0.3},
     ),
-    'PD_Dog2D_Slopes_Mixed_Terrain-v0': ({'target': True}, {'terrain_samples': 100}),
-    'PD_Raptor2D_Steps_Terrain-v0': ({'centre': 'posture', 'target': True},),
-    'MTU_Biped2D_LLC_Imitate_Flat-v0': ({'target': False}, {'terrain_samples': 50}),
+    'PD_Dog2D_Slopes_Mixed_Terrain-v0': ({'reference_observation': True}, {'terrain_observation': 100}),
+    'PD_Raptor2D_Steps_Terrain-v0': ({'action_offset': 'posture', 'reference_observation': True},),
+    'MTU_Biped2D_LLC_Imitate_Flat-v0': ({'reference_observation': False}, {'terrain_observation': 50}),
     'MTU_Raptor2D_LLC_Imitate_Flat-v0': ({'muscle_set': 'run'}, {'substeps': 20}),
-    'Torque_Dog2D_LLC_Imitate_Flat-v0': ({'target': False, 'terrain_samples': 10},),
-    'Vel_Biped2D_LLC_Imitate_Flat-v0': ({'target': False}, {'substeps': 10, 'start_phase': 0.0}),
+    'Torque_Dog2D_LLC_Imitate_Flat-v0': ({'reference_observation': False, 'terrain_observation': 10},),
+    'Vel_Biped2D_LLC_Imitate_Flat-v0': ({'reference_observation': False}, {'substeps': 10, 'start_phase': 0.0}),
     'FSM_Dog2D_Terrain_Mixed-v0': (
         {'interface': 'base_action'}, {'substeps': 4}, {'spawn': 'upstream'}, {'start_noise': 0.02},
     ),
     'FSM_Biped2D_Terrain_Slopes-v0': ({'interface': 'base_action', 'start_noise': 0.01},),
     'FSM_Hopper2D_Terrain_Gaps-v0': ({'substeps': 1},),
     'PD_Biped3D_Imitate-v0': (
-        {'target': True}, {'mirrored': True}, {'substeps': 20},
-        {'centre': 'posture'}, {'centre': 'original'}, {'half_range': 0.7}, {'start_phase': 0.6},
-        {'terrain_map': True}, {'time_limit': 0.3},
+        {'reference_observation': True}, {'mirrored': True}, {'substeps': 20},
+        {'action_offset': 'posture'}, {'action_offset': 'original'}, {'action_scale': 0.7}, {'start_phase': 0.6},
+        {'terrain_observation': 'height'}, {'time_limit': 0.3},
     ),
-    'PD_Biped3D_Imitate-Stairs-v0': ({'terrain_map': True, 'mirrored': True},),
+    'PD_Biped3D_Imitate-Stairs-v0': ({'terrain_observation': 'height', 'mirrored': True},),
     'PD_Biped3D_LLC_General_Step-v0': (
         {'mirrored': True}, {'plans': {'from_root': 1.0}}, {'plans': {'from_root': 0.5, 'sharp': 0.5}},
-        {'goal': True}, {'miss': 0.1, 'grace': 0.2}, {'footstep_scale': 4.0, 'heading_scale': 2.0},
+        {'goal': True}, {'max_landing_error': 0.1, 'grace_period': 0.2}, {'footstep_scale': 4.0, 'heading_scale': 2.0},
         {'pushes': {'force': (80, 120), 'duration': (0.1, 0.3), 'interval': (0.1, 0.3)}},
-        {'terrain_map': True}, {'start_phase': ((0.0, 0.1), (0.5, 0.6))},
+        {'terrain_observation': 'height'}, {'start_phase': ((0.0, 0.1), (0.5, 0.6))},
     ),
     'PD_Biped3D_LLC_Trail_Step-v0': ({'mirrored': True, 'plans': {'length': (0.3, 0.6)}},),
     'PD_Biped2D_LLC_Flat_Step-v0': (
-        {'plans': {'length': (0.25, 0.6), 'change': 1.0}, 'miss': 0.5}, {'terrain_samples': 50},
+        {'plans': {'length': (0.25, 0.6), 'change': 1.0}, 'max_landing_error': 0.5}, {'terrain_observation': 50},
         {'footstep_scale': 4.0}, {'start_phase': 0.0, 'substeps': 5},
     ),
     'PD_Biped3D_HLC_Forest-v0': (
         {'goal_distance': (3, 5), 'goal_reached': 2.0}, {'start_phases': (0.0, 0.1, 0.6)},
-        {'step_length': 0.3, 'target_speed': 0.5}, {'sight': ()}, {'substeps': 20},
+        {'step_length': 0.3, 'target_speed': 0.5}, {'terrain_observation': ()}, {'substeps': 20},
     ),
     'PD_Biped3D_HLC_DynamicsObstacles-v0': (
-        {'sight': ('height', 'velocity')}, {'sight': ('velocity',)},
-        {'interface': 'frame', 'sight': ('height', 'velocity')},
+        {'terrain_observation': ('height', 'velocity')}, {'terrain_observation': ('velocity',)},
+        {'interface': 'frame', 'terrain_observation': ('height', 'velocity')},
     ),
     'PD_Biped3D_HLC_Soccer-v0': (
-        {'interface': 'frame'}, {'goal_distance': (1, 2)}, {'sight': ('height',)},
+        {'interface': 'frame'}, {'goal_distance': (1, 2)}, {'terrain_observation': ('height',)},
     ),
     'PD_Biped3D_Terrain_Trail_Hard-v0': (
-        {'reward': 'original'}, {'terrain_map': False}, {'goal_reached': 3.0},
+        {'reward': 'original'}, {'terrain_observation': ()}, {'goal_reached': 3.0},
     ),
-    'PD_Biped3D_Terrain_Soccer_Hard-v0': ({'terrain_map': True, 'goal_reached': 2.0},),
-    ('biped3d', 'torque'): ({}, {'target': True}),
+    'PD_Biped3D_Terrain_Soccer_Hard-v0': ({'terrain_observation': 'height', 'goal_reached': 2.0},),
+    ('biped3d', 'torque'): ({}, {'reference_observation': True}),
     ('biped3d', 'velocity', 'hills3d'): ({},),
     ('biped3d', 'position', 'conveyor3d_wide'): ({'start_phase': 0.1},),
-    ('biped3d_full_mocap',): ({'centre': 'original'},),
-    ('biped3d_mocap', 'position', 'stairs3d', 'footsteps'): ({'terrain_map': True},),
-    ('biped2d', 'torque', 'gaps', 'walk'): ({'terrain_view': True},),
-    ('dog', 'muscle', 'slopes_mixed', 'walk'): ({'terrain_view': True},),
-    ('biped3d_full_mocap', 'position', 'hills3d', 'walk'): ({'terrain_view': True},),
-    ('biped2d', 'muscle', 'gaps_curriculum'): ({'blend': 0.5}, {'blend': 0.9}),
+    ('biped3d_full_mocap',): ({'action_offset': 'original'},),
+    ('biped3d_mocap', 'position', 'stairs3d', 'footsteps'): ({'terrain_observation': 'height'},),
+    ('biped2d', 'torque', 'gaps', 'walk'): ({'terrain_observation': 50},),
+    ('dog', 'muscle', 'slopes_mixed', 'walk'): ({'terrain_observation': 50},),
+    ('biped3d_full_mocap', 'position', 'hills3d', 'walk'): ({'terrain_observation': 'height'},),
+    ('biped2d', 'muscle', 'gaps_curriculum'): ({'terrain_level': 0.5}, {'terrain_level': 0.9}),
     ('goat', 'position', 'cliffs_rugged'): ({},),
-    ('raptor', None, 'slopes_blend', 'gait'): ({'blend': 0.3},),
+    ('raptor', None, 'slopes_blend', 'gait'): ({'terrain_level': 0.3},),
 }  # fmt: skip
 PARTS = {
     'rewards': {'fast': (0.5, parts.speed), 'lazy': (-0.1, parts.effort)},

@@ -1,6 +1,6 @@
 """What a high-level step costs against the footstep controller's own stepping; ratios of one run.
 
-    python benchmarks/hierarchy.py [--rows N] [--seconds S] [ID ...]
+    python benchmarks/hierarchy.py [--num_envs N] [--seconds S] [ID ...]
 
 Prints, on one thread, per 1/30 s of one simulation and resets included:
 
@@ -15,9 +15,11 @@ import time
 
 import numpy as np
 
-from trl_suite import catalogue
-from trl_suite.commands import bench
-from trl_suite.controllers import llc
+from trl_suite import policies
+from trl_suite.cli import bench
+from trl_suite.controllers import footstep_controller
+from trl_suite.registry import catalogue
+from trl_suite.tasks.navigation import hierarchical_rules
 from trl_suite.vector import VectorEnvironment
 
 HALF_RANGE = 0.1  # of the random plans about action 0, straight on
@@ -36,17 +38,19 @@ def measured(environments, act, frames, seconds):
     return (time.perf_counter() - begin) / count
 
 
-def footsteps(rows, seconds):
+def footsteps(num_envs, seconds):
     """The footstep environment, driven by the shipped controller."""
-    controller = llc.load()
-    environments = VectorEnvironment(llc.DEFAULT, rows, 1, 0)
-    return measured(environments, lambda o: np.clip(controller(o), -1, 1), lambda e: rows, seconds)
+    controller = footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
+    environments = VectorEnvironment(hierarchical_rules.CONTROLLER, num_envs, 1, 0)
+    return measured(
+        environments, lambda o: np.clip(controller(o), -1, 1), lambda e: num_envs, seconds
+    )
 
 
-def high_level(id_, rows, seconds):
+def high_level(id_, num_envs, seconds):
     """A high-level environment under random actions."""
-    environments, random = VectorEnvironment(id_, rows, 1, 0), np.random.default_rng(0)
-    shape = (rows, len(environments.action_map))
+    environments, random = VectorEnvironment(id_, num_envs, 1, 0), np.random.default_rng(0)
+    shape = (num_envs, len(environments.action_map))
     return measured(
         environments, lambda o: random.uniform(-HALF_RANGE, HALF_RANGE, shape),
         lambda e: round(e.info['duration'].sum() / bench.CONTROL_TIMESTEP), seconds,
@@ -57,15 +61,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     all_ = [id_ for id_ in catalogue.BY_ID if '_HLC_' in id_]
     parser.add_argument('ids', nargs='*', metavar='ID', default=all_)
-    parser.add_argument('--rows', type=int, default=64)
+    parser.add_argument('--num-envs', type=int, default=64)
     parser.add_argument('--seconds', type=float, default=4.0, help='per measurement')
     arguments = parser.parse_args()
-    base = footsteps(arguments.rows, arguments.seconds)
-    print(f'{llc.DEFAULT}: {1e6 * base:.0f} us')
+    base = footsteps(arguments.num_envs, arguments.seconds)
+    print(f'{hierarchical_rules.CONTROLLER}: {1e6 * base:.0f} us')
     for id_ in arguments.ids:
-        cost = high_level(id_, arguments.rows, arguments.seconds)
+        cost = high_level(id_, arguments.num_envs, arguments.seconds)
         print(f'{id_}: {cost / base:.2f} times as much', flush=True)
-    again = footsteps(arguments.rows, arguments.seconds)
+    again = footsteps(arguments.num_envs, arguments.seconds)
     print(f'the first measurement again: {again / base:.2f} times as much')
 
 

@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import World
-from trl_suite.terrain import Ground, Strip
-from trl_suite.terrain.layout import Layout
+from trl_suite.terrain import PlanarGround, SpatialGround
+from trl_suite.terrain.spatial.layout import Layout
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
@@ -38,10 +38,10 @@ IDS = (
     'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Forest-v0',
 )  # fmt: skip
 PARTS = (
-    ('drawing', Strip, '__init__'), ('drawing', Strip, 'window'), ('drawing', Ground, '__init__'),
+    ('drawing', PlanarGround, '__init__'), ('drawing', PlanarGround, 'window'), ('drawing', SpatialGround, '__init__'),
     ('drawing', Layout, 'vertices'), ('drawing', Layout, 'boxes_in'),
-    ('start and goals', Ground, 'spawn'), ('start and goals', Ground, 'goal'),
-    ('laying', PlanarTerrain, 'begin_episode'), ('laying', SpatialTerrain, 'begin_episode'),
+    ('start and goals', SpatialGround, 'spawn'), ('start and goals', SpatialGround, 'goal'),
+    ('laying', PlanarArena, 'begin_episode'), ('laying', SpatialArena, 'begin_episode'),
     ('physics', World, 'forward'), ('physics', World, 'reset'),
 )  # fmt: skip
 

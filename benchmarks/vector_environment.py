@@ -4,10 +4,10 @@
 
 Prints, under random actions, resets included:
 
-- our vector environment by rows and threads: control steps per second; what one thread does of them,
-  us per row and control step; cost of a reset; and the speed-up that 16 and 64 cores would give, by
+- our vector environment by num_envs and threads: control steps per second; what one thread does of them,
+  us per simulation and control step; cost of a reset; and the speed-up that 16 and 64 cores would give, by
   Amdahl's law from the part that one thread does;
-- memory per row: what fresh processes with 16 and with 1024 rows differ by;
+- memory per simulation: what fresh processes with 16 and with 1024 num_envs differ by;
 - MuJoCo alone with the same models on the same threads, raw `mj_step` of one of them, and our single
   environment;
 - the peers that are installed: dm_control's suite, Gymnasium's MuJoCo environments (single, sync,
@@ -24,8 +24,8 @@ import multiprocessing
 import os
 import resource
 
-from trl_suite.commands import bench
-from trl_suite.commands.bench import actions, rate, raw, warmed
+from trl_suite.cli import bench
+from trl_suite.cli.bench import actions, rate, raw, warmed
 
 IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
@@ -43,34 +43,34 @@ def resident():
         return int(file.read().split()[1]) * resource.getpagesize()
 
 
-def ours(id_, rows, threads, seconds):
+def ours(id_, num_envs, threads, seconds):
     """Our vector environment: rate, serial part, reset cost, projection; and the rate of MuJoCo alone."""
-    found = bench.vector(id_, rows, threads, seconds)
+    found = bench.vector(id_, num_envs, threads, seconds)
     result = {
         'control steps per second': round(found['control']),
-        'serial, us per row': round(found['serial'], 3),
-        'reset, ms per row': round(found['reset'], 3),
+        'serial, us per simulation': round(found['serial'], 3),
+        'reset, ms per simulation': round(found['reset'], 3),
         'share of resets': round(found['resets'], 3),
         'projection': bench.projection(found, threads),
     }
     return result, found['engine'] / SUBSTEPS
 
 
-def footprint(id_, rows):
-    """Resident memory of this process once it has built, reset and stepped as many rows, bytes."""
-    environments, _ = warmed(id_, rows, max(THREADS))
+def footprint(id_, num_envs):
+    """Resident memory of this process once it has built, reset and stepped as many num_envs, bytes."""
+    environments, _ = warmed(id_, num_envs, max(THREADS))
     found = resident()
     environments.close()
     return found
 
 
 def memory(id_):
-    """Memory per row, bytes; processes of their own, where nothing was allocated and freed before."""
+    """Memory per simulation, bytes; processes of their own, where nothing was allocated and freed before."""
     sizes = []
-    for rows in MEMORY_ROWS:
+    for num_envs in MEMORY_ROWS:
         spawn = multiprocessing.get_context('spawn')
         with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
-            sizes.append(pool.submit(footprint, id_, rows).result())
+            sizes.append(pool.submit(footprint, id_, num_envs).result())
     return (sizes[1] - sizes[0]) / (MEMORY_ROWS[1] - MEMORY_ROWS[0])
 
 
@@ -115,12 +115,12 @@ def peers(seconds):
 
             found[f'Gymnasium {id_}'] = rate(step, seconds) / reference
             for mode in ('sync', 'async'):
-                rows = 16
-                vector = gymnasium.make_vec(id_, num_envs=rows, vectorization_mode=mode)
+                num_envs = 16
+                vector = gymnasium.make_vec(id_, num_envs=num_envs, vectorization_mode=mode)
                 vector.reset(seed=0)
-                drawn_rows = actions(space.low, space.high, (rows, *space.shape))
-                speed = rate(lambda v=vector, d=drawn_rows: v.step(next(d)), seconds, rows)
-                found[f'Gymnasium {id_} {mode}, {rows} rows'] = speed / reference
+                drawn_rows = actions(space.low, space.high, (num_envs, *space.shape))
+                speed = rate(lambda v=vector, d=drawn_rows: v.step(next(d)), seconds, num_envs)
+                found[f'Gymnasium {id_} {mode}, {num_envs} simulations'] = speed / reference
                 vector.close()
             if id_ == 'Humanoid-v5':
                 found.update(envpool_humanoid(space, reference, seconds))
@@ -135,18 +135,18 @@ def envpool_humanoid(space, reference, seconds):
         print(f'EnvPool is not measured: {error}')
         return {}
     found = {}
-    for rows in (16, 64):
-        pool = envpool.make_gymnasium('Humanoid-v4', num_envs=rows, num_threads=2)
+    for num_envs in (16, 64):
+        pool = envpool.make_gymnasium('Humanoid-v4', num_envs=num_envs, num_threads=2)
         pool.reset()
-        shape = (rows, *space.shape)
+        shape = (num_envs, *space.shape)
         drawn = actions(space.low, space.high, shape)
-        speed = rate(lambda p=pool, d=drawn: p.step(next(d)), seconds, rows)
-        found[f'EnvPool Humanoid-v4, {rows} rows, 2 threads'] = speed / reference
+        speed = rate(lambda p=pool, d=drawn: p.step(next(d)), seconds, num_envs)
+        found[f'EnvPool Humanoid-v4, {num_envs} simulations, 2 threads'] = speed / reference
     return found
 
 
 def plot(figures, path):
-    """Draws rate against rows."""
+    """Draws rate against simulations."""
     import matplotlib
 
     matplotlib.use('Agg')
@@ -156,19 +156,19 @@ def plot(figures, path):
     for k, (id_, found) in enumerate(figures['ours'].items()):
         reference = figures['single'][id_]['raw mj_step']
         for threads in THREADS:
-            rows = [n for n in ROWS if f'{n} rows, {threads} threads' in found]
+            specs = [n for n in ROWS if f'{n} num_envs, {threads} threads' in found]
             rates = [
-                found[f'{n} rows, {threads} threads']['control steps per second'] / reference
-                for n in rows
+                found[f'{n} num_envs, {threads} threads']['control steps per second'] / reference
+                for n in specs
             ]
             axes.plot(
-                rows,
+                specs,
                 rates,
                 'o-' if threads == 1 else 's--',
                 color=f'C{k}',
                 label=f'{id_}, {threads} thread{"s" * (threads > 1)}',
             )
-    axes.set(xscale='log', xlabel='rows', ylabel='rate / raw mj_step on one thread')
+    axes.set(xscale='log', xlabel='simulations', ylabel='rate / raw mj_step on one thread')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc='center left', bbox_to_anchor=(1.01, 0.5))
     figure.tight_layout()
@@ -179,22 +179,22 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
     parser.add_argument('--json', help='also write the figures to this file')
-    parser.add_argument('--plot', help='also draw rate against rows')
-    parser.add_argument('--rows', type=int, nargs='*', default=ROWS)
+    parser.add_argument('--plot', help='also draw rate against simulations')
+    parser.add_argument('--num-envs', type=int, nargs='*', default=ROWS)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
     figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'engine alone': {}}
-    figures['memory per row, kB'] = {}
+    figures['memory per simulation, kB'] = {}
     for id_ in IDS:
         figures['single'][id_] = {k: round(v) for k, v in single(id_, arguments.seconds).items()}
         print(id_, figures['single'][id_])
-        figures['memory per row, kB'][id_] = round(memory(id_) / 1e3)
-        print(f'  memory per row: {figures["memory per row, kB"][id_]} kB')
+        figures['memory per simulation, kB'][id_] = round(memory(id_) / 1e3)
+        print(f'  memory per simulation: {figures["memory per row, kB"][id_]} kB')
         figures['ours'][id_], figures['engine alone'][id_] = {}, {}
         for threads in THREADS:
-            for rows in arguments.rows:
-                name = f'{rows} rows, {threads} threads'
-                found, speed = ours(id_, rows, threads, arguments.seconds)
+            for num_envs in arguments.num_envs:
+                name = f'{num_envs} simulations, {threads} threads'
+                found, speed = ours(id_, num_envs, threads, arguments.seconds)
                 figures['ours'][id_][name] = found
                 figures['engine alone'][id_][name] = round(speed)
                 print(f'  {name}: {found}, the engine alone {speed:.0f}/s', flush=True)

@@ -17,7 +17,7 @@ import time
 import nbclient
 import nbformat
 
-from trl_suite import errors, files
+from trl_suite.util import errors, files
 
 FOLDER = pathlib.Path(__file__).resolve().parent
 NAMES = tuple(sorted(path.stem for path in FOLDER.glob('*.ipynb')))

@@ -1,9 +1,9 @@
 """Writes the reference pages from the catalogue and the code, and makes their pictures.
 
-    python docs/generate.py [--again] [--only PATTERN] [--pages] [--check]
+    python docs/generate.py [--overwrite] [--filter PATTERN] [--pages] [--check]
 
 Pages are written anew; of pictures only those that are missing, or that show a policy that has been
-replaced, unless --again. Needs `pip install 'trl_suite[video]'`. With --check nothing is written; it
+replaced, unless --overwrite. Needs `pip install 'trl_suite[video]'`. With --check nothing is written; it
 fails if a page is not as it would be.
 """
 
@@ -19,11 +19,15 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from trl_suite import acting, catalogue, characters, describe, files, policies, suite, terrain
-from trl_suite.characters.muscles import MUSCLES
-from trl_suite.commands import gallery
+from trl_suite import characters, describe, policies, suite, terrain
+from trl_suite.actuation.muscles import MUSCLES
 from trl_suite.describe import common
-from trl_suite.mannequin import Mannequin
+from trl_suite.environments import named_policies as acting
+from trl_suite.registry import catalogue
+from trl_suite.registry.build import task_type
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.util import files
+from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 FAMILIES = {
@@ -55,13 +59,6 @@ WITHOUT = {  # a shipped policy
     'clip': 'the clip itself, whose poses are the targets, without feedback (`--policy clip`)',
     'zero': 'action 0 throughout, which for a gait is the default one (`--policy zero`)',
 }
-_LANDING = ('footsteps', 'footsteps2d', 'hike', 'soccer')
-DRAWN = {  # beside the physics, and by which rules
-    ' Orange and blue: where the foot that swings and the other one are to land.': _LANDING,
-    ' Beads: the way of the centre of mass; red: the goal.': (
-        'hike', 'soccer', 'journey', 'ball_journey',
-    ),
-}  # fmt: skip
 README = '../README.md'
 # What encloses the tables in the README that are written here.
 SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
@@ -87,12 +84,18 @@ def pages() -> dict[str, str]:
     """Returns the text of every page by its path below docs/."""
     found = {'README.md': home()}
     environments: dict[Any, Any] = {}
-    for row in catalogue.ROWS:
+    for spec in catalogue.SPECS:
         # What differs by its ground only is compiled once.
-        key = (row.rules, row.character, row.actuation, row.clip, repr(sorted(row.options.items())))
+        key = (
+            spec.task_type,
+            spec.character,
+            spec.actuation,
+            spec.clip,
+            repr(sorted(spec.options.items())),
+        )
         if key not in environments:
-            environments[key] = suite.build_row(row, {}, {})
-        found[f'environments/{row.id}.md'] = environment_page(row, environments[key])
+            environments[key] = suite.build_environment(spec, {}, {})
+        found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
     found['environments/README.md'] = environment_index()
     for name in characters.CHARACTERS:
         found[f'characters/{name}.md'] = character_page(name)
@@ -140,7 +143,7 @@ def home() -> str:
         table(
             ('reference, made from the code', ''),
             (
-                ('[Environments](environments/README.md)', f'{len(catalogue.ROWS)}, one page each'),
+                ('[Environments](environments/README.md)', f'{len(catalogue.SPECS)}, one page each'),
                 ('[Characters](characters/README.md)', f'{len(characters.CHARACTERS)}, with their joints'),
                 ('[Terrains](terrains/README.md)', f'{len(presets())} presets, with their parameters'),
             ),
@@ -167,45 +170,45 @@ def home() -> str:
 # Environments
 
 
-def environment_page(row: catalogue.Row, environment: Any) -> str:
-    also = (f'{row.domain}/{row.task}', *row.aliases)
+def environment_page(spec: catalogue.EnvSpec, environment: Any) -> str:
+    also = (f'{spec.domain}/{spec.task}', *spec.aliases)
     facts = (
         ('also', ', '.join(f'`{name}`' for name in also)),
-        ('tags', ', '.join(sorted(row.tags))),
-        ('character', links('characters', [row.character])),
-        ('terrain', links('terrains', [row.terrain])),
-        ('actuation', row.actuation),
+        ('tags', ', '.join(sorted(spec.tags))),
+        ('character', links('characters', [spec.character])),
+        ('terrain', links('terrains', [spec.terrain])),
+        ('actuation', spec.actuation),
     )
     about, rules = [], []
-    for title, parts in describe.parts(row, environment):
+    for title, parts in describe.parts(spec, environment):
         text = f'## {describe.escape(title)}\n\n{describe.markdown(parts)}'
         if title.startswith('Terrain'):
-            draws = f'{gallery.TERRAIN_DRAWS} draws of {row.terrain}'
-            text += f'\n\n{picture(draws, gallery.terrain_path(row.terrain))}'
+            draws = f'{gallery.TERRAIN_DRAWS} draws of {spec.terrain}'
+            text += f'\n\n{picture(draws, gallery.terrain_path(spec.terrain))}'
         (about if title.startswith(('Character', 'Links')) else rules).append(text)
     return page(
-        row.id,
-        row.description,
-        strip(row, environment),
+        spec.id,
+        spec.description,
+        strip(spec, environment),
         table(('', ''), facts),
-        f"```python\nfrom trl_suite import suite\n\nenvironment = suite.make('{row.id}')\n```",
-        learnt(row),
+        f"```python\nfrom trl_suite import suite\n\nenvironment = suite.make('{spec.id}')\n```",
+        learnt(spec),
         *rules,
         *about,
         '## Differs from the original\n\n'
-        + '\n'.join(f'- {describe.escape(text)}' for text in describe.differences_of(row))
+        + '\n'.join(f'- {describe.escape(text)}' for text in describe.differences_of(spec))
         + '\n\nReasons are in [Differences from the original](../differences.md).',
     )
 
 
-def strip(row: catalogue.Row, environment: Any) -> str:
-    _, begin, end, _ = gallery.scene(row.id)
-    drawn = ''.join(text for text, rules in DRAWN.items() if row.rules in rules)
-    name, _ = acting.best(environment, row.id)
+def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
+    _, begin, end, _ = gallery.scene(spec.id)
+    drawn = task_type(spec).description.legend
+    name, _ = acting.best(environment, spec.id)
     who = WITHOUT.get(name)
     said = f'No policy is shipped for it yet; this is {who}' if who else 'The shipped policy'
     return (
-        f'{picture("Film strip", gallery.strip_path(row.id))}\n\n'
+        f'{picture("Film strip", gallery.strip_path(spec.id))}\n\n'
         f'*{said}: {begin:g} to {end:g} s of an episode, or until it ends.{drawn}*'
     )
 
@@ -215,29 +218,30 @@ def begun(settings: Mapping[str, Any]) -> str:
     start = settings['start']
     if start in catalogue.BY_ID:
         return f'[{start}]({start}.md)'
-    shown = f'shown for {settings["cloned"] / 1e6:.2g} million plans'
-    if start == 'guide':
-        return f'what a guide with a map would do (`examples/guide.py`), {shown}'
-    return f'what `--policy {start}` does, {shown}'
+    copied = f'imitated for {settings["cloned"] / 1e6:.2g} million plans'
+    if start == 'expert':
+        return f'what an expert with a map would do (`examples/expert.py`), {copied}'
+    return f'what `--policy {start}` does, {copied}'
 
 
-def learnt(row: catalogue.Row) -> str:
-    found = gallery.record(row.id)
+def learnt(spec: catalogue.EnvSpec) -> str:
+    found = gallery.record(spec.id)
     if found is None:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
-    unit = 'plans' if 'hierarchical' in row.tags else 'steps'
+    unit, searched = task_type(spec).samples, task_type(spec).score == 'distance'
     trained = f'{samples / 1e6:.2g} million {unit}'
-    if row.rules == 'gait':
+    after = f'{taken / 1e6:.2g} million'
+    if searched:
         trained = f'{samples:g} decisions, each of which tries all base actions'
-    after = f'{taken:g} decisions' if row.rules == 'gait' else f'{taken / 1e6:.2g} million'
+        after = f'{taken:g} decisions'
     if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
-        after += ', when it had only been shown'
+        after += ', at the end of imitation'
     seeds = len(found['runs'])
     facts = (
-        ('return', f'{result["fraction"]:.1%} of the maximum {result["step_limit"]}'),
-        ('episodes that lasted to the step limit', f'{result["full"]:.0%} of {result["episodes"]}'),
+        ('return', f'{result["normalized_return"]:.1%} of the maximum {result["step_limit"]}'),
+        ('episodes that lasted to the step limit', f'{result["completion_rate"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
         *([('policy taken after', after)] if taken < 0.99 * samples else []),
@@ -247,7 +251,7 @@ def learnt(row: catalogue.Row) -> str:
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''
     return (
         f'## The shipped policy\n\n{table(("", ""), facts)}\n\n'
-        f'{picture("Learning curve", gallery.curve_path(row.id))}\n\n'
+        f'{picture("Learning curve", gallery.curve_path(spec.id))}\n\n'
         f'*While it learnt, without noise{more}. All policies: [What has been learnt](../results.md).*'
     )
 
@@ -256,19 +260,19 @@ def environment_index() -> str:
     shipped = policies.available()
     parts = []
     for domain, title in FAMILIES.items():
-        rows = [row for row in catalogue.ROWS if row.domain == domain]
+        specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         cells = [
             (
-                f'[{row.id}]({row.id}.md)', row.description, links('characters', [row.character]),
-                links('terrains', [row.terrain]), 'yes' if row.id in shipped else '',
+                f'[{spec.id}]({spec.id}.md)', spec.description, links('characters', [spec.character]),
+                links('terrains', [spec.terrain]), 'yes' if spec.id in shipped else '',
             )
-            for row in rows
+            for spec in specs
         ]  # fmt: skip
         header = ('environment', 'what', 'character', 'terrain', 'policy')
         parts += [f'## {title}', picture(domain, f'families/{domain}.jpg'), table(header, cells)]
     return page(
         'Environments',
-        f'{len(catalogue.ROWS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
+        f'{len(catalogue.SPECS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
         f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
         'character, actuation, terrain or tag, and `trl-suite info ID` prints what a page says. Their '
         'names are those of the original, misspelt where it is.',
@@ -281,19 +285,21 @@ def environment_index() -> str:
 
 
 def character_page(name: str) -> str:
-    row = characters.CHARACTERS[name]
-    mannequin = Mannequin(name)
-    figure = mannequin.character
-    weights = [joint.weight for joint in row.joints.values()]
-    joints = common.links(figure, mannequin.environment.physics, (common.REWARD_WEIGHT, weights))
-    used = [each.id for each in catalogue.ROWS if each.character == name]
+    spec = characters.CHARACTERS[name]
+    viewer = KinematicViewer(name)
+    figure = viewer.character
+    weights = [joint.weight for joint in spec.joints.values()]
+    joints = common.links(figure, viewer.environment.physics, (common.REWARD_WEIGHT, weights))
+    used = [each.id for each in catalogue.SPECS if each.character == name]
     return page(
         name,
-        row.description,
+        spec.description,
         picture(name, gallery.character_path(name)),
         f'{common.figures(figure)}. '
         + (
-            'Its root is free in three dimensions.' if row.spatial else 'It moves in the x-z plane.'
+            'Its root is free in three dimensions.'
+            if spec.spatial
+            else 'It moves in the x-z plane.'
         ),
         '## Links and joints',
         describe.markdown_table(joints),
@@ -302,9 +308,9 @@ def character_page(name: str) -> str:
         table(
             ('', ''),
             (
-                ('end effectors', ', '.join(row.end_effectors)),
-                ('a fall is the ground under', ', '.join(row.fall_links)),
-                ('clip of its own', suite.DEFAULT_CLIPS.get(name, 'none')),
+                ('end effectors', ', '.join(spec.end_effectors)),
+                ('a fall is the ground under', ', '.join(spec.fall_links)),
+                ('clip of its own', spec.clip or 'none'),
             ),
         ),
         f'## Environments\n\n{links("environments", used) or "None; it is for `suite.build`."}',
@@ -314,10 +320,10 @@ def character_page(name: str) -> str:
 def character_index() -> str:
     cells = [
         (
-            f'[{name}]({name}.md)', picture(name, gallery.character_path(name)), row.description,
-            sum(each.character == name for each in catalogue.ROWS),
+            f'[{name}]({name}.md)', picture(name, gallery.character_path(name)), spec.description,
+            sum(each.character == name for each in catalogue.SPECS),
         )
-        for name, row in characters.CHARACTERS.items()
+        for name, spec in characters.CHARACTERS.items()
     ]  # fmt: skip
     return page(
         'Characters',
@@ -352,7 +358,7 @@ def terrain_page(name: str) -> str:
     )
     parameters = table(('parameter', 'unit', *titles, 'default of the type'), cells)
     blended = 'Sets are blended by the task option `blend`, 0 to {}; the picture shows set 0.'
-    used = [row.id for row in catalogue.ROWS if row.terrain == name]
+    used = [spec.id for spec in catalogue.SPECS if spec.terrain == name]
     size = f'{length:g} m on a side' if ground.spatial else f'{length:g} m'
     return page(
         name,
@@ -395,7 +401,7 @@ def terrain_index() -> str:
             (
                 f'[{name}]({slug(name)}.md)', f'`{ground.type}`', meaning(ground),
                 max(len(ground.parameter_sets), 1),
-                sum(row.terrain == name for row in catalogue.ROWS),
+                sum(spec.terrain == name for spec in catalogue.SPECS),
             )
             for name, ground in names.items()
         ]  # fmt: skip
@@ -413,7 +419,7 @@ def terrain_index() -> str:
 # Speed
 
 
-PROJECTED = '1024 rows, 2 threads'
+PROJECTED = '1024 simulations, 2 threads'
 
 
 def speeds() -> dict[str, Any]:
@@ -434,21 +440,21 @@ def solved() -> str:
     """How well the shipped policies do, by family."""
     cells = []
     for domain in FAMILIES:
-        rows = [row for row in catalogue.ROWS if row.domain == domain]
-        entries = filter(None, (gallery.record(row.id) for row in rows))
+        specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
+        entries = filter(None, (gallery.record(spec.id) for spec in specs))
         found = [
             next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
             for entry in entries
         ]
         middle = {
             name: statistics.median(each[name] for each in found)
-            for name in ('fraction', 'full', 'distance')
+            for name in ('normalized_return', 'completion_rate', 'distance')
         }
         # A gait has no reward that ends with a limit: what counts is how far it comes.
-        gaits = all(row.rules == 'gait' for row in rows)
+        gaits = all(task_type(spec).score == 'distance' for spec in specs)
         cells.append((
-            f'`{domain}`', f'{len(found)} of {len(rows)}',
-            *(('–', '–') if gaits else (f'{middle["fraction"]:.2f}', f'{middle["full"]:.0%}')),
+            f'`{domain}`', f'{len(found)} of {len(specs)}',
+            *(('–', '–') if gaits else (f'{middle["normalized_return"]:.2f}', f'{middle["completion_rate"]:.0%}')),
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
@@ -465,13 +471,13 @@ def speed() -> str:
     found, cells = speeds(), []
     for id, alone in found['single'].items():
         own, raw = found['ours'][id], found['engine alone'][id]
-        one, two = (f'256 rows, {threads} threads' for threads in (1, 2))
+        one, two = (f'256 simulations, {threads} threads' for threads in (1, 2))
         cells.append((
             f'`{id}`', f'{alone["single environment"]} ({alone["single environment"] / alone["raw mj_step"]:.2f})',
             *(f'{own[n]["control steps per second"]} ({own[n]["control steps per second"] / raw[n]:.2f})'
               for n in (one, two)),
-            f'{own[one]["reset, ms per row"]:.2f} ms',
-            f'{found["memory per row, kB"][id]} kB',
+            f'{own[one]["reset, ms per simulation"]:.2f} ms',
+            f'{found["memory per simulation, kB"][id]} kB',
         ))  # fmt: skip
     header = ('', 'one', '256, one thread', '256, two threads', 'a reset', 'memory of each')
     said = (
@@ -489,7 +495,7 @@ def speed_page() -> str:
         (
             f'`{id}`', setting, own['control steps per second'],
             f'{own["control steps per second"] / found["engine alone"][id][setting]:.2f}',
-            f'{own["serial, us per row"]:.2f}', f'{own["reset, ms per row"]:.2f}',
+            f'{own["serial, us per simulation"]:.2f}', f'{own["reset, ms per simulation"]:.2f}',
             f'{own["share of resets"]:.2f}',
         )
         for id, settings in found['ours'].items()
@@ -498,7 +504,7 @@ def speed_page() -> str:
     single = [
         (
             f'`{id}`', own['single environment'], own['raw mj_step'],
-            f'{own["single environment"] / own["raw mj_step"]:.2f}', found['memory per row, kB'][id],
+            f'{own["single environment"] / own["raw mj_step"]:.2f}', found['memory per simulation, kB'][id],
         )
         for id, own in found['single'].items()
     ]  # fmt: skip
@@ -509,17 +515,17 @@ def speed_page() -> str:
     return page(
         'Speed',
         f'Measured by `python benchmarks/vector_environment.py` on {MACHINE}. Actions are random; a '
-        'control step is 10 physics steps; rows are simulations that step together. `trl-suite bench '
+        'control step is 10 physics steps; simulations step together. `trl-suite bench '
         'ID` measures your machine.',
         '## One environment',
-        table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per row of many'), single),
+        table(('environment', 'control steps per s', 'raw `mj_step`', 'ratio', 'kB per simulation of many'), single),
         '## Many at once',
-        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, rows '
+        'Resets with new terrain included. *Ratio* is to what MuJoCo alone does with the same models, simulations '
         'and threads; it may be above 1, as without resets bodies lie on the ground, where steps cost '
-        'more. *Serial* is what one thread does of a control step while the others wait, in us per row; '
+        'more. *Serial* is what one thread does of a control step while the others wait, in us per simulation; '
         '*resets* is their share of the time.',
         table(('environment', '', 'control steps per s', 'ratio', 'serial', 'a reset, ms', 'resets'), cells),
-        '![Rates by rows and threads](../benchmarks/vector_environment.png)',
+        '![Rates by simulations and threads](../benchmarks/vector_environment.png)',
         '## More cores',
         "A projection, not a measurement: how many times one core's rate 1024 simulations would reach, by "
         "Amdahl's law from what one thread does alone (*serial* above). Memory and caches that cores share "
@@ -551,8 +557,10 @@ def gone(found: dict[str, str]) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--again', action='store_true', help='make pictures that are there, too')
-    parser.add_argument('--only', default='*', metavar='PATTERN', help='of pictures, as an id')
+    parser.add_argument(
+        '--overwrite', action='store_true', help='make pictures that are there, too'
+    )
+    parser.add_argument('--filter', default='*', metavar='PATTERN', help='of pictures, as an id')
     parser.add_argument('--pages', action='store_true', help='make no pictures')
     parser.add_argument('--check', action='store_true', help='only tell whether pages are fresh')
     arguments = parser.parse_args()
@@ -571,7 +579,7 @@ def main() -> int:
     print(f'{len(old)} pages written')
     if arguments.pages:
         return 0
-    written, failed = gallery.make(DOCS / 'pictures', arguments.only, arguments.again)
+    written, failed = gallery.make(DOCS / 'pictures', arguments.filter, arguments.overwrite)
     for name, error in failed.items():
         print(f'{name}: {error}', file=sys.stderr)
     print(f'{len(written)} pictures made')

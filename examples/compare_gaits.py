@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import train_all
 
-from trl_suite import evaluation, files, policies, resources
+from trl_suite import evaluation, policies
+from trl_suite.util import files, resources
 
 
 def line(name: str, found: dict[str, Any]) -> str:

@@ -14,13 +14,15 @@ import json
 
 import train_all
 
-from trl_suite import catalogue, evaluation, files, policies, resources
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.util import files, resources
 
 
-def flat_ground(row: catalogue.Row) -> str:
+def flat_ground(spec: catalogue.EnvSpec) -> str:
     """Id of the environment with the same observations on flat ground."""
-    figure = '_'.join(row.id.split('_')[:2])
-    return f'{figure}_Flat_Terrain-v0' if 'blind' not in row.tags else f'{figure}_Flat-v0'
+    figure = '_'.join(spec.id.split('_')[:2])
+    return f'{figure}_Flat_Terrain-v0' if 'blind' not in spec.tags else f'{figure}_Flat-v0'
 
 
 def main() -> None:
@@ -30,23 +32,23 @@ def main() -> None:
     arguments = parser.parse_args()
     path = resources.directory('trained') / 'transfer.json'
     stored = json.loads(path.read_text()) if path.exists() else {}
-    plaid = [row for row in catalogue.ROWS if row.domain == 'plaid' and row.terrain != 'flat']
-    for row in plaid:
-        named = row.id in arguments.ids if arguments.ids else row.id not in stored
-        entry, flat = path.with_name(f'{row.id}.json'), path.with_name(f'{flat_ground(row)}.npz')
+    plaid = [spec for spec in catalogue.SPECS if spec.domain == 'plaid' and spec.terrain != 'flat']
+    for spec in plaid:
+        named = spec.id in arguments.ids if arguments.ids else spec.id not in stored
+        entry, flat = path.with_name(f'{spec.id}.json'), path.with_name(f'{flat_ground(spec)}.npz')
         if not named or not entry.exists() or not flat.exists():
             continue
         found = evaluation.evaluate(
-            row.id, policies.load(flat), train_all.EPISODES, train_all.SEED, arguments.threads
+            spec.id, policies.load(flat), train_all.EPISODES, train_all.SEED, arguments.threads
         )
         runs = json.loads(entry.read_text())
         own = train_all.shipped(runs)['evaluation']
         print(
-            f'{row.id}: {own["distance"]:.1f} m, {own["full"]:.0%} complete; that of flat ground '
-            f'{found["distance"]:.1f} m, {found["full"]:.0%}',
+            f'{spec.id}: {own["distance"]:.1f} m, {own["completion_rate"]:.0%} complete; that of flat ground '
+            f'{found["distance"]:.1f} m, {found["completion_rate"]:.0%}',
             flush=True,
         )
-        stored[row.id] = found
+        stored[spec.id] = found
         with files.replacing(path) as part:
             part.write_text(json.dumps(stored) + '\n')
 

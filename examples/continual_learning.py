@@ -30,8 +30,8 @@ class FineTuning:
         trainer = self.trainer
         trainer.environments.close()
         trainer.environment = environment
-        trainer.begin_lesson()
-        trainer.row = trainer.environments.row
+        trainer.begin_stage()
+        trainer.spec = trainer.environments.spec
         # The number of samples tells one stage from the next.
         seeds = sequences.train_seeds(self.settings.num_envs, (self.seed, trainer.samples))
         trainer.environments.seed(seeds)
@@ -65,7 +65,7 @@ def main(arguments=None):
     if chosen.threads:
         torch.set_num_threads(chosen.threads)
     settings = ppo_settings.settings_for(
-        sequence.ids[0], start='', samples=chosen.budget * len(sequence), lessons=()
+        sequence.ids[0], start='', samples=chosen.budget * len(sequence), stages=()
     )
     chosen.output.mkdir(parents=True, exist_ok=True)
     result = sequences.run(

@@ -1,7 +1,7 @@
 """How well a footstep controller walks where it is told: plans, pushes, slopes, bumps, belts.
 
     python examples/evaluate_footsteps.py                           # the reference policy
-    python examples/evaluate_footsteps.py mine.npz --only general straight --json mine.json
+    python examples/evaluate_footsteps.py mine.npz --filter general straight --json mine.json
 
 For every condition, over episodes with the seeds of `evaluation.evaluate`: the share that lasts to
 the end, the mean reward per step (0 after a fall), the distance from planned to actual landing
@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import files, policies, suite
-from trl_suite.catalogue import Row
+from trl_suite import policies, suite
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped3D_LLC_General_Step-v0'
@@ -64,22 +65,22 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def row_for(id_: str, terrain: Any) -> Row:
-    row = suite.find(id_)
-    options = {k: v for k, v in row.options.items() if k != 'plans'}
+def row_for(id_: str, terrain: Any) -> EnvSpec:
+    spec = suite.find(id_)
+    options = {k: v for k, v in spec.options.items() if k != 'plans'}
     return dataclasses.replace(
-        row, terrain=terrain or row.terrain, options=types.MappingProxyType(options)
+        spec, terrain=terrain or spec.terrain, options=types.MappingProxyType(options)
     )
 
 
 def run(
-    row: Row, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
+    spec: EnvSpec, policy: policies.Policy, episodes: int, seed: int, seconds: float, **options: Any
 ) -> dict[str, Any]:
     """Runs one episode in every row; returns what became of them."""
     steps = round(seconds * 30)
     seeds = np.random.SeedSequence(seed).generate_state(episodes, np.uint32).tolist()
     environments = VectorEnvironment(
-        row, episodes, 0, seeds, autoreset='disabled', step_limit=steps, task_kwargs=options
+        spec, episodes, 0, seeds, autoreset='disabled', step_limit=steps, task_kwargs=options
     )
     policy.check(environments)
     observation = environments.reset()
@@ -103,7 +104,7 @@ def run(
     errors, turns = np.concatenate(landing), np.concatenate(heading)
     return {
         'episodes': episodes, 'seed': seed, 'seconds': seconds, 'survived': float(full.mean()),
-        'fraction': reward / (steps * episodes), 'landing': float(errors.mean()),
+        'normalized_return': reward / (steps * episodes), 'landing': float(errors.mean()),
         'landing_90': float(np.quantile(errors, 0.9)), 'heading': float(turns.mean()),
         'distance': float(distance.mean()),
     }  # fmt: skip
@@ -113,7 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('policy', nargs='?', help='.npz file; the reference policy by default')
     parser.add_argument('--id', default=ID)
-    parser.add_argument('--only', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
+    parser.add_argument('--filter', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
     parser.add_argument('--episodes', type=int, default=100)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--seconds', type=float, default=SECONDS)
@@ -125,14 +126,14 @@ def main() -> None:
         else suite.reference_policy(arguments.id)
     )
     found = {}
-    for name in arguments.only:
+    for name in arguments.filter:
         options = dict(CONDITIONS[name])
         row = row_for(arguments.id, options.pop('terrain', None))
         found[name] = result = run(
             row, policy, arguments.episodes, arguments.seed, arguments.seconds, **options
         )
         print(
-            f'{name:34} survived {result["survived"]:.2f}  reward {result["fraction"]:.3f}  '
+            f'{name:34} survived {result["survived"]:.2f}  reward {result["normalized_return"]:.3f}  '
             f'landing {result["landing"]:.3f} m, 90 % {result["landing_90"]:.3f}  '
             f'heading {result["heading"]:.3f} rad',
             flush=True,

@@ -21,9 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, errors, files, policies, resources
-from trl_suite.scripted import scripted
-from trl_suite.tasks.spatial_task import CONTROL_TIMESTEP
+from trl_suite import policies
+from trl_suite.registry import catalogue
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
+from trl_suite.tasks.navigation.scripted import scripted
+from trl_suite.util import errors, files, resources
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 32
@@ -37,11 +39,11 @@ MINUTE = 60.0  # s
 def along_trails(environments: VectorEnvironment, place: np.ndarray) -> np.ndarray:
     """Distance of places (n, 2) from the beginnings of their trails, (n,) m; 0 where is none."""
     found = np.zeros(len(place))
-    for row, ground in enumerate(environments.task.arena.grounds):
+    for env_id, ground in enumerate(environments.task.arena.grounds):
         if ground.layout.trail is not None:
             trail = ground.layout.trail
             middle = 0.5 * (trail.start + trail.end)
-            found[row] = SEGMENT * np.linalg.norm(middle - place[row], axis=1).argmin()
+            found[env_id] = SEGMENT * np.linalg.norm(middle - place[env_id], axis=1).argmin()
     return found
 
 
@@ -108,9 +110,9 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()
     ids = [
-        row.id
-        for row in catalogue.ROWS
-        if row.tags.intersection(TAGS) and fnmatch.fnmatchcase(row.id, arguments.pattern)
+        spec.id
+        for spec in catalogue.SPECS
+        if spec.tags.intersection(TAGS) and fnmatch.fnmatchcase(spec.id, arguments.pattern)
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', arguments.pattern, catalogue.BY_ID))

@@ -33,8 +33,9 @@ import torch
 import tqdm
 from torch import nn
 
-from trl_suite import characters, evaluation, files, policies
-from trl_suite.tasks import gait
+from trl_suite import characters, evaluation, policies
+from trl_suite.tasks.gait import rules as gait_rules
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 
@@ -45,10 +46,9 @@ class Settings:
     samples: float = 2e5  # cycles
     num_envs: int = 64
     start: str = ''  # id whose policy the run begins with, or a policy file; '': with none
-    guided: float = (
-        8e3  # first cycles, driven by `start`, the shipped policy or random base actions
-    )
-    guide_epsilon: float = 0.15  # share of random actions in them
+    # First cycles, driven by the policy it begins with, the shipped one, or by random base actions.
+    expert_cycles: float = 8e3
+    expert_epsilon: float = 0.15  # share of random actions in them
     begin: float = 2e3  # cycles before learning begins; they set the scales of the observation
     epsilon: float = 0.08  # share of random actions after them
     greedy: float = 0.25  # share of simulations without random actions and without retries
@@ -179,7 +179,7 @@ class Learner:
         environments = self.environments
         parameters = environments.task.gait.parameters
         self.choices = parameters.action(parameters.base_actions)
-        ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+        ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
         self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]
@@ -195,11 +195,11 @@ class Learner:
             self.networks.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
         )
         self.replay = Replay(int(s.capacity), len(self.columns))
-        self.guide = policies.reference(id_) if id_ in policies.available() else None
+        self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
             shipped = s.start in policies.available()
-            self.guide = (policies.reference if shipped else policies.load)(s.start)
-            self.begin_with(self.guide)
+            self.expert = (policies.reference if shipped else policies.load)(s.start)
+            self.begin_with(self.expert)
         self.samples = self.updates = 0
         self.loss = 0.0
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
@@ -262,13 +262,13 @@ class Learner:
         """Chooses an action for each row, (n,)."""
         s, n = self.settings, self.settings.num_envs
         epsilon = np.full(n, s.epsilon)
-        guided = self.samples < s.guided
-        if guided and self.guide is None:
+        by_expert = self.samples < s.expert_cycles
+        if by_expert and self.expert is None:
             epsilon[:] = 1.0
             chosen = np.zeros(n, int)
-        elif guided:
-            epsilon[:] = s.guide_epsilon
-            away = self.guide(self.observation)[:, None] - self.choices
+        elif by_expert:
+            epsilon[:] = s.expert_epsilon
+            away = self.expert(self.observation)[:, None] - self.choices
             chosen = (away**2).sum(2).argmin(1)
         else:
             with torch.no_grad():
@@ -315,18 +315,18 @@ class Learner:
             environments.reset(fresh)
         self.observation = environments.task.observation.copy()
 
-    def go_back(self, row: int) -> bool:
+    def go_back(self, env_id: int) -> bool:
         """Puts a row that fell where it was some cycles ago; returns whether it did."""
-        s, past = self.settings, self.past[row]
+        s, past = self.settings, self.past[env_id]
         back = int(self.random.integers(s.back[0], s.back[1] + 1))
-        if self.random.random() >= s.retry or self.greedy[row]:
+        if self.random.random() >= s.retry or self.greedy[env_id]:
             return False
-        if self.tried[0, row] >= s.retries or len(past) <= back:
+        if self.tried[0, env_id] >= s.retries or len(past) <= back:
             return False
         for _ in range(back + 1):
             state = past.pop()
-        self.environments.set_state(state, [row])
-        self.tried[:, row] = self.tried[0, row] + 1, 0
+        self.environments.set_state(state, [env_id])
+        self.tried[:, env_id] = self.tried[0, env_id] + 1, 0
         return True
 
     def learn(self) -> None:
@@ -393,7 +393,7 @@ class Learner:
         environments, network = self.environments, self.targets[0]
         strides = *(stride for *_, stride in self.settings.convolutions), 1
         return policies.Policy(
-            id=environments.row.id,
+            id=environments.spec.id,
             blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
             actions=tuple(environments.action_map.names),
             quantity=environments.action_map.quantity,
@@ -413,7 +413,7 @@ class Learner:
             info={
                 'seed': self.seed,
                 'samples': self.samples,
-                'character': characters.fingerprint(environments.task.character.row),
+                'character': characters.fingerprint(environments.task.character.spec),
             },
         )  # fmt: skip
 
@@ -421,11 +421,13 @@ class Learner:
         """Puts a point on the curve, and returns it."""
         s, begin = self.settings, time.process_time()
         result = evaluation.evaluate(
-            self.environments.row, self.exported(), s.evaluation_episodes, ppo.EVALUATION_SEED,
+            self.environments.spec, self.exported(), s.evaluation_episodes, ppo.EVALUATION_SEED,
             self.threads,
         )  # fmt: skip
         self.seconds['evaluation'] += time.process_time() - begin
-        point = {name: result[name] for name in ('fraction', 'full', 'distance')}
+        point = {
+            name: result[name] for name in ('normalized_return', 'completion_rate', 'distance')
+        }
         point['median_distance'] = float(np.median(result['distances']))
         point |= {'samples': self.samples, 'updates': self.updates, 'loss': self.loss}
         self.curve.append({**point, 'seconds': dict(self.seconds)})
@@ -446,7 +448,7 @@ class Learner:
     def write_curve(self, folder: pathlib.Path) -> None:
         """Writes the settings and the curve."""
         record = {
-            'id': self.environments.row.id, 'seed': self.seed,
+            'id': self.environments.spec.id, 'seed': self.seed,
             'settings': dataclasses.asdict(self.settings), 'threads': self.threads,
             'curve': self.curve,
         }  # fmt: skip
@@ -504,7 +506,9 @@ def train(
 def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'cycles')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        print(f'{point["samples"]:9} {point["distance"]:.1f} m, {point["full"]:.0%} complete')
+        print(
+            f'{point["samples"]:9} {point["distance"]:.1f} m, {point["completion_rate"]:.0%} complete'
+        )
     print(folder / 'policy.npz')
 
 

@@ -30,9 +30,9 @@ if args.file is None:
         parts.append(JOINT.format(f'{leg}_knee', leg, foot, '0 0 -.25', -2))
     args.file.write_text(f'<robot name="table">{"".join(parts)}</robot>')
 links = {'end_effectors': args.feet, 'fall_links': args.fall}
-row = characters.from_file(args.file, **links, spatial=args.spatial)
-print(*row.notes, sep='\n')  # what was assumed
-env = suite.build(row, terrain=args.terrain, task='walk', task_kwargs={'random': args.seed})
+spec = characters.from_file(args.file, **links, spatial=args.spatial)
+print(*spec.notes, sep='\n')  # what was assumed
+env = suite.build(spec, terrain=args.terrain, task='walk', task_kwargs={'random': args.seed})
 i = np.arange(len(env.action_map))
 bend, trot = 0.2 - 0.6 * (i % 2), np.pi * ((i // 2 + i // 4) % 2 - i % 2 / 2)
 policy = lambda _: bend + 0.3 * np.sin(15 * env.physics.time() + trot)  # noqa: E731

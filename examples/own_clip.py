@@ -9,7 +9,8 @@ Reads BVH, CMU's AMC, and the JSON of TerrainRL and DeepMimic. Where joints have
 
 import argparse
 
-from trl_suite import clip_check, rendering, retargeting, suite
+from trl_suite import rendering, retargeting, suite
+from trl_suite.retargeting import clip_check
 
 
 def main(arguments=None):

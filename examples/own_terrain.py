@@ -24,7 +24,7 @@ if args.file.suffix == '.png':
     mine = terrain.from_image(args.file, args.spacing, high=args.height)
 else:
     mine = terrain.from_mesh(args.file, args.spacing, centre=True)
-ground = terrain.Ground(mine, args.seed)
+ground = terrain.SpatialGround(mine, args.seed)
 terrain.save_mesh(ground, args.output.with_suffix('.glb'), low=-12, high=12)
 print(f'{ground.height(0, 0):.2f} m at the origin, {ground.height(6, 0):.2f} m 6 m ahead')
 env = suite.build('biped3d_mocap', None, mine, 'footsteps', task_kwargs={'random': args.seed})

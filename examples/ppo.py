@@ -5,8 +5,8 @@
 
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it
 had never stopped), `curve.json` (settings, learning curve), `policy.npz` (the policy that scored
-best in the evaluations of the curve, for `trl_suite.policies`), `lesson_N.npz` at the end of every
-lesson but the last, and at the end `last.npz`.
+best in the evaluations of the curve, for `trl_suite.policies`), `stage_N.npz` at the end of every
+curriculum stage but the last, and at the end `last.npz`.
 
 PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
 Implementation Details of PPO); the settings of each environment stand in `ppo_settings.py`. Needs
@@ -28,18 +28,18 @@ from typing import Any
 import numpy as np
 import torch
 import tqdm
-from guide import guide
+from expert import expert
 from ppo_settings import Settings, settings_for
 from torch import nn
 from torch.optim import swa_utils
 
 from trl_suite import characters, evaluation, policies, suite
-from trl_suite.catalogue import Row
-from trl_suite.tasks import rewards
-from trl_suite.terrain import spatial_ground
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.tasks.components import rewards
+from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.vector import VectorEnvironment
 
-TEACHERS = {**evaluation.BASELINES, 'guide': guide}
+TEACHERS = {**evaluation.BASELINES, 'expert': expert}
 EVALUATION_SEED = 2**31  # far from the seeds of training; published figures use others again
 OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # blocks of an observation
@@ -170,22 +170,24 @@ def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
 class Trainer:
     """One run: the simulations, the networks, and where it has got to."""
 
-    def __init__(self, environment: str | Row, seed: int, settings: Settings, threads: int) -> None:
+    def __init__(
+        self, environment: str | EnvSpec, seed: int, settings: Settings, threads: int
+    ) -> None:
         torch.manual_seed(seed)
-        self.row = suite.find(environment) if isinstance(environment, str) else environment
+        self.spec = suite.find(environment) if isinstance(environment, str) else environment
         self.seed = seed
         self.settings, self.threads = settings, threads
         s = settings
-        if not 1 <= s.lessons_averaged <= max(1, len(s.lessons)):
+        if not 1 <= s.stages_averaged <= max(1, len(s.stages)):
             raise ValueError(
-                f'lessons_averaged: {s.lessons_averaged}; expected 1 to {max(1, len(s.lessons))}, the '
-                'number of lessons'
+                f'stages_averaged: {s.stages_averaged}; expected 1 to {max(1, len(s.stages))}, the '
+                'number of stages'
             )
         self.samples = 0
-        self.begin_lesson()
+        self.begin_stage()
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
         if s.mirrored and self.mirror is None:
-            raise ValueError(f'{self.row.id} has no left and right to mirror')
+            raise ValueError(f'{self.spec.id} has no left and right to mirror')
         terms = getattr(self.environments.task, 'TERMS', rewards.IMITATION_TERMS)
         self.largest = {name: weight for name, (weight, _) in terms.items()}
         self.random = np.random.default_rng(seed)
@@ -218,23 +220,23 @@ class Trainer:
         self.recent = np.zeros(3)  # return, steps and number of the episodes ended lately
 
     @property
-    def lesson(self) -> int:
-        """How many lessons have begun."""
+    def stage(self) -> int:
+        """How many curriculum stages have begun."""
         s = self.settings
-        return sum(self.samples >= share * s.samples for share, _ in s.lessons)
+        return sum(self.samples >= share * s.samples for share, _ in s.stages)
 
-    def begin_lesson(self) -> None:
-        """Makes the simulations of the present lesson, all at their start."""
-        s, self.current = self.settings, self.lesson
-        self.best = -np.inf  # who has not had all lessons does not ship
+    def begin_stage(self) -> None:
+        """Makes the simulations of the present curriculum stage, all at their start."""
+        s, self.current = self.settings, self.stage
+        self.best = -np.inf  # who has not had all curriculum stages does not ship
         seed: int | list[int] = self.seed
         if self.current > 1:
             sequence = np.random.SeedSequence((self.seed, self.current))
             seed = sequence.generate_state(s.num_envs).tolist()
-        options = dict(s.lessons[self.current - 1][1]) if self.current else {}
-        row = dataclasses.replace(self.row, terrain=options.pop('terrain', self.row.terrain))
+        options = dict(s.stages[self.current - 1][1]) if self.current else {}
+        spec = dataclasses.replace(self.spec, terrain=options.pop('terrain', self.spec.terrain))
         self.environments = VectorEnvironment(
-            row, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
+            spec, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
         )
         self.observation = self.environments.reset()
         self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
@@ -245,7 +247,7 @@ class Trainer:
         acts, scales = self.environments.action_map, self.scales
         same = (other.actions, other.quantity) == (tuple(acts.names), acts.quantity)
         if not same:
-            raise ValueError(f'{self.row.id} does not act as {other.id} does')
+            raise ValueError(f'{self.spec.id} does not act as {other.id} does')
         hidden = tuple(len(bias) for bias in other.biases[:-1])
         if hidden != self.settings.hidden:
             raise ValueError(f'hidden: {self.settings.hidden}, but {other.id} has {hidden}')
@@ -303,7 +305,7 @@ class Trainer:
         s, environments = self.settings, self.environments
         teacher = TEACHERS[baseline](environments)
         seen: list[np.ndarray] = []
-        shown: list[np.ndarray] = []
+        labels: list[np.ndarray] = []
         std = self.log_std.exp().detach().numpy()
         for number in range(s.clonings):
             first = len(seen)
@@ -311,25 +313,25 @@ class Trainer:
                 observation, left = self.seen(self.observation)
                 action = teacher(self.observation)
                 seen.append(observation.copy())
-                shown.append(self.mirror.answered(action, left) if self.mirror else action)
+                labels.append(self.mirror.unmirror_action(action, left) if self.mirror else action)
                 if number > 0:
                     with torch.no_grad():
                         action = self.policy(self.scales(observation)).numpy()
-                    action = self.mirror.answered(action, left) if self.mirror else action
+                    action = self.mirror.unmirror_action(action, left) if self.mirror else action
                 noise = self.random.standard_normal(action.shape)
                 step = environments.step(np.clip(action + std * noise, -1, 1))
                 ended = step.terminated | step.truncated
                 self.observation = environments.reset(ended) if ended.any() else step.observation
             self.scales.update(np.concatenate(seen[first:]))
-            self.fit(np.concatenate(seen), np.concatenate(shown))
+            self.fit(np.concatenate(seen), np.concatenate(labels))
             self.samples += (len(seen) - first) * s.num_envs
             if folder is not None and number < s.clonings - 1:
                 self.evaluate(folder, 0.0)
 
-    def fit(self, seen: np.ndarray, shown: np.ndarray) -> None:
+    def fit(self, seen: np.ndarray, labels: np.ndarray) -> None:
         """Has the policy answer observations (n, k) by actions (n, a)."""
         inputs = self.scales(seen)
-        targets = torch.from_numpy(shown.astype(np.float32))
+        targets = torch.from_numpy(labels.astype(np.float32))
         optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
         for _ in range(self.settings.cloning_epochs):
             order = torch.from_numpy(self.random.permutation(len(inputs)))
@@ -355,7 +357,7 @@ class Trainer:
                 means[t] = self.policy(self.scales(observations[t])).numpy()
             actions[t] = means[t] + std * noise[t]
             step = environments.step(
-                self.mirror.answered(actions[t], left) if self.mirror else actions[t]
+                self.mirror.unmirror_action(actions[t], left) if self.mirror else actions[t]
             )
             failed[t] = step.terminated | self.strays(step.info['reward_terms'])
             ended[t] = failed[t] | step.truncated
@@ -377,8 +379,8 @@ class Trainer:
         with torch.no_grad():
             values = self.value(inputs)[:, 0].numpy().reshape(s.horizon + 1, s.num_envs)
             following = values[1:].astype(float)
-            for t, rows, last in cut:
-                following[t, rows] = self.value(self.scales(last))[:, 0].numpy()
+            for t, env_ids, last in cut:
+                following[t, env_ids] = self.value(self.scales(last))[:, 0].numpy()
         following[failed] = 0.0
         advantage = advantages(reward, values[:-1], following, ended, s.gamma, s.lambda_)
         self.scales.update(flat[: -s.num_envs])  # seen only after this update
@@ -470,7 +472,7 @@ class Trainer:
         )
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
         return policies.Policy(
-            id=self.row.id,
+            id=self.spec.id,
             blocks=tuple(
                 (name, part.stop - part.start) for name, part in self.environments.blocks.items()
             ),
@@ -488,7 +490,7 @@ class Trainer:
             info={
                 'seed': self.seed,
                 'samples': self.samples,
-                'character': characters.fingerprint(self.environments.task.character.row),
+                'character': characters.fingerprint(self.environments.task.character.spec),
             },
             mirror=self.mirror,
         )
@@ -497,13 +499,13 @@ class Trainer:
         """Adds a point to the curve; keeps the policy if it is the best so far."""
         policy = self.exported()
         found = evaluation.evaluate(
-            self.row, policy, self.settings.evaluation_episodes, EVALUATION_SEED, self.threads
+            self.spec, policy, self.settings.evaluation_episodes, EVALUATION_SEED, self.threads
         )
         returned, steps, number = self.recent.tolist()
         point = {
             'samples': self.samples,
-            'fraction': found['fraction'],
-            'full': found['full'],
+            'normalized_return': found['normalized_return'],
+            'completion_rate': found['completion_rate'],
             'distance': found['distance'],
             'training_return': returned / max(number, 1),
             'training_length': steps / max(number, 1),
@@ -513,12 +515,12 @@ class Trainer:
         }
         self.recent[:] = 0
         self.curve.append(point)
-        if found['fraction'] > self.best:
-            self.best = found['fraction']
+        if found['normalized_return'] > self.best:
+            self.best = found['normalized_return']
             policies.save(policy, folder / 'policy.npz')
 
     def has_learnt(self) -> bool:
-        last = [point['fraction'] for point in self.curve[-2:]]
+        last = [point['normalized_return'] for point in self.curve[-2:]]
         return len(last) == 2 and min(last) >= self.settings.enough
 
     def save(self, folder: pathlib.Path) -> None:
@@ -537,7 +539,7 @@ class Trainer:
         torch.save(state, part)
         os.replace(part, folder / 'checkpoint.pt')
         curve = {
-            'id': self.row.id,
+            'id': self.spec.id,
             'seed': self.seed,
             'settings': dataclasses.asdict(self.settings),
             'threads': self.threads,
@@ -560,10 +562,10 @@ class Trainer:
         self.optimizer.load_state_dict(state['optimizer'])
         self.scales.count, self.scales.mean, self.scales.square = state['scales']
         self.random.bit_generator.state = state['random']
-        if self.lesson != self.current:
+        if self.stage != self.current:
             kept = {name: getattr(self, name) for name in _STATE}
             self.environments.close()
-            self.begin_lesson()
+            self.begin_stage()
             for name, value in kept.items():
                 setattr(self, name, value)
         self.environments.set_state(state['environments'])
@@ -594,9 +596,9 @@ def train(
     ) as bar:
         bar.set_description(id_)
         while trainer.samples < total and not trainer.has_learnt():
-            if trainer.lesson != trainer.current:
+            if trainer.stage != trainer.current:
                 trainer.environments.close()
-                trainer.begin_lesson()
+                trainer.begin_stage()
             begin, before = time.perf_counter(), trainer.samples
             if not trainer.begun:
                 trainer.imitate(settings.start, folder)
@@ -606,8 +608,8 @@ def train(
             divergence = trainer.learn(batch)
             if trainer.average:
                 trainer.average.update_parameters(trainer.policy)
-            if trainer.lesson != trainer.current:
-                policies.save(trainer.exported(), folder / f'lesson_{trainer.current}.npz')
+            if trainer.stage != trainer.current:
+                policies.save(trainer.exported(), folder / f'stage_{trainer.current}.npz')
             end = time.perf_counter()
             trainer.seconds['simulation'] += middle - begin
             trainer.seconds['learning'] += end - middle
@@ -616,7 +618,7 @@ def train(
             bar.set_postfix(
                 reward=f'{trainer.recent[0] / max(trainer.recent[1], 1):.2f}',
                 length=f'{trainer.recent[1] / number:.0f}',
-                score=f'{trainer.curve[-1]["fraction"]:.2f}' if trainer.curve else '-',
+                score=f'{trainer.curve[-1]["normalized_return"]:.2f}' if trainer.curve else '-',
                 refresh=False,
             )
             every = settings.evaluate_every
@@ -624,8 +626,8 @@ def train(
                 trainer.evaluate(folder, divergence)
                 trainer.seconds['evaluation'] += time.perf_counter() - end
                 trainer.save(folder)
-    earlier = range(trainer.current - settings.lessons_averaged + 1, trainer.current)
-    parts = [policies.load(folder / f'lesson_{i}.npz') for i in earlier]
+    earlier = range(trainer.current - settings.stages_averaged + 1, trainer.current)
+    parts = [policies.load(folder / f'stage_{i}.npz') for i in earlier]
     policies.save(mean_of([*parts, trainer.exported()]), folder / 'last.npz')
     return trainer.curve
 
@@ -658,7 +660,7 @@ def main() -> None:
     id_, seed, changes, folder, threads = command_line(__doc__.splitlines()[0], 'control steps')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(
-            f'{point["samples"]:9} {point["fraction"]:.3f} of the maximum, {point["full"]:.0%} complete'
+            f'{point["samples"]:9} {point["normalized_return"]:.3f} of the maximum, {point["completion_rate"]:.0%} complete'
         )
     print(folder / 'policy.npz')
 

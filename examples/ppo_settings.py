@@ -1,4 +1,4 @@
-"""What `ppo.py` trains with: the settings of each environment, and the lessons that come before it.
+"""What `ppo.py` trains with: the settings of each environment, and the curriculum stages that come before it.
 
 Rows of `OVERRIDES` say what differs from the defaults of `Settings`.
 """
@@ -40,10 +40,10 @@ class Settings:
     # What is evaluated and ships has the mean of the weights over about so many samples, the later
     # ones counting more (Polyak averaging); 0: the weights of now.
     averaged: float = 0.0
-    # And what ships at last is the mean over so many ends of lessons, the last ones (stochastic
+    # And what ships at last is the mean over so many ends of stages, the last ones (stochastic
     # weight averaging, Izmailov et al. 2018, arXiv:1803.05407): one policy that can do what each of
     # them has stressed.
-    lessons_averaged: int = 1
+    stages_averaged: int = 1
     # In training an episode also ends when a reward term, as share of its maximum and smoothed over
     # `patience` seconds, falls below its value here: for gaits so fast that standing still is a
     # local optimum. Evaluations are without it.
@@ -59,9 +59,9 @@ class Settings:
     # Blocks of the observation that begin with bearing and distance of a place, which the network
     # then sees in a straight line, too (see `trl_suite.policies.placed`).
     places: tuple[str, ...] = ()
-    # Lessons: from which share of the samples on, with which options of the task; and on which
+    # Curriculum stages: from which share of the samples on, with which options of the task; and on which
     # `terrain`, if another. Evaluations have those of the environment.
-    lessons: tuple[tuple[float, dict[str, Any]], ...] = ()
+    stages: tuple[tuple[float, dict[str, Any]], ...] = ()
     # Begin with the published policy of this environment, as PLAiD does (Berseth et al. 2018): its
     # weights, its scales and its noise. What it did not observe begins without influence. Or with
     # one of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
@@ -81,7 +81,7 @@ class Settings:
 
 
 def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
-    """Lessons of equal length on a terrain that comes ever closer to a preset, and at last on it.
+    """Curriculum stages of equal length on a terrain that comes ever closer to a preset, and at last on it.
 
     Args:
       preset: of the terrain.
@@ -91,11 +91,11 @@ def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tupl
     preset_ = terrain.load(preset)
     full = dict(preset_.parameter_sets[0])
     ground = {'Type': preset_.type, 'Params': [{**full, **low}, full]}
-    return evenly([*({'terrain': ground, 'blend': height} for height in heights), {}])
+    return evenly([*({'terrain': ground, 'terrain_level': height} for height in heights), {}])
 
 
 def crowded(preset: str) -> tuple[Any, ...]:
-    """Lessons on walls only and on all obstacles, closer together than in a mixed preset, and on that."""
+    """Curriculum stages on walls only and on all obstacles, closer together than in a mixed preset, and on that."""
     mixed = terrain.load(preset)
     near = {
         name: CLOSER * value if 'Spacing' in name else value
@@ -108,9 +108,9 @@ def crowded(preset: str) -> tuple[Any, ...]:
     )
 
 
-def evenly(lessons: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
-    """Lessons of equal length, one after the other."""
-    return tuple((i / len(lessons), options) for i, options in enumerate(lessons))
+def evenly(stages: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
+    """Curriculum stages of equal length, one after the other."""
+    return tuple((i / len(stages), options) for i, options in enumerate(stages))
 
 
 # What differs from the defaults, by the pattern of an id; a later row wins.
@@ -125,17 +125,17 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # the plan. Who plans from the root also stops, and turns about: that comes last.
 WALKER = 37e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
-LESSONS = (
+STAGES = (
     (0.0, {
-        'footstep_scale': 3.0, 'heading_scale': 2.0, 'miss': 0.5,
+        'footstep_scale': 3.0, 'heading_scale': 2.0, 'max_landing_error': 0.5,
         'plans': {'length': (0.4, 0.6), 'sharp': 0.0},
     }),
     (0.9e6 / WALKER, {
-        'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.5,
+        'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.5,
         'plans': {**VARIED, 'sharp': 0.03},
     }),
     (2.1e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 3.0, 'miss': 0.6,
+        'footstep_scale': 10.0, 'heading_scale': 3.0, 'max_landing_error': 0.6,
         'plans': {**VARIED, 'sharp': 0.1},
         'pushes': {'force': (50, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
@@ -145,12 +145,12 @@ LESSONS = (
         'pushes': {'force': (80, 220), 'duration': (0.2, 0.2), 'interval': (1, 3)},
     }),
     (9e6 / WALKER, {
-        'footstep_scale': 3.0, 'heading_scale': 5.0, 'miss': 0.8,
+        'footstep_scale': 3.0, 'heading_scale': 5.0, 'max_landing_error': 0.8,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
     (10e6 / WALKER, {
-        'footstep_scale': 8.0, 'heading_scale': 5.0, 'miss': 0.6,
+        'footstep_scale': 8.0, 'heading_scale': 5.0, 'max_landing_error': 0.6,
         'plans': {**VARIED, 'sharp': 0.05},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
@@ -165,39 +165,39 @@ LESSONS = (
         'pushes': {'force': (80, 200), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
     }),
     (18e6 / WALKER, {
-        'footstep_scale': 10.0, 'heading_scale': 4.0, 'miss': 0.5, 'grace': 2.0,
+        'footstep_scale': 10.0, 'heading_scale': 4.0, 'max_landing_error': 0.5, 'grace_period': 2.0,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.1},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
     (19.3e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 4.0, 'miss': 0.35, 'grace': 1.5,
+        'footstep_scale': 15.0, 'heading_scale': 4.0, 'max_landing_error': 0.35, 'grace_period': 1.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (80, 180), 'duration': (0.2, 0.2), 'interval': (3, 8)},
     }),
     (21e6 / WALKER, {
-        'footstep_scale': 15.0, 'heading_scale': 3.0, 'miss': 0.5, 'grace': 2.5,
+        'footstep_scale': 15.0, 'heading_scale': 3.0, 'max_landing_error': 0.5, 'grace_period': 2.5,
         'plans': {**VARIED, 'change': 0.3, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
     (23e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
+        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
         'plans': {**VARIED, 'change': 0.5, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (2.5, 5)},
     }),
     (25e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.3, 'grace': 2.5,
+        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.3, 'grace_period': 2.5,
         'plans': {**VARIED, 'change': 0.2, 'sharp': 0.06},
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
     (27e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
+        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
         'plans': {
             **VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2, 'sharp': 0.06,
         },
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
     (33e6 / WALKER, {
-        'footstep_scale': 20.0, 'heading_scale': 3.0, 'miss': 0.35, 'grace': 2.5,
+        'footstep_scale': 20.0, 'heading_scale': 3.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
         'plans': {
             **VARIED, 'length': (0.0, 0.7), 'root_length': (0.0, 0.7), 'change': 0.2, 'sharp': 0.08,
             'from_root': 0.5, 'root_turn': 0.6,
@@ -207,49 +207,49 @@ LESSONS = (
 )  # fmt: skip
 # Running: the row's own plan first, then other lengths and gentle turns, then plans from the root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
-RUN_LESSONS = (
-    (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'miss': 0.8}),
+RUN_STAGES = (
+    (0.0, {'footstep_scale': 2.0, 'heading_scale': 2.0, 'max_landing_error': 0.8}),
     (0.25, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
+        'footstep_scale': 4.0, 'heading_scale': 2.0, 'max_landing_error': 0.8,
         'plans': {**RUN_PLANS, 'turn': 0.15},
     }),
     (0.5, {
-        'footstep_scale': 4.0, 'heading_scale': 2.0, 'miss': 0.8,
+        'footstep_scale': 4.0, 'heading_scale': 2.0, 'max_landing_error': 0.8,
         'plans': {
             **RUN_PLANS, 'length': (0.8, 1.3), 'turn': 0.25, 'from_root': 0.3,
             'root_length': (0.8, 1.3), 'root_width': (0.08, 0.25), 'root_turn': 0.25,
         },
     }),
 )  # fmt: skip
-FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'lessons': LESSONS, 'averaged': 5e5}
-SHORTER = {'samples': 2e6, 'lessons': evenly([options for _, options in LESSONS[:3]])}
-ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'miss': 0.6}),)
+FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
+SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
+ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),)
 STEPS_ON = {  # on other grounds and plans; gently, or what the walker can is lost
-    **FOOTSTEPS, 'samples': 1e6, 'lessons': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
 # In the plane: the row's own plan, then all lengths, ever more accurately. The reward alone would have
 # it walk a quarter of a metre ahead of the plan, as the reference's longer steps do.
 PLANAR_PLANS = {'length': (0.25, 0.6), 'change': 1.0}
-PLANAR_LESSONS = (
-    (0.0, {'footstep_scale': 3.0, 'miss': 0.5}),
-    (0.2, {'footstep_scale': 5.0, 'miss': 0.3, 'plans': PLANAR_PLANS}),
-    (0.45, {'footstep_scale': 10.0, 'miss': 0.2, 'plans': PLANAR_PLANS}),
+PLANAR_STAGES = (
+    (0.0, {'footstep_scale': 3.0, 'max_landing_error': 0.5}),
+    (0.2, {'footstep_scale': 5.0, 'max_landing_error': 0.3, 'plans': PLANAR_PLANS}),
+    (0.45, {'footstep_scale': 10.0, 'max_landing_error': 0.2, 'plans': PLANAR_PLANS}),
 )  # fmt: skip
 PLANAR_STEPS = {
-    'samples': 0.8e6, 'gamma': 0.97, 'lessons': PLANAR_LESSONS, 'start': 'PD_Biped2D_Flat-v0',
+    'samples': 0.8e6, 'gamma': 0.97, 'stages': PLANAR_STAGES, 'start': 'PD_Biped2D_Flat-v0',
 }  # fmt: skip
-RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'lessons': RUN_LESSONS, **RUNS}
+RUN_STEPS = {**FOOTSTEPS, 'samples': 5e6, 'stages': RUN_STAGES, **RUNS}
 PLANS = {  # a step is a whole footstep: few of them
     'samples': 4e5, 'num_envs': 128, 'horizon': 16, 'minibatch': 512, 'learning_rate': 2e-4,
-    'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('target',),
+    'kl_per_action': 0.01, 'initial_std': 0.12, 'view': (6.0, 3.0), 'places': ('goal',),
     'start': 'scripted', 'evaluate_every': 4e4, 'evaluation_episodes': 16,
 }  # fmt: skip
 # Updates stop after a few steps, too few to learn a value by.
 BETTER_VALUED = {'value_goes_on': True, 'learning_rate': 1e-4}
 # Shown the way by somebody who has a map, again and again from where it goes astray; then by itself.
 GUIDED = {
-    **BETTER_VALUED, 'samples': 2e5, 'start': 'guide', 'cloned': 1.2e5, 'clonings': 6,
+    **BETTER_VALUED, 'samples': 2e5, 'start': 'expert', 'cloned': 1.2e5, 'clonings': 6,
     'value_first': 1.4e5, 'map_bound': 0.3, 'averaged': 2e4, 'evaluate_every': 2e4,
     'evaluation_episodes': 32,
 }  # fmt: skip
@@ -258,8 +258,8 @@ BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
 # A goal so large that a kicked ball comes to rest in it, and then ever smaller.
 DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
-    'value_goes_on': True, 'averaged': 2e4, 'places': ('target', 'ball'),
-    'lessons': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
+    'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
+    'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
 CYCLES = {  # of a gait, 0.3 to 0.6 s long: few steps, each of them much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
@@ -272,7 +272,7 @@ LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
 # Who has so long to live treads on the spot in front of a wall, unless that ends the episode.
 CROWDED = {
-    'gamma': 0.98, 'lessons': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
+    'gamma': 0.98, 'stages': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
     'patience': 1.0,
 }  # fmt: skip
 ENOUGH = {'enough': 0.95}
@@ -320,7 +320,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, 'samples': 6e6, 'averaged': 3e5, 'enough': np.inf}),
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
     ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
-    ('PD_*2D_Mixed_Terrain-v0', {'lessons': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
+    ('PD_*2D_Mixed_Terrain-v0', {'stages': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
@@ -331,7 +331,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_General_Step-v0', {'lessons_averaged': 2}),
+    ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # Its observation is mirrored.

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import train_all
 
-from trl_suite import catalogue, resources
+from trl_suite.registry import catalogue, terrainrl
+from trl_suite.util import resources
 
 DOCS = pathlib.Path(__file__).resolve().parents[1] / 'docs'
 MODELS = {'position': 'PD', 'torque': 'torque', 'muscle': 'muscle', 'velocity': 'velocity'}
@@ -75,7 +76,7 @@ def million(samples: float) -> str:
 
 def reached(run: dict[str, Any], fraction: float) -> float | None:
     """Samples after which an evaluation of the curve first reached a fraction of the maximum."""
-    return next((p['samples'] for p in run['curve'] if p['fraction'] >= fraction), None)
+    return next((p['samples'] for p in run['curve'] if p['normalized_return'] >= fraction), None)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -91,8 +92,8 @@ def environment_row(id_: str, entry: dict[str, Any]) -> list[str]:
     interval = found['return_interval'] / found['step_limit']
     return [
         f'`{id_}`',
-        f'{found["fraction"]:.3f} ± {interval:.3f}',
-        f'{found["full"]:.0%}',
+        f'{found["normalized_return"]:.3f} ± {interval:.3f}',
+        f'{found["completion_rate"]:.0%}',
         f'{found["distance"]:.1f}',
         million(run['curve'][-1]['samples']),
         f'{minutes:.0f}',
@@ -104,15 +105,15 @@ def environment_row(id_: str, entry: dict[str, Any]) -> list[str]:
 def comparison_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     rows = []
     for id_, entry in entries.items():
-        row, runs = catalogue.BY_ID[id_], entry['runs']
-        if not train_all.compared(row):
+        spec, runs = catalogue.BY_ID[id_], entry['runs']
+        if not train_all.compared(spec):
             continue
-        fractions = [run['evaluation']['fraction'] for run in runs]
-        cells = [f'{row.character}, {MODELS[row.actuation]}', str(len(runs))]
+        fractions = [run['evaluation']['normalized_return'] for run in runs]
+        cells = [f'{spec.character}, {MODELS[spec.actuation]}', str(len(runs))]
         cells += [
             f'{np.mean(fractions):.3f}',
             ' '.join(f'{fraction:.3f}' for fraction in fractions),
-            f'{np.mean([run["evaluation"]["full"] for run in runs]):.0%}',
+            f'{np.mean([run["evaluation"]["completion_rate"] for run in runs]):.0%}',
         ]
         for milestone in MILESTONES:
             when = [reached(run, milestone) for run in runs]
@@ -133,7 +134,7 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     stored = json.loads(path.read_text()) if path.exists() else {}
     rows = []
     for id_, entry in entries.items():
-        if catalogue.BY_ID[id_].rules != 'gait' or id_ not in stored:
+        if catalogue.BY_ID[id_].actuation != 'gait' or id_ not in stored:
             continue
         run = train_all.shipped(entry)
         own, default = (
@@ -157,7 +158,7 @@ def footstep_rows() -> list[list[str]]:
         return []
     return [
         [
-            name, str(found['episodes']), f'{found["survived"]:.0%}', f'{found["fraction"]:.3f}',
+            name, str(found['episodes']), f'{found["survived"]:.0%}', f'{found["normalized_return"]:.3f}',
             f'{found["landing"]:.3f}', f'{found["landing_90"]:.3f}', f'{found["heading"]:.3f}',
         ]
         for name, found in json.loads(path.read_text())['conditions'].items()
@@ -174,8 +175,8 @@ def transfer_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
             own = train_all.shipped(entries[id_])['evaluation']
             rows.append([
                 f'`{id_}`', f'{own["distance"]:.1f}', f'{flat["distance"]:.1f}',
-                f'{own["distance"] / flat["distance"]:.1f}', f'{own["full"]:.0%}',
-                f'{flat["full"]:.0%}',
+                f'{own["distance"] / flat["distance"]:.1f}', f'{own["completion_rate"]:.0%}',
+                f'{flat["completion_rate"]:.0%}',
             ])  # fmt: skip
     return rows
 
@@ -219,8 +220,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'episodes that lasted to the end (256 steps; above a footstep controller 200 s), *distance* '
         'the mean in m, *minutes* the wall time of the run. *Begins with*: the policy whose weights '
         'the run began with, whose samples are not counted again; or what it was shown at first: '
-        '`scripted`, the rules written by hand, or `guide`, the plans of [one who has a map]'
-        '(../examples/guide.py), whose samples are counted; the page of an environment says whether its policy '
+        '`scripted`, the rules written by hand, or `expert`, the plans of [one who has a map]'
+        '(../examples/expert.py), whose samples are counted; the page of an environment says whether its policy '
         'was taken while it was shown, or after. '
         f'Machine: {machines}; one thread per '
         'run, up to five runs and other work side by side, so that minutes say little.',
@@ -231,7 +232,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             (
                 environment_row(id_, entry)
                 for id_, entry in entries.items()
-                if catalogue.BY_ID[id_].rules != 'gait'
+                if catalogue.BY_ID[id_].actuation != 'gait'
             ),
         ),
         '![Learning curves](learning_curves.png)',
@@ -251,7 +252,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             '## Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
             f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which '
-            f'{catalogue.GAIT_STEP_LIMIT} cycles cut; of the mean the 95 % interval; speed in m/s. '
+            f'{terrainrl.STEP_LIMIT} cycles cut; of the mean the 95 % interval; speed in m/s. '
             'A decision is a cycle: of `examples/search_gaits.py` one whose base actions '
             'were all tried, of `examples/learn_gaits.py` one that was taken. In 2016: the mean that the paper of Peng, Berseth and van de Panne reports for '
             'some 10 million cycles, in another simulator, as we remember it (not checked).',
@@ -310,10 +311,10 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
 
     panels: dict[tuple[str, str], list[str]] = {}
     for id_ in entries:
-        row = catalogue.BY_ID[id_]
-        if row.rules != 'gait':  # whose return says little
-            name = next((name for tag, name in PANELS.items() if tag in row.tags), row.character)
-            panels.setdefault((row.domain, name), []).append(id_)
+        spec = catalogue.BY_ID[id_]
+        if spec.actuation != 'gait':  # whose return says little
+            name = next((name for tag, name in PANELS.items() if tag in spec.tags), spec.character)
+            panels.setdefault((spec.domain, name), []).append(id_)
     columns = 3
     count = -(-len(panels) // columns)
     figure, axes = pyplot.subplots(
@@ -323,14 +324,14 @@ def plot(entries: dict[str, dict[str, Any]], path: pathlib.Path) -> None:
         axis.set_title(f'{domain}: {name}')
         colours = pyplot.get_cmap('tab10' if len(ids) <= 10 else 'tab20').colors
         for colour, id_ in zip(itertools.cycle(colours), ids, strict=False):
-            row = catalogue.BY_ID[id_]
+            spec = catalogue.BY_ID[id_]
             for run in entries[id_]['runs']:
                 ship = run['seed'] == entries[id_]['shipped']
                 axis.plot(
                     [p['samples'] / 1e6 for p in run['curve']],
-                    [p['fraction'] for p in run['curve']],
+                    [p['normalized_return'] for p in run['curve']],
                     color=colour, alpha=1 if ship else 0.4, linewidth=1.2,
-                    label=row.task if ship else None,
+                    label=spec.task if ship else None,
                 )  # fmt: skip
         lengths = [run['curve'][-1]['samples'] for id_ in ids for run in entries[id_]['runs']]
         if max(lengths) > LONGEST * min(lengths):

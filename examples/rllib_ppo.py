@@ -18,8 +18,8 @@ STEPS = 32  # of every simulation between updates
 NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad; RLlib's 1 fells any walker
 
 
-def configuration(id_, runners=2, rows=32, seed=0):
-    """PPO with as many runners as given, each of which steps `rows` simulations on one core."""
+def configuration(id_, runners=2, num_envs=32, seed=0):
+    """PPO with as many runners as given, each of which steps `num_envs` simulations on one core."""
 
     def less_noise(algorithm, **_):
         algorithm.learner_group.foreach_learner(
@@ -35,12 +35,12 @@ def configuration(id_, runners=2, rows=32, seed=0):
         PPOConfig()
         .environment(f'trl_suite.gym:trl_suite/{id_}', env_config={'num_threads': 1})
         .env_runners(
-            num_env_runners=runners, num_envs_per_env_runner=rows, rollout_fragment_length=STEPS,
+            num_env_runners=runners, num_envs_per_env_runner=num_envs, rollout_fragment_length=STEPS,
             gym_env_vectorize_mode=VectorizeMode.VECTOR_ENTRY_POINT,
             env_to_module_connector=lambda env, spaces, device: MeanStdFilter(),
         )
         .training(
-            train_batch_size_per_learner=STEPS * rows * runners, minibatch_size=512, num_epochs=5,
+            train_batch_size_per_learner=STEPS * num_envs * runners, minibatch_size=512, num_epochs=5,
             lr=3e-4, gamma=0.95, lambda_=0.95, clip_param=0.2, use_kl_loss=False, grad_clip=0.5,
             vf_loss_coeff=0.5, vf_clip_param=math.inf,
         )

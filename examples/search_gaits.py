@@ -29,8 +29,9 @@ import ppo_settings
 import torch
 import tqdm
 
-from trl_suite import characters, evaluation, files, policies
-from trl_suite.tasks import gait
+from trl_suite import characters, evaluation, policies
+from trl_suite.tasks.gait import rules as gait_rules
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 
@@ -111,7 +112,7 @@ class Search:
 
 def visible(blocks: dict[str, slice], view: float) -> np.ndarray:
     """Which columns of an observation are no ground, or not too far ahead."""
-    ahead = np.linspace(-gait.BEHIND, gait.AHEAD, gait.SAMPLES)
+    ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
     seen = np.ones(max(part.stop for part in blocks.values()), bool)
     seen[blocks['terrain']] = ahead <= view
     return np.flatnonzero(seen)
@@ -168,7 +169,7 @@ class Learner:
         environments, columns = self.environments, self.scales.columns
         layers = [layer for layer in self.network if isinstance(layer, torch.nn.Linear)]
         return policies.Policy(
-            id=environments.row.id,
+            id=environments.spec.id,
             blocks=tuple((name, p.stop - p.start) for name, p in environments.blocks.items()),
             actions=tuple(environments.action_map.names),
             quantity=environments.action_map.quantity,
@@ -184,7 +185,7 @@ class Learner:
             info={
                 'seed': seed,
                 'samples': samples,
-                'character': characters.fingerprint(environments.task.character.row),
+                'character': characters.fingerprint(environments.task.character.spec),
             },
         )
 
@@ -217,7 +218,7 @@ def train(
     seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
     if curve:
         seconds = dict(curve[-1]['seconds'])
-    best = max((point['fraction'] for point in curve), default=-np.inf)
+    best = max((point['normalized_return'] for point in curve), default=-np.inf)
     observation = environments.reset()
     with tqdm.tqdm(total=int(s.samples), initial=len(found), unit='decision') as bar:
         bar.set_description(id_)
@@ -246,14 +247,16 @@ def train(
             )
             seconds['learning'] += middle - begin
             seconds['evaluation'] += time.perf_counter() - middle
-            point = {name: result[name] for name in ('fraction', 'full', 'distance')}
+            point = {
+                name: result[name] for name in ('normalized_return', 'completion_rate', 'distance')
+            }
             point |= {'samples': len(found), 'loss': loss, 'seconds': dict(seconds)}
             point['median_distance'] = float(np.median(result['distances']))
             point['searched'] = searched  # m; distances of the episodes that the search has ended
             searched = []
             curve.append(point)
-            if point['fraction'] > best:
-                best = point['fraction']
+            if point['normalized_return'] > best:
+                best = point['normalized_return']
                 policies.save(policy, folder / 'policy.npz')
             policies.save(policy, folder / 'last.npz')
             bar.set_postfix(distance=f'{point["median_distance"]:.1f} m', loss=f'{loss:.2f}')
@@ -288,7 +291,7 @@ def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'decisions')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(
-            f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["full"]:.0%} complete'
+            f'{point["samples"]:9} {point["median_distance"]:.1f} m, {point["completion_rate"]:.0%} complete'
         )
     print(folder / 'policy.npz')
 

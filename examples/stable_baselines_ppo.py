@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from trl_suite.stable_baselines import SuiteVecEnv
+from trl_suite.adapters.stable_baselines import SuiteVecEnv
 
 
 class LearningCurve(BaseCallback):

@@ -23,12 +23,12 @@ STEPS, EPOCHS, BATCH = 32, 5, 512  # of each row between updates; over them; ste
 NOISE = 0.2  # standard deviation of the first actions, about 0.3 rad
 
 
-def train(id_, rows=64, samples=100_000, seed=0):
+def train(id_, num_envs=64, samples=100_000, seed=0):
     """Yields the number of steps and the mean return after every update."""
     torch.manual_seed(seed)
-    # TorchRL itself says which rows begin anew: 'Disabled'.
+    # TorchRL itself says which num_envs begin anew: 'Disabled'.
     environment = GymWrapper(
-        gymnasium.make_vec(f'trl_suite/{id_}', num_envs=rows, autoreset_mode='Disabled')
+        gymnasium.make_vec(f'trl_suite/{id_}', num_envs=num_envs, autoreset_mode='Disabled')
     )
     environment = TransformedEnv(environment, RewardSum())
     environment.set_seed(seed)
@@ -47,7 +47,7 @@ def train(id_, rows=64, samples=100_000, seed=0):
     loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0, critic_coeff=0.5)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
     collector = Collector(
-        environment, actor, frames_per_batch=STEPS * rows, total_frames=samples,
+        environment, actor, frames_per_batch=STEPS * num_envs, total_frames=samples,
         auto_register_policy_transforms=True,
     )  # fmt: skip
     for update, batch in enumerate(collector, 1):
@@ -62,15 +62,17 @@ def train(id_, rows=64, samples=100_000, seed=0):
                 nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
                 optimizer.step()
         ended = batch['next', 'done']
-        yield update * STEPS * rows, batch['next', 'episode_reward'][ended].mean().item()
+        yield update * STEPS * num_envs, batch['next', 'episode_reward'][ended].mean().item()
     collector.shutdown()
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--environment', default='PD_Biped2D_Flat-v0', help='id or alias')
-    parser.add_argument('--rows', type=int, default=64, help='simulations at once')
-    parser.add_argument('--samples', type=int, default=100_000, help='steps of all rows together')
+    parser.add_argument('--num-envs', type=int, default=64, help='simulations at once')
+    parser.add_argument(
+        '--samples', type=int, default=100_000, help='steps of all num_envs together'
+    )
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()
     for count, mean in train(*vars(arguments).values()):

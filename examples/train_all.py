@@ -1,9 +1,9 @@
 """Trains the reference policies of the suite: every row of the catalogue, some with three seeds.
 
     python examples/train_all.py                       # all that is missing, two runs side by side
-    python examples/train_all.py --only '*Dog2D*' --jobs 8
-    python examples/train_all.py --only PD_Dog2D_Gaps_Terrain-v0 --again
-    python examples/train_all.py --only FSM_Goat2D_Terrain_Cliffs-v0
+    python examples/train_all.py --filter '*Dog2D*' --jobs 8
+    python examples/train_all.py --filter PD_Dog2D_Gaps_Terrain-v0 --overwrite
+    python examples/train_all.py --filter FSM_Goat2D_Terrain_Cliffs-v0
 
 Each run is `examples/ppo.py` on one thread, of rows that gaits drive `examples/learn_gaits.py` or
 `examples/search_gaits.py`; those that begin with the policy of another environment come after it.
@@ -38,7 +38,9 @@ import ppo_settings
 import search_gaits
 import tqdm
 
-from trl_suite import catalogue, errors, evaluation, files, policies, resources
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.util import errors, files, resources
 
 EPISODES, SEED = 50, 0  # of the published evaluation
 GAIT_EPISODES = 200  # how far a gait gets before it falls varies as much as it is
@@ -54,18 +56,18 @@ GAITS = (  # that are compared with their default gaits
 LEARNT = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0')  # not searched
 
 
-def compared(row: catalogue.Row) -> bool:
+def compared(spec: catalogue.EnvSpec) -> bool:
     """Whether an environment is one of those that compare actuation models."""
-    return row.domain == 'imitation' and 'planar' in row.tags and '_Run_' not in row.id
+    return spec.domain == 'imitation' and 'planar' in spec.tags and '_Run_' not in spec.id
 
 
 def jobs(pattern: str, only_seeds: Collection[int] = COMPARED_SEEDS) -> list[tuple[str, int]]:
     """Which runs there are: first one of each environment, then the repetitions."""
     ids = [
         id_
-        for id_, row in catalogue.BY_ID.items()
+        for id_, spec in catalogue.BY_ID.items()
         if id_ == pattern
-        or (fnmatch.fnmatchcase(id_, pattern) and (row.rules != 'gait' or id_ in GAITS))
+        or (fnmatch.fnmatchcase(id_, pattern) and (spec.actuation != 'gait' or id_ in GAITS))
     ]
     if not ids:
         raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
@@ -81,7 +83,7 @@ def shipped(entry: dict[str, Any]) -> dict[str, Any]:
 
 def program(id_: str) -> ModuleType:
     """The program that trains an environment."""
-    if catalogue.BY_ID[id_].rules != 'gait':
+    if catalogue.BY_ID[id_].actuation != 'gait':
         return ppo
     return learn_gaits if id_ in LEARNT else search_gaits
 
@@ -145,10 +147,10 @@ def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
 def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, Any]:
     """Evaluates a finished run and writes it beside the others of its environment."""
     curve = json.loads((folder / 'curve.json').read_text())
-    # After lessons the last policy is the one that has learnt what the environment does not ask for.
-    name = 'last' if curve['settings'].get('lessons') else 'policy'
+    # After curriculum stages the last policy is the one that has learnt what the environment does not ask for.
+    name = 'last' if curve['settings'].get('stages') else 'policy'
     policy = trimmed(policies.load(folder / f'{name}.npz'))
-    episodes = GAIT_EPISODES if catalogue.BY_ID[id_].rules == 'gait' else EPISODES
+    episodes = GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
     found = evaluation.evaluate(id_, policy, episodes, SEED, num_threads=1)
     run = {**curve, 'machine': machine, 'shipped_at': policy.info['samples'], 'evaluation': found}
     others = [r for r in entries(id_) if r['seed'] != seed and r['settings'] == run['settings']]
@@ -164,11 +166,11 @@ def enter(id_: str, seed: int, folder: pathlib.Path, machine: str) -> dict[str, 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only', default='*', metavar='PATTERN', help='of ids')
+    parser.add_argument('--filter', default='*', metavar='PATTERN', help='of ids')
     parser.add_argument('--seeds', type=int, nargs='+', default=COMPARED_SEEDS, help='only these')
     parser.add_argument('--jobs', type=int, default=2, help='runs side by side')
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument('--again', action='store_true', help='train anew what has been entered')
+    parser.add_argument('--overwrite', action='store_true', help='train anew what has been entered')
     parser.add_argument(
         '--machine',
         default=f'{os.cpu_count()} cores, {platform.machine()}, {platform.system()}',
@@ -176,11 +178,11 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     todo = []
-    for id_, seed in jobs(arguments.only, arguments.seeds):
+    for id_, seed in jobs(arguments.filter, arguments.seeds):
         entered = any(r['seed'] == seed and r['settings'] == settings(id_) for r in entries(id_))
-        if arguments.again:
+        if arguments.overwrite:
             shutil.rmtree(arguments.runs / id_ / f'seed_{seed}', ignore_errors=True)
-        if arguments.again or not entered:
+        if arguments.overwrite or not entered:
             todo.append((id_, seed))
     entering = threading.Lock()  # two seeds of one environment
 
@@ -208,8 +210,8 @@ def main() -> None:
             else:
                 found = run['evaluation']
                 bar.write(
-                    f'{id_} seed {seed}: {found["fraction"]:.3f} of the maximum, '
-                    f'{found["full"]:.0%} complete'
+                    f'{id_} seed {seed}: {found["normalized_return"]:.3f} of the maximum, '
+                    f'{found["completion_rate"]:.0%} complete'
                 )
             bar.update()
 

@@ -33,8 +33,9 @@ import cma
 import numpy as np
 import tune_gait
 
-from trl_suite import controllers, errors, files
+from trl_suite import controllers
 from trl_suite.controllers import Parameters
+from trl_suite.util import errors, files
 
 BACK = 3  # cycles before a fall, at most, that a state is taken
 AFTER = 3  # cycles with the default gait after those with the candidate
@@ -59,9 +60,9 @@ class Obstacles:
     def __init__(self, gait: Parameters, terrain: str, default: np.ndarray, rows: int) -> None:
         self.gait, self.default = gait, default
         self.lead = 2 if gait.kind == 'stride' else 1
-        self.bench = tune_gait.Bench(gait.character, rows, gait.centre, terrain)
+        self.bench = tune_gait.Bench(gait.character, rows, gait.action_offset, terrain)
         self.bench.environments.reset()
-        flat = tune_gait.Bench(gait.character, STARTS, gait.centre)
+        flat = tune_gait.Bench(gait.character, STARTS, gait.action_offset)
         runs = tune_gait.measure(flat, default, [FRICTION])
         flat.environments.close()
         self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
@@ -69,7 +70,7 @@ class Obstacles:
     def actions(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the actions of the simulations that mean parameters (..., P)."""
         places = self.gait.actions
-        return (vectors - self.gait.centre)[..., places] / self.bench.half_range[places]
+        return (vectors - self.gait.action_offset)[..., places] / self.bench.action_scale[places]
 
     def collect(
         self, vectors: np.ndarray, count: int, rng: np.random.Generator
@@ -221,7 +222,7 @@ def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathli
         original[int(name)] if name in numbers else [name, name, 0] for name in names
     ]
     used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
-    used.add(data['centre'])
+    used.add(data['action_offset'])
     for part in ('sets', 'tuning'):
         data[part] = {name: value for name, value in data[part].items() if name in used}
     return tune_gait.write(character, data)
@@ -259,7 +260,7 @@ def main() -> None:
             return np.array(stored[name]['vector'])
         return tune_gait.vector_of(gait, name)
 
-    known = [vector(name) for name in arguments.start] if arguments.start else [gait.centre]
+    known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
     rng = np.random.default_rng(arguments.seed)
     for terrain in arguments.terrain:
         began = time.process_time()

@@ -28,10 +28,11 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors, files
-from trl_suite.catalogue import Row
 from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load, parameters
-from trl_suite.tasks.gait import FRAME, LONGEST_CYCLE, SUBSTEPS, GaitTask
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE, SUBSTEPS
+from trl_suite.tasks.gait.task import GaitTask
+from trl_suite.util import errors, files
 from trl_suite.vector import VectorEnvironment
 
 START_NOISE = 0.01  # rad, of the joints; see `GaitTask`
@@ -41,7 +42,7 @@ EPISODES, EVALUATION_SEED = 20, 0  # of published figures
 FINAL_SEED = 2**31  # from which the finalists' starts are drawn, with the seed of the search
 FINALISTS = 7  # the best of so many last generations, and the mean of the distribution
 CYCLE, MOST_CYCLES, BONUS = 0.1, 15, 0.02  # s, of the shortest; how many count; what each is worth
-REACH = 1000.0  # search scales from the centre that an action may be; it never is
+REACH = 1000.0  # search scales from the action_offset that an action may be; it never is
 DIGITS = 6
 
 
@@ -80,8 +81,8 @@ class Bench:
     def __init__(
         self,
         character: str,
-        rows: int,
-        centre: np.ndarray,
+        env_ids: int,
+        action_offset: np.ndarray,
         terrain: str = 'flat',
         substeps: int = SUBSTEPS,
         threads: int = 1,
@@ -90,26 +91,26 @@ class Bench:
 
         Args:
           character: one with a gait.
-          rows: number of episodes side by side.
-          centre: parameters that are run without any rounding, (P,); others may lie about them.
+          env_ids: number of episodes side by side.
+          action_offset: parameters that are run without any rounding, (P,); others may lie about them.
           terrain: what ground all run on.
           substeps: physics steps per control step.
           threads: that step the physics.
         """
-        row = Row(
+        spec = EnvSpec(
             id=f'{character}/gait/{terrain}/tuning', domain='custom', task='tuning',
             character=character, actuation='gait', terrain=terrain, rules='gait',
             options=MappingProxyType({'start_noise': START_NOISE, 'substeps': substeps}),
             description='Gaits are measured.',
         )  # fmt: skip
-        self.environments = VectorEnvironment(row, rows, threads, seed=0)
+        self.environments = VectorEnvironment(spec, env_ids, threads, seed=0)
         task = self.environments.task
         assert isinstance(task, GaitTask)
         self.task, self.gait = task, task.gait.parameters
-        self.centre, self.half_range = centre, REACH * self.gait.search_scale
+        self.action_offset, self.action_scale = action_offset, REACH * self.gait.search_scale
         # So that actions in [-1, 1] reach every candidate.
-        task.rules.options.centre[:] = centre
-        task.rules.options.half_range[:] = self.half_range[self.gait.actions]
+        task.rules.options.action_offset[:] = action_offset
+        task.rules.options.action_scale[:] = self.action_scale[self.gait.actions]
         self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
 
     def run(
@@ -124,37 +125,37 @@ class Bench:
           friction: coefficient of sliding friction of ground and character, (n,).
         """
         task, world, count = self.task, self.task.world, len(vectors)
-        for row in np.flatnonzero(friction != self.frictions).tolist():
-            world.models[row].geom_friction[:, 0] = friction[row]
-            world.set_const(row)
+        for env_id in np.flatnonzero(friction != self.frictions).tolist():
+            world.models[env_id].geom_friction[:, 0] = friction[env_id]
+            world.set_const(env_id)
         self.frictions = np.array(friction, float)
         self.environments.reset(seed=[int(seed) for seed in seeds])
         places = self.gait.actions
-        actions = (vectors - self.centre)[:, places] / self.half_range[places]
+        actions = (vectors - self.action_offset)[:, places] / self.action_scale[places]
         root = task.figure.links[0]
         start = world.subtree_com[:, root, 0].copy()
         elapsed, distance = np.zeros((2, count))
         cycles, going = np.zeros(count, int), np.ones(count, bool)
         upright = np.ones(count, bool)
         while going.any():
-            rows = np.flatnonzero(going)
-            task.step(actions, rows)
-            duration, failed = task.state.duration[rows], task.failed[rows]
-            elapsed[rows] += duration
-            now = np.nan_to_num(world.subtree_com[rows, root, 0] - start[rows])
+            env_ids = np.flatnonzero(going)
+            task.step(actions, env_ids)
+            duration, failed = task.state.duration[env_ids], task.failed[env_ids]
+            elapsed[env_ids] += duration
+            now = np.nan_to_num(world.subtree_com[env_ids, root, 0] - start[env_ids])
             whole = (duration > CYCLE) & (duration < LONGEST_CYCLE * FRAME - CONTROL_TIMESTEP)
-            cycles[rows] += whole & ~failed & (now > distance[rows])
-            distance[rows] = now
-            in_time = elapsed[rows] < horizon
-            upright[rows] = ~(failed & in_time)
-            going[rows] = ~failed & in_time
+            cycles[env_ids] += whole & ~failed & (now > distance[env_ids])
+            distance[env_ids] = now
+            in_time = elapsed[env_ids] < horizon
+            upright[env_ids] = ~(failed & in_time)
+            going[env_ids] = ~failed & in_time
         return Runs(horizon, upright, elapsed, distance, cycles)
 
 
 def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
     """The parameters of a set by name, a base action by number, or action 0."""
     if start is None:
-        return gait.centre
+        return gait.action_offset
     if start.isdecimal() and int(start) < len(gait.base_actions):
         return gait.base_actions[int(start)]
     if start not in gait.sets:
@@ -283,7 +284,7 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
     runs = measure(bench, found, FRICTIONS[:1])
     bench.environments.close()
     return found, {
-        'start': arguments.start or 'centre',
+        'start': arguments.start or 'action_offset',
         'seed': arguments.seed,
         'sd': arguments.sd,
         'population': population,
@@ -341,7 +342,7 @@ def enter(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Pa
     """Enters a gait as set 'tuned' and as action 0."""
     data = stored(character)
     data['sets']['tuned'] = vector.tolist()
-    data['centre'] = 'tuned'
+    data['action_offset'] = 'tuned'
     data.setdefault('tuning', {})['tuned'] = log
     return write(character, data)
 

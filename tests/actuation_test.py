@@ -7,8 +7,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
-from trl_suite import actuation, characters, motion, resources, suite
-from trl_suite.tasks import imitation
+from trl_suite import actuation, characters, motion, suite
+from trl_suite.tasks.imitation import planar_rules as imitation_rules
+from trl_suite.util import resources
 
 TIMESTEP = 1 / 300  # s
 MUSCLES = {'biped2d': 16, 'biped2d_full': 16, 'dog': 44, 'goat': 44, 'raptor': 40}
@@ -51,7 +52,7 @@ class Mounted:
         names = [joint.full_identifier for joint in self.character.joints]
         ids = [self.model.joint(name).id for name in names]
         self.qpos, self.dof = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
-        self.joints = list(self.character.row.joints.values())
+        self.joints = list(self.character.spec.joints.values())
         ids = [self.model.actuator(f'{name}/{each}').id for each in self.map.names]
         self.actuators = np.array(ids)
 
@@ -78,12 +79,12 @@ class ActionMapTest(parameterized.TestCase):
         size = MUSCLES[name] if model == 'muscle' else JOINTS[name]
         self.assertLen(mapping, size)
         self.assertLen(set(mapping.names), size)
-        self.assertEqual(mapping.centre.shape, (size,))
-        self.assertEqual(mapping.half_range.shape, (size,))
+        self.assertEqual(mapping.action_offset.shape, (size,))
+        self.assertEqual(mapping.action_scale.shape, (size,))
         rng = np.random.default_rng(0)
         action = rng.uniform(-1, 1, (5, size))
         control = mapping.control(action)
-        np.testing.assert_allclose(control, mapping.centre + mapping.half_range * action)
+        np.testing.assert_allclose(control, mapping.action_offset + mapping.action_scale * action)
         np.testing.assert_allclose(mapping.action(control), action, atol=1e-12)
         far = rng.uniform(1, 9, size)
         np.testing.assert_array_equal(mapping.control(far), mapping.control(np.ones(size)))
@@ -107,12 +108,12 @@ class ActionMapTest(parameterized.TestCase):
         ('velocity', 'target velocity', 'rad/s (leg: m/s)', (10 * np.pi, 10)),
         ('position', 'target angle', 'rad (leg: m)', (1.5, 0.2)),
     )
-    def test_prismatic_joint(self, model, quantity, unit, half_range):
+    def test_prismatic_joint(self, model, quantity, unit, action_scale):
         mapping = Mounted('hopper', model).map
         self.assertEqual((mapping.quantity, mapping.unit), (quantity, unit))
         self.assertEqual(mapping.names, ('hip', 'leg'))
-        np.testing.assert_allclose(mapping.half_range, half_range)
-        np.testing.assert_array_equal(mapping.centre, 0)
+        np.testing.assert_allclose(mapping.action_scale, action_scale)
+        np.testing.assert_array_equal(mapping.action_offset, 0)
 
     @parameterized.parameters(*JOINTS)
     def test_names_are_those_of_the_joints_in_link_order(self, name):
@@ -129,12 +130,12 @@ class ActionMapTest(parameterized.TestCase):
             ('right_forearm', 56.25), ('neck', 37.5),
         ):  # fmt: skip
             self.assertAlmostEqual(full[joint], torque)
-        np.testing.assert_array_equal(mapping.centre, 0)
+        np.testing.assert_array_equal(mapping.action_offset, 0)
 
     def test_velocity_is_five_turns_a_second(self):
         mapping = Mounted('raptor', 'velocity').map
-        np.testing.assert_allclose(mapping.half_range, 31.4159265, rtol=1e-8)
-        np.testing.assert_array_equal(mapping.centre, 0)
+        np.testing.assert_allclose(mapping.action_scale, 31.4159265, rtol=1e-8)
+        np.testing.assert_array_equal(mapping.action_offset, 0)
 
     def test_excitation_is_between_a_hundredth_and_one(self):
         mapping = Mounted('dog', 'muscle').map
@@ -143,46 +144,48 @@ class ActionMapTest(parameterized.TestCase):
 
     def test_position_without_options_is_the_posture_and_1_5_rad(self):
         mapping = Mounted('raptor', 'position').map
-        np.testing.assert_array_equal(mapping.half_range, 1.5)
-        centre = dict(zip(mapping.names, mapping.centre, strict=True))
-        self.assertAlmostEqual(centre['right_hip'], 0.46487)
-        self.assertAlmostEqual(centre['left_knee'], -1.456)
+        np.testing.assert_array_equal(mapping.action_scale, 1.5)
+        action_offset = dict(zip(mapping.names, mapping.action_offset, strict=True))
+        self.assertAlmostEqual(action_offset['right_hip'], 0.46487)
+        self.assertAlmostEqual(action_offset['left_knee'], -1.456)
 
     def test_position_options(self):
         reach = np.linspace(0.5, 1.5, 6)
-        mapping = Mounted('biped2d', 'position', centre=[0.1] * 6, half_range=reach).map
+        mapping = Mounted('biped2d', 'position', action_offset=[0.1] * 6, action_scale=reach).map
         np.testing.assert_allclose(mapping.control(np.ones(6)), 0.1 + reach)
         for options in (
-            {'centre': [0.0]}, {'centre': [np.nan] * 6}, {'half_range': 0}, {'half_range': -1},
+            {'action_offset': [0.0]}, {'action_offset': [np.nan] * 6}, {'action_scale': 0}, {'action_scale': -1},
         ):  # fmt: skip
-            with self.assertRaisesRegex(ValueError, 'centre and half_range'):
+            with self.assertRaisesRegex(ValueError, 'action_offset and action_scale'):
                 Mounted('biped2d', 'position', **options)
 
     def test_position_options_of_a_prismatic_joint(self):
-        mapping = Mounted('hopper', 'position', centre=[0.3, -0.1], half_range=[0.7, 0.05]).map
+        mapping = Mounted(
+            'hopper', 'position', action_offset=[0.3, -0.1], action_scale=[0.7, 0.05]
+        ).map
         np.testing.assert_allclose(mapping.control(np.ones(2)), (1, -0.05))
-        mapping = Mounted('hopper', 'position', half_range=0.4).map
-        np.testing.assert_array_equal(mapping.half_range, 0.4)
+        mapping = Mounted('hopper', 'position', action_scale=0.4).map
+        np.testing.assert_array_equal(mapping.action_scale, 0.4)
 
     def test_environment_centres_position_control_on_the_clip(self):
         environment = suite.make('PD_Dog2D_LLC_Imitate_Flat-v0', {'random': 0})
         clip = motion.load('dog_bound')
         times = np.linspace(0, clip.duration, 2000, endpoint=False)
         mean = clip.pose(times)[:, 3:].mean(0)
-        np.testing.assert_allclose(environment.action_map.centre, mean, atol=2e-3)
-        np.testing.assert_array_equal(environment.action_map.half_range, 1.5)
+        np.testing.assert_allclose(environment.action_map.action_offset, mean, atol=2e-3)
+        np.testing.assert_array_equal(environment.action_map.action_scale, 1.5)
 
     def test_original_map_spans_four_times_the_range_of_the_file(self):
-        task_kwargs = {'centre': 'original'}
+        task_kwargs = {'action_offset': 'original'}
         mapping = suite.build('biped2d', task_kwargs=task_kwargs).action_map
         knee = mapping.names.index('right_knee')
-        self.assertAlmostEqual(mapping.centre[knee], -1.57)
-        self.assertAlmostEqual(mapping.half_range[knee], 6.28)
+        self.assertAlmostEqual(mapping.action_offset[knee], -1.57)
+        self.assertAlmostEqual(mapping.action_scale[knee], 6.28)
         mapping = suite.build('dog', task_kwargs=task_kwargs).action_map
         figures = {
-            joint: (centre, reach)
-            for joint, centre, reach in zip(
-                mapping.names, mapping.centre, mapping.half_range, strict=True
+            joint: (action_offset, reach)
+            for joint, action_offset, reach in zip(
+                mapping.names, mapping.action_offset, mapping.action_scale, strict=True
             )
         }
         np.testing.assert_allclose(figures['tail0'], (0, 4 * np.pi))  # turns freely
@@ -192,23 +195,23 @@ class ActionMapTest(parameterized.TestCase):
         np.testing.assert_allclose(figures['spine0'], (0, 6.28), atol=1e-9)
 
     def test_centres(self):
-        self.assertCountEqual(imitation.CENTRES, ('clip', 'posture', 'original'))
-        mapping = suite.build('raptor', task_kwargs={'centre': 'posture'}).action_map
-        self.assertAlmostEqual(mapping.centre[mapping.names.index('left_hip')], 0.46487)
-        mapping = suite.build('raptor', task_kwargs={'half_range': 0.7}).action_map
-        np.testing.assert_array_equal(mapping.half_range, 0.7)
+        self.assertCountEqual(imitation_rules.ACTION_OFFSETS, ('clip', 'posture', 'original'))
+        mapping = suite.build('raptor', task_kwargs={'action_offset': 'posture'}).action_map
+        self.assertAlmostEqual(mapping.action_offset[mapping.names.index('left_hip')], 0.46487)
+        mapping = suite.build('raptor', task_kwargs={'action_scale': 0.7}).action_map
+        np.testing.assert_array_equal(mapping.action_scale, 0.7)
 
     def test_refusals(self):
         with self.assertRaisesRegex(ValueError, "unknown actuation 'postion'.*'position'"):
             actuation.add(characters.make('dog'), 'postion', TIMESTEP)
-        row = dataclasses.replace(
+        spec = dataclasses.replace(
             characters.CHARACTERS['biped2d'],
             name='mine',
             path=str(resources.directory('xml') / 'biped2d.xml'),
         )
         with self.assertRaisesRegex(ValueError, "'mine' has no muscles.*biped2d.*dog.*raptor"):
-            actuation.add(characters.make(row), 'muscle', TIMESTEP)
-        self.assertLen(actuation.add(characters.make(row), 'position', TIMESTEP), 6)
+            actuation.add(characters.make(spec), 'muscle', TIMESTEP)
+        self.assertLen(actuation.add(characters.make(spec), 'position', TIMESTEP), 6)
 
     @parameterized.parameters(*WITHOUT_MUSCLES)
     def test_characters_without_muscles(self, name):
@@ -220,7 +223,9 @@ class ActionMapTest(parameterized.TestCase):
         leg = character.joints[1]
         del leg.range
         leg.limited = False
-        with self.assertRaisesRegex(ValueError, "'hopper': centre and half_range must be finite"):
+        with self.assertRaisesRegex(
+            ValueError, "'hopper': action_offset and action_scale must be finite"
+        ):
             actuation.add(character, 'position', TIMESTEP)
 
 
@@ -242,7 +247,7 @@ class ServoTest(parameterized.TestCase):
         passive = -data.qfrc_damper[mounted.dof] / rate
         # A fiftieth of the torque limit acts outside the clamp, the rest of kd inside.
         np.testing.assert_allclose(passive, np.minimum(limits / 50, kd))
-        spring = kp * (mounted.map.centre + full(name, 'position') * action - angle)
+        spring = kp * (mounted.map.action_offset + full(name, 'position') * action - angle)
         inside = np.clip(spring - (kd - passive) * rate, -limits, limits)
         np.testing.assert_allclose(mounted.torque, inside, atol=1e-9)
 
@@ -319,7 +324,7 @@ class ServoTest(parameterized.TestCase):
 
 def on_the_ground(name, model):
     """A character that can move: (model, data, character, action map)."""
-    if name in suite.DEFAULT_CLIPS:
+    if characters.CHARACTERS[name].clip:
         environment = suite.build(name, model, 'slopes_mixed', task_kwargs={'random': 3})
         environment.reset()
         physics, task = environment.physics, environment.task

@@ -8,8 +8,9 @@ from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
 from trl_suite import terrain
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
+from trl_suite.terrain.spatial import generators
 
 TIMESTEP = 1 / 300  # s
 SUBSTEPS = 10
@@ -29,7 +30,7 @@ CUBE = {
 
 def tree(source, load=None):
     """An arena, by itself or with one free body."""
-    arena = SpatialTerrain(terrain.load(source))
+    arena = SpatialArena(terrain.load(source))
     root = arena.mjcf_model
     root.option.timestep = TIMESTEP
     if load is not None:
@@ -54,15 +55,15 @@ class Stage:
             model = self.physics.model.ptr
             self.world = PhysicsWorld(self.physics)
             self.model, self.data = model, self.physics.data.ptr
-        self.rows = np.arange(len(seeds))
+        self.env_ids = np.arange(len(seeds))
         arena.bind(self.world)
         self.xy = np.zeros((len(seeds), 2)) if xy is None else np.array(xy, float)
-        for row, seed in enumerate(seeds):
-            arena.begin_episode(row, terrain.Ground(arena.terrain, seed), self.xy[row])
+        for env_id, seed in enumerate(seeds):
+            arena.begin_episode(env_id, terrain.SpatialGround(arena.terrain, seed), self.xy[env_id])
         if load is not None:
             joint = model.body('load').jntadr[0]
             self.q, self.v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        self.world.forward(self.rows)
+        self.world.forward(self.env_ids)
 
     def put(self, position, velocity=(0, 0, 0)):
         """Puts the loads somewhere, moving."""
@@ -71,7 +72,7 @@ class Stage:
         self.world.qpos[:, q + 3 : q + 7] = (1, 0, 0, 0)
         self.world.qvel[:, v : v + 6] = 0
         self.world.qvel[:, v : v + 3] = velocity
-        self.world.forward(self.rows)
+        self.world.forward(self.env_ids)
 
     @property
     def position(self):
@@ -86,9 +87,9 @@ class Stage:
             self.arena.follow(self.xy if xy is None else xy)
             self.world.step(SUBSTEPS)
 
-    def height(self, x, y, row=0):
+    def height(self, x, y, env_id=0):
         x, y = np.atleast_2d(x), np.atleast_2d(y)
-        return self.arena.height(x, y, slice(row, row + 1))[0]
+        return self.arena.height(x, y, slice(env_id, env_id + 1))[0]
 
     def rays(self, x, y):
         """Heights of the collision geometry, by rays from above."""
@@ -110,8 +111,8 @@ class GeometryTest(parameterized.TestCase):
         stage = Stage(source)
         tolerance = SINGLE if source in GRIDS else EXACT
         for seed, xy in ((0, (0, 0)), (1, (17.3, -9.1)), (2, (-40.2, 12.0)), (3, (200.0, 31.0))):
-            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed), xy)
-            stage.world.forward(stage.rows)
+            stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed), xy)
+            stage.world.forward(stage.env_ids)
             x, y = np.transpose(xy)[:, None] + np.random.default_rng(seed).uniform(
                 -12, 12, (2, 250)
             )
@@ -159,7 +160,7 @@ class GeometryTest(parameterized.TestCase):
     def test_solver_and_friction(self, source):
         model = Stage(source).model
         planar = mjcf.Physics.from_mjcf_model(
-            PlanarTerrain(terrain.load('flat')).mjcf_model
+            PlanarArena(terrain.load('flat')).mjcf_model
         ).model.ptr
         for name in ('cone', 'integrator', 'noslip_iterations', 'gravity', 'solver', 'tolerance'):
             np.testing.assert_array_equal(getattr(model.opt, name), getattr(planar.opt, name), name)
@@ -189,7 +190,7 @@ class GeometryTest(parameterized.TestCase):
                 ),
             )  # fmt: skip
 
-        self.addCleanup(terrain.spatial._generators.pop, 'turned3d')
+        self.addCleanup(generators._generators.pop, 'turned3d')
         for seed in range(4):
             stage = Stage({'Type': 'turned3d'}, (seed,))
             x, y = np.random.default_rng(seed).uniform(-13, 13, (2, 600))
@@ -202,15 +203,15 @@ class GeometryTest(parameterized.TestCase):
 
     def test_refuses(self):
         with self.assertRaisesRegex(ValueError, 'gaps'):
-            SpatialTerrain(terrain.load('gaps'))
+            SpatialArena(terrain.load('gaps'))
         with self.assertRaisesRegex(ValueError, 'hills3d'):
-            PlanarTerrain(terrain.load('hills3d'))
+            PlanarArena(terrain.load('hills3d'))
 
         @terrain.register3d('steep3d', replace=True)
         def steep(parameters, rng):
             return terrain.Layout(level=None, grid=lambda i, j: np.add.outer(i, 0 * j) * 0.5)
 
-        self.addCleanup(terrain.spatial._generators.pop, 'steep3d')
+        self.addCleanup(generators._generators.pop, 'steep3d')
         with self.assertRaisesRegex(ValueError, 'steep3d.*rises.*40 m'):
             Stage({'Type': 'steep3d'})
 
@@ -222,8 +223,8 @@ class DynamicsTest(parameterized.TestCase):
     def test_a_ball_stays_on_a_block(self, source):
         stage = Stage(source, load=BALL)
         for seed in (1, 2):
-            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
-            stage.world.forward(stage.rows)
+            stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
+            stage.world.forward(stage.env_ids)
             boxes, met = stage.arena.surroundings.boxes[0], 0
             for k in range(len(boxes.top)):
                 x, y = boxes.position[k]
@@ -243,7 +244,7 @@ class DynamicsTest(parameterized.TestCase):
     def test_nothing_falls_through(self, source):
         stage = Stage(source, load=CUBE)
         for seed in range(3):
-            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
             for x, y in np.random.default_rng(seed).uniform(-8, 8, (4, 2)):
                 stage.put((x, y, stage.height(x, y)[0] + 1.0), (1, 0, -2))
                 stage.run(1.0)
@@ -266,7 +267,7 @@ class DynamicsTest(parameterized.TestCase):
     def test_a_body_on_a_belt_reaches_its_speed(self, source):
         stage = Stage(source, load=CUBE)
         for seed in range(4):
-            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
             speed = stage.arena.surface_velocity(np.full((1, 1), 4.0), np.zeros((1, 1)))[0, 0, 1]
             self.assertAlmostEqual(abs(speed), {'conveyor3d': 0.4}.get(source, 0.6))
             stage.put((4, 0, 0.11))
@@ -284,7 +285,7 @@ class DynamicsTest(parameterized.TestCase):
         stage = Stage('conveyor3d', load=CUBE)
         signs = set()
         for seed in range(6):
-            stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, seed))
+            stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, seed))
             stage.put((4, 0, 0.11))
             stage.run(0.5)
             signs.add(bool(stage.velocity[0, 1] > 0))
@@ -365,14 +366,14 @@ class DynamicsTest(parameterized.TestCase):
         self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some turned
         # Queries and geometry agree on where they are.
         x, y = np.random.default_rng(0).uniform(-12, 12, (2, 400))
-        stage.world.forward(stage.rows)
+        stage.world.forward(stage.env_ids)
         np.testing.assert_allclose(stage.rays(x, y), stage.height(x, y), atol=EXACT)
         self.assertGreater((stage.height(x, y) > 0).sum(), 3)
 
     def test_boxes_move_after_a_reset_of_the_world(self):
         stage = Stage('dynamic_obstacles3d', (7,), load=BALL)
-        stage.world.reset(stage.rows)  # as placing a character does
-        stage.world.forward(stage.rows)
+        stage.world.reset(stage.env_ids)  # as placing a character does
+        stage.world.forward(stage.env_ids)
         stage.arena._look(0)
         before = stage.arena.surroundings.centres()[0]
         movers = stage.arena.grounds[0].layout.movers
@@ -391,7 +392,7 @@ class DynamicsTest(parameterized.TestCase):
         expected = without.model.stat.meaninertia
         self.assertAlmostEqual(with_drives.model.stat.meaninertia, expected, delta=1e-6 * expected)
         stage = with_drives
-        stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, 3))
+        stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, 3))
         self.assertAlmostEqual(stage.model.stat.meaninertia, expected, delta=1e-6 * expected)
 
     def test_contact_sensors(self):
@@ -475,7 +476,7 @@ class WorldTest(parameterized.TestCase):
     )  # fmt: skip
 
     def begin(self, source, seeds, batch):
-        grounds = [terrain.Ground(terrain.load(source), seed) for seed in seeds]
+        grounds = [terrain.SpatialGround(terrain.load(source), seed) for seed in seeds]
         starts = [ground.spawn(np.random.RandomState(7)) for ground in grounds]
         stage = Stage(source, seeds, load=BALL, batch=batch, xy=[start[:2] for start in starts])
         x, y = stage.xy[:, :1], stage.xy[:, 1:]
@@ -499,9 +500,9 @@ class WorldTest(parameterized.TestCase):
         seeds = (11, 4, 8)
         stage, heading = self.begin(source, seeds, batch=True)
         seen = self.advance(stage, heading, 60)  # far enough to lay windows anew
-        for row, seed in enumerate(seeds):
+        for env_id, seed in enumerate(seeds):
             single, psi = self.begin(source, (seed,), batch=False)
-            np.testing.assert_array_equal(self.advance(single, psi, 60)[0], seen[row])
+            np.testing.assert_array_equal(self.advance(single, psi, 60)[0], seen[env_id])
         if source != 'plane':
             self.assertFalse(np.array_equal(seen[0][:, 6:], seen[1][:, 6:]))
 
@@ -532,16 +533,16 @@ class WorldTest(parameterized.TestCase):
         np.testing.assert_array_equal(found[1], seen[0])
 
     def test_rows_by_themselves(self):
-        """A row that is begun or followed leaves the others alone."""
+        """A simulation that is begun or followed leaves the others alone."""
         stage, heading = self.begin('pillars3d', (1, 2, 3), batch=True)
         self.advance(stage, heading, 10)
-        models = [stage.world.models[row].geom_pos.copy() for row in range(3)]
-        rows = np.array([1])
-        stage.arena.begin_episode(1, terrain.Ground(stage.arena.terrain, 77), (50.0, 3.0))
+        models = [stage.world.models[env_id].geom_pos.copy() for env_id in range(3)]
+        env_ids = np.array([1])
+        stage.arena.begin_episode(1, terrain.SpatialGround(stage.arena.terrain, 77), (50.0, 3.0))
         self.assertFalse(np.array_equal(stage.world.models[1].geom_pos, models[1]))
-        stage.arena.follow(np.array([(70.0, 3.0)]), rows)
-        for row in (0, 2):
-            np.testing.assert_array_equal(stage.world.models[row].geom_pos, models[row])
+        stage.arena.follow(np.array([(70.0, 3.0)]), env_ids)
+        for env_id in (0, 2):
+            np.testing.assert_array_equal(stage.world.models[env_id].geom_pos, models[env_id])
         self.assertGreater(stage.arena.surroundings.centre[1, 0], 60)
 
     def test_same_seed_same_ground(self):
@@ -555,7 +556,7 @@ class WorldTest(parameterized.TestCase):
     def test_nothing_is_compiled_anew(self):
         stage = Stage('pillars3d')
         model = stage.model
-        stage.arena.begin_episode(0, terrain.Ground(stage.arena.terrain, 5))
+        stage.arena.begin_episode(0, terrain.SpatialGround(stage.arena.terrain, 5))
         self.assertIs(stage.physics.model.ptr, model)
 
     @parameterized.parameters('hills3d', 'trail3d1', 'pillars3d')
@@ -571,7 +572,7 @@ class WorldTest(parameterized.TestCase):
             return arena, environment
 
         def picture(arena, environment, seed, x):
-            arena.begin_episode(0, terrain.Ground(arena.terrain, seed))
+            arena.begin_episode(0, terrain.SpatialGround(arena.terrain, seed))
             arena.follow(np.array([(x, 0.0)]))
             arena.follow(np.zeros((1, 2)))
             environment.physics.forward()

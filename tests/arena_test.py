@@ -5,10 +5,11 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import mjcf
 
-from trl_suite import catalogue, suite, terrain
-from trl_suite.arenas import PlanarTerrain, boxes
+from trl_suite import suite, terrain
+from trl_suite.arenas import PlanarArena, boxes
 from trl_suite.engine import PhysicsWorld
-from trl_suite.terrain import planar_ground
+from trl_suite.registry import catalogue
+from trl_suite.terrain.planar import windows as planar_ground
 
 TIMESTEP = 1 / 300  # s
 GRAVITY = 9.8  # m/s^2; the original's
@@ -37,11 +38,11 @@ OF_GAITS = (
 )  # fmt: skip
 
 
-class Ground:
+class SpatialGround:
     """An arena by itself, or with one planar body on it."""
 
     def __init__(self, source, seed=0, timestep=TIMESTEP, body=None, **strip):
-        self.arena = PlanarTerrain(terrain.load(source))
+        self.arena = PlanarArena(terrain.load(source))
         root = self.arena.mjcf_model
         root.option.timestep = timestep
         if body is not None:
@@ -54,8 +55,8 @@ class Ground:
         self.model, self.data = self._physics.model.ptr, self._physics.data.ptr
         self.world = PhysicsWorld(self._physics)
         self.arena.bind(self.world)
-        self.strip = terrain.Strip(self.arena.terrain, seed, **strip)
-        self.arena.begin_episode(0, terrain.Strip(self.arena.terrain, seed, **strip))
+        self.strip = terrain.PlanarGround(self.arena.terrain, seed, **strip)
+        self.arena.begin_episode(0, terrain.PlanarGround(self.arena.terrain, seed, **strip))
         self.world.forward(np.zeros(1, int))
 
     def follow(self, x):
@@ -102,7 +103,7 @@ class GeometryTest(parameterized.TestCase):
     """Ray casts against the profile."""
 
     def sample(self, source, seed, centre):
-        ground = Ground(source, seed)
+        ground = SpatialGround(source, seed)
         ground.follow(centre)
         xs = np.random.default_rng(seed).uniform(centre - BEHIND, centre + AHEAD, 1500)
         xs = away_from_faces(ground.strip, xs)
@@ -129,7 +130,7 @@ class GeometryTest(parameterized.TestCase):
     def test_faces_are_vertical(self, source):
         met = 0
         for seed in range(4):
-            ground = Ground(source, seed)
+            ground = SpatialGround(source, seed)
             for face, left, right in zip(*faces_of(ground.strip, -5, 17), strict=True):
                 if abs(right - left) < 0.03:
                     continue
@@ -149,7 +150,7 @@ class GeometryTest(parameterized.TestCase):
         """No lower end of a tilted box leans out of a side of a gap."""
         gaps = 0
         for seed in range(5):
-            ground = Ground(source, seed)
+            ground = SpatialGround(source, seed)
             faces = faces_of(ground.strip, -5, 17)
             drop = faces[1] - faces[2]
             for i in np.flatnonzero((drop[:-1] > 0.5) & (drop[1:] < -0.5)):
@@ -162,19 +163,19 @@ class GeometryTest(parameterized.TestCase):
 
     def test_ground_does_not_depend_on_the_window(self):
         for source in ('slopes_mixed_humanoid', 'slopes_humanoid', 'mixed_humanoid'):
-            ground = Ground(source, 5)
+            ground = SpatialGround(source, 5)
             xs = away_from_faces(ground.strip, np.linspace(2, 14, 1201))
             first = ground.heights(xs)
             ground.follow(6.5)
             np.testing.assert_allclose(ground.heights(xs), first, atol=1e-9)
 
     def test_a_strip_two_metres_wide(self):
-        ground = Ground('steps_humanoid')
+        ground = SpatialGround('steps_humanoid')
         for lateral, hit in ((0.99, True), (-0.99, True), (1.01, False)):
             self.assertEqual(ground.ray((3, lateral, 5), (0, 0, -1))[2], hit)
 
     def test_solver_and_friction(self):
-        ground = Ground('mixed_humanoid')
+        ground = SpatialGround('mixed_humanoid')
         option = ground.model.opt
         self.assertEqual(option.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL)
         self.assertEqual(option.integrator, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -189,7 +190,7 @@ class QueryTest(parameterized.TestCase):
 
     @parameterized.parameters('slopes_humanoid', 'gaps_humanoid', 'cliffs_rugged')
     def test_height_and_slope(self, source):
-        ground = Ground(source, 4)
+        ground = SpatialGround(source, 4)
         for centre in (0.0, 9.0, -40.0, 500.0):
             ground.follow(centre)
             xs = np.random.default_rng(1).uniform(centre - 3, centre + 12, (1, 400))
@@ -197,13 +198,13 @@ class QueryTest(parameterized.TestCase):
             np.testing.assert_allclose(ground.arena.slope(xs), ground.strip.slope(xs), atol=1e-9)
 
     def test_heights_at_vertices(self):
-        ground = Ground('slopes_humanoid', 4)
+        ground = SpatialGround('slopes_humanoid', 4)
         heights, _ = ground.strip.window(-100, 400)
         xs = np.arange(-100, 300)[None] * CELL
         np.testing.assert_allclose(ground.arena.height(xs)[0], heights, atol=1e-10)
 
     def test_far_heights(self):
-        ground = Ground('slopes_mixed_humanoid', 4)
+        ground = SpatialGround('slopes_mixed_humanoid', 4)
         ground.follow(9.0)
         arrays = ground.arena.ground
         xs = np.linspace(-35, 45, 999)[None]
@@ -221,7 +222,7 @@ class QueryTest(parameterized.TestCase):
         self.assertFalse(arrays.is_wide[0])
 
     def test_functions_of_one_simulation(self):
-        ground = Ground('slopes_humanoid', 4)
+        ground = SpatialGround('slopes_humanoid', 4)
         arrays = ground.arena.ground
         for x in (-5.9, 0.0, 0.3, 3.0, 17.9):
             at = np.array([[x]])
@@ -236,7 +237,7 @@ class QueryTest(parameterized.TestCase):
         self.assertFalse(planar_ground.has_left(0, np.nan, arrays))
 
     def test_wrong_shapes_are_refused(self):
-        ground = Ground('flat')
+        ground = SpatialGround('flat')
         with self.assertRaisesRegex(ValueError, r'shape \(2, 1\); expected \(1, k\)'):
             ground.arena.height(np.zeros((2, 1)))
 
@@ -246,10 +247,10 @@ class PoolTest(parameterized.TestCase):
 
     @parameterized.parameters(*OF_ROWS, *OF_GAITS, 'narrow_gaps_raptor', 'slopes_steps_hard')
     def test_pool_is_never_exceeded(self, source):
-        ground = PlanarTerrain(terrain.load(source))
+        ground = PlanarArena(terrain.load(source))
         pool, most = len(ground.boxes), 0
         for seed in range(100, 140):
-            strip = terrain.Strip(ground.terrain, seed)
+            strip = terrain.PlanarGround(ground.terrain, seed)
             for centre in range(-1, 10):
                 first = (centre - 1) * 240  # windows of 24 m are laid every 6 m
                 window = strip.window(first, 961)
@@ -257,17 +258,17 @@ class PoolTest(parameterized.TestCase):
         self.assertLessEqual(most, pool)
 
     def test_rows_use_these_terrains(self):
-        planar = [row for row in catalogue.ROWS if 'planar' in row.tags]
-        self.assertEqual({row.terrain for row in planar}, {*OF_ROWS, *OF_GAITS})
+        planar = [spec for spec in catalogue.SPECS if 'planar' in spec.tags]
+        self.assertEqual({spec.terrain for spec in planar}, {*OF_ROWS, *OF_GAITS})
 
     def test_unused_boxes_are_out_of_reach(self):
-        ground = Ground('steps_humanoid')
+        ground = SpatialGround('steps_humanoid')
         deep = ground.model.geom_pos[:, 2] < -50
         self.assertTrue(deep.any())
         self.assertFalse(deep.all())
 
     def test_boxes_follow_each_other(self):
-        strip = terrain.Strip(terrain.load('slopes_mixed_humanoid'), 3)
+        strip = terrain.PlanarGround(terrain.load('slopes_mixed_humanoid'), 3)
         pieces = boxes.from_profile(-240, *strip.window(-240, 961))
         self.assertTrue((np.diff(pieces.position[:, 0]) > -0.5).all())
         self.assertTrue((pieces.half_size > 0).all())
@@ -282,7 +283,7 @@ class DynamicsTest(parameterized.TestCase):
     )  # fmt: skip
     def test_a_ball_rests_at_the_exact_height(self, source, x):
         ball = {'type': 'sphere', 'size': (0.1,), 'mass': 1}
-        ground = Ground(source, 2, body=ball)
+        ground = SpatialGround(source, 2, body=ball)
         ground.follow(x)
         places = x + np.linspace(-2, 6, 200)
         heights = np.array([ground.strip.height(p + np.linspace(-0.3, 0.3, 25)) for p in places])
@@ -301,7 +302,7 @@ class DynamicsTest(parameterized.TestCase):
             'type': 'box', 'size': (0.0885, 0.04, 0.025), 'mass': 5, 'condim': 1, 'priority': 1,
             'solref': (0.005, 1), 'solimp': (0.95, 0.99, 0.001),
         }  # fmt: skip
-        ground = Ground(source, seed, body=foot)
+        ground = SpatialGround(source, seed, body=foot)
         model, data, strip = ground.model, ground.data, ground.strip
         ground.follow(start)
         pitch = np.arctan((strip.height(start + 0.08) - strip.height(start - 0.08)) / 0.16)
@@ -330,14 +331,14 @@ class DynamicsTest(parameterized.TestCase):
         }  # fmt: skip
         for seed in range(3):
             source = {'Type': 'var2d_steps', 'Params': [steps]}
-            strip = terrain.Strip(terrain.load(source), seed)
+            strip = terrain.PlanarGround(terrain.load(source), seed)
             self.assertGreater(len(boxes.from_profile(0, *strip.window(0, 240)).position), 12)
             travel, ratio = self.slide(source, seed, 0, 2, 3)
             self.assertAlmostEqual(travel, 6, delta=0.02)
             self.assertAlmostEqual(ratio, 1, delta=0.002)
 
     def test_level_ground_is_one_box(self):
-        strip = terrain.Strip(terrain.load('flat'), 0)
+        strip = terrain.PlanarGround(terrain.load('flat'), 0)
         self.assertLen(boxes.from_profile(-240, *strip.window(-240, 961)).position, 1)
 
     def test_a_foot_slides_down_a_slope(self):
@@ -352,7 +353,7 @@ class LongWalkTest(parameterized.TestCase):
 
     @parameterized.parameters('slopes_mixed_humanoid', 'cliffs_rugged')
     def test_two_hundred_metres(self, source):
-        ground, largest = Ground(source, 7), 0.006
+        ground, largest = SpatialGround(source, 7), 0.006
         rng = np.random.default_rng(0)
         for x in np.arange(0, 200, 1.7):
             ground.follow(x)
@@ -364,7 +365,7 @@ class LongWalkTest(parameterized.TestCase):
             )
 
     def test_a_jump_and_back(self):
-        ground = Ground('slopes_humanoid', 7)
+        ground = SpatialGround('slopes_humanoid', 7)
         xs = np.linspace(-2, 10, 300)
         before = ground.heights(xs)
         for x in (900.0, -333.0, 0.0):
@@ -375,7 +376,7 @@ class LongWalkTest(parameterized.TestCase):
         environment = suite.make('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'random': 3})
         environment.reset()
         physics, arena = environment.physics, environment.task.arena
-        strip = terrain.Strip.from_state(arena.strips[0].state())
+        strip = terrain.PlanarGround.from_state(arena.grounds[0].state())
         for x in np.arange(0.0, 200.0, 2.5):
             with physics.reset_context():
                 physics.named.data.qpos['biped2d_full/root_x/'] = x

@@ -8,7 +8,7 @@ from absl.testing import absltest, parameterized
 from dm_control import mjcf
 
 from trl_suite import terrain
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.engine import BatchWorld, bounds, light_model
 from trl_suite.util.compiled import packed
 
@@ -41,7 +41,7 @@ class ArenaTest(parameterized.TestCase):
     @parameterized.parameters(*PLANAR, *SPATIAL)
     def test_bounds(self, name):
         ground = terrain.load(name)
-        arena = (SpatialTerrain if ground.spatial else PlanarTerrain)(ground)
+        arena = (SpatialArena if ground.spatial else PlanarArena)(ground)
         arena.mjcf_model.worldbody.add('body', name='ball').add('geom', size=(0.1,))
         ball = arena.mjcf_model.find('body', 'ball')
         ball.add('joint', type='slide', axis=(1, 0, 0))
@@ -49,9 +49,9 @@ class ArenaTest(parameterized.TestCase):
         arena.bind(world)
         for seed in range(4):
             if ground.spatial:
-                arena.begin_episode(1, terrain.Ground(ground, seed), (5.0 * seed, -3.0))
+                arena.begin_episode(1, terrain.SpatialGround(ground, seed), (5.0 * seed, -3.0))
             else:
-                arena.begin_episode(1, terrain.Strip(ground, seed))
+                arena.begin_episode(1, terrain.PlanarGround(ground, seed))
             inertia = world.models[1].stat.meaninertia
             assert_like_set_const(world.models[1], array_names(world.models[1]))
             self.assertEqual(world.models[1].stat.meaninertia, inertia)

@@ -329,7 +329,7 @@ class FiguresTest(parameterized.TestCase):
     """Bodies are those of the original."""
 
     def test_all_spatial_characters_are_here(self):
-        spatial = [name for name, row in characters.CHARACTERS.items() if row.spatial]
+        spatial = [name for name, spec in characters.CHARACTERS.items() if spec.spatial]
         self.assertCountEqual(spatial, NAMES)
 
     @parameterized.parameters(*NAMES)
@@ -400,17 +400,17 @@ class FiguresTest(parameterized.TestCase):
     def test_joints(self, name):
         character, table = characters.make(name), JOINTS[name]
         model, _ = alone(name)
-        self.assertEqual(tuple(character.row.joints), tuple(table))  # order is that of the links
-        self.assertEqual(character.row.links, ('root', *table))
+        self.assertEqual(tuple(character.spec.joints), tuple(table))  # order is that of the links
+        self.assertEqual(character.spec.links, ('root', *table))
         balls = [is_ball(row[5]) for row in table.values()]
         np.testing.assert_array_equal(character.spherical, balls)
         np.testing.assert_array_equal(character.dofs, np.where(balls, 3, 1))
         self.assertFalse(character.prismatic.any())
         np.testing.assert_allclose(character.torque_limits, [row[1] for row in table.values()])
-        for (joint, row), figures, reach in zip(
-            table.items(), character.row.joints.values(), character.joint_ranges, strict=True
+        for (joint, spec), figures, reach in zip(
+            table.items(), character.spec.joints.values(), character.joint_ranges, strict=True
         ):
-            _, limit, kp, kd, weight, limits = row
+            _, limit, kp, kd, weight, limits = spec
             compiled = model.joint(joint)
             self.assertEqual((figures.kp, figures.kd, figures.weight), (kp, kd, weight), joint)
             self.assertEqual(model.jnt_limited[compiled.id], 1)
@@ -432,31 +432,31 @@ class FiguresTest(parameterized.TestCase):
         ('biped3d_simbicon', 7, 2.6, 'root', 1),
     )  # fmt: skip
     def test_links_and_reward_weights(self, name, count, total, link, weight):
-        row = characters.CHARACTERS[name]
-        self.assertLen(row.links, count)
-        self.assertAlmostEqual(row.weights.sum(), 1, delta=1e-12)
-        self.assertAlmostEqual(row.weights[row.links.index(link)], weight / total, delta=1e-12)
+        spec = characters.CHARACTERS[name]
+        self.assertLen(spec.links, count)
+        self.assertAlmostEqual(spec.weights.sum(), 1, delta=1e-12)
+        self.assertAlmostEqual(spec.weights[spec.links.index(link)], weight / total, delta=1e-12)
 
     @parameterized.parameters(*NAMES)
     def test_fall_links_end_effectors_and_stumbles(self, name):
-        row = characters.CHARACTERS[name]
-        self.assertCountEqual(row.fall_links, FIGURES[name].fall.split())
-        self.assertEqual(row.end_effectors, ('right_ankle', 'left_ankle'))
+        spec = characters.CHARACTERS[name]
+        self.assertCountEqual(spec.fall_links, FIGURES[name].fall.split())
+        self.assertEqual(spec.end_effectors, ('right_ankle', 'left_ankle'))
         free = {'right_ankle', 'left_ankle'}
         if name == 'biped3d_simbicon':  # as of the characters with gaits
             free |= {'right_knee', 'left_knee'}
-        self.assertEqual(set(row.stumble_exempt), free)
-        self.assertNotEmpty(row.description)
+        self.assertEqual(set(spec.stumble_exempt), free)
+        self.assertNotEmpty(spec.description)
 
     @parameterized.parameters(*NAMES)
     def test_mirror_pairs(self, name):
-        row = characters.CHARACTERS[name]
-        sides = [joint for joint in row.joints if joint.startswith(('right_', 'left_'))]
-        self.assertCountEqual(itertools.chain(*row.mirror), sides)
-        for right, left in row.mirror:
+        spec = characters.CHARACTERS[name]
+        sides = [joint for joint in spec.joints if joint.startswith(('right_', 'left_'))]
+        self.assertCountEqual(itertools.chain(*spec.mirror), sides)
+        for right, left in spec.mirror:
             self.assertEqual(right.removeprefix('right'), left.removeprefix('left'))
             self.assertEqual(JOINTS[name][right], JOINTS[name][left])
-            self.assertEqual(row.joints[right], row.joints[left])
+            self.assertEqual(spec.joints[right], spec.joints[left])
 
     def test_original_limits_of_joints_that_are_not_symmetric(self):
         character = characters.make('biped3d_simbicon')
@@ -470,11 +470,11 @@ class MirrorTest(parameterized.TestCase):
 
     def exchanged(self, character):
         """The other side's name of every link that has two sides."""
-        return {**dict(character.row.mirror), **{b: a for a, b in character.row.mirror}}
+        return {**dict(character.spec.mirror), **{b: a for a, b in character.spec.mirror}}
 
     def mirrored(self, character, vectors):
         """Rotation vectors and angles of the mirror image, (D,)."""
-        names, exchanged = list(character.row.joints), self.exchanged(character)
+        names, exchanged = list(character.spec.joints), self.exchanged(character)
         parts = dict(zip(names, np.split(vectors, np.cumsum(character.dofs)[:-1]), strict=True))
         signs = {1: np.ones(1), 3: np.array([-1.0, 1.0, -1.0])}
         return np.concatenate([
@@ -482,11 +482,11 @@ class MirrorTest(parameterized.TestCase):
         ])  # fmt: skip
 
     def positions(self, body):
-        scope = body.character.row.name
+        scope = body.character.spec.name
         mujoco.mj_kinematics(body.model, body.data)
         return {
             link: body.data.body(f'{scope}/{link}').xipos.copy()
-            for link in body.character.row.links
+            for link in body.character.spec.links
         }
 
     def assert_mirrored(self, here, there, character, atol):
@@ -508,7 +508,7 @@ class MirrorTest(parameterized.TestCase):
     @parameterized.product(name=NAMES, model=('position', 'torque', 'velocity'))
     def test_motion(self, name, model):
         first, second = (Floating(name, model) for _ in range(2))
-        self.assertFalse(first.map.centre.any())
+        self.assertFalse(first.map.action_offset.any())
         # Below the clamps: at them, which steps MuJoCo damps implicitly depends on the last bit.
         size = {'position': 0.05, 'torque': 0.3, 'velocity': 0.02}[model]
         action = size * np.random.default_rng(4).uniform(-1, 1, len(first.map))
@@ -680,8 +680,8 @@ class OwnArenaTest(parameterized.TestCase):
     def test_two_characters_in_one_arena(self):
         arena = users_arena()
         for i in range(2):
-            row = characters.CHARACTERS['biped3d_mocap']
-            character = characters.Character(row, name=f'walker_{i}')
+            spec = characters.CHARACTERS['biped3d_mocap']
+            character = characters.Character(spec, name=f'walker_{i}')
             character.create_root_joints(arena.attach(character))
             actuation.add(character, 'position', TIMESTEP)
         physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
@@ -720,10 +720,10 @@ class ActionMapTest(parameterized.TestCase):
         self.assertEqual(
             mapping.actuators, tuple(JOINTS[name]) if model == 'position' else mapping.names
         )
-        self.assertFalse(mapping.centre.any())
+        self.assertFalse(mapping.action_offset.any())
         small = 0.5 * np.random.default_rng(0).uniform(-1, 1, (5, len(mapping)))
         control = mapping.control(small)
-        np.testing.assert_allclose(control, mapping.half_range * small)
+        np.testing.assert_allclose(control, mapping.action_scale * small)
         np.testing.assert_allclose(mapping.action(control), small, atol=1e-12)
         for action, row in zip(small, control, strict=True):
             np.testing.assert_array_equal(mapping.control(action), row)  # alone as in a batch
@@ -741,7 +741,7 @@ class ActionMapTest(parameterized.TestCase):
     @parameterized.parameters(*NAMES)
     def test_reach(self, name):
         reach = {
-            model: dict(zip(mapping.names, mapping.half_range, strict=True))
+            model: dict(zip(mapping.names, mapping.action_scale, strict=True))
             for model in ('torque', 'velocity', 'position')
             for mapping in (Floating(name, model).map,)
         }
@@ -754,32 +754,38 @@ class ActionMapTest(parameterized.TestCase):
 
     def test_centre_and_half_range(self):
         rng = np.random.default_rng(0)
-        centre, reach = rng.uniform(-0.2, 0.2, 17), rng.uniform(0.5, 1, 17)
-        mapping = Floating('biped3d', 'position', centre=centre, half_range=reach).map
-        np.testing.assert_allclose(mapping.control(-np.ones(17)), centre - reach)
-        mapping = Floating('biped3d', 'position', half_range=1.0).map
-        np.testing.assert_array_equal(mapping.half_range, 1.0)
-        for options in ({'centre': np.zeros(7)}, {'half_range': [1.0] * 7}, {'half_range': 0}):
+        action_offset, reach = rng.uniform(-0.2, 0.2, 17), rng.uniform(0.5, 1, 17)
+        mapping = Floating(
+            'biped3d', 'position', action_offset=action_offset, action_scale=reach
+        ).map
+        np.testing.assert_allclose(mapping.control(-np.ones(17)), action_offset - reach)
+        mapping = Floating('biped3d', 'position', action_scale=1.0).map
+        np.testing.assert_array_equal(mapping.action_scale, 1.0)
+        for options in (
+            {'action_offset': np.zeros(7)},
+            {'action_scale': [1.0] * 7},
+            {'action_scale': 0},
+        ):
             with self.assertRaises(ValueError):
                 Floating('biped3d', 'position', **options)
 
     def test_working_posture_of_a_ball_joint(self):
-        row = characters.CHARACTERS['biped3d']
-        joints = dict(row.joints)
+        spec = characters.CHARACTERS['biped3d']
+        joints = dict(spec.joints)
         joints['torso'] = dataclasses.replace(joints['torso'], target=(0.1, -0.2, 0.3))
         joints['left_knee'] = dataclasses.replace(joints['left_knee'], target=-0.5)
-        character = characters.make(dataclasses.replace(row, joints=joints))
+        character = characters.make(dataclasses.replace(spec, joints=joints))
         mapping = actuation.add(character, 'position', TIMESTEP)
-        centre = dict(zip(mapping.names, mapping.centre, strict=True))
-        self.assertEqual([centre[f'torso_{axis}'] for axis in 'xyz'], [0.1, -0.2, 0.3])
-        self.assertEqual((centre['left_knee'], centre['left_hip_x']), (-0.5, 0))
+        action_offset = dict(zip(mapping.names, mapping.action_offset, strict=True))
+        self.assertEqual([action_offset[f'torso_{axis}'] for axis in 'xyz'], [0.1, -0.2, 0.3])
+        self.assertEqual((action_offset['left_knee'], action_offset['left_hip_x']), (-0.5, 0))
 
     @parameterized.parameters(*NAMES)
     def test_torques_are_clamped_by_their_norm(self, name):
         mapping = Floating(name, 'torque').map
         action = np.random.default_rng(1).uniform(-1, 1, (200, len(mapping)))
         control = mapping.control(action)
-        affine = mapping.half_range * action
+        affine = mapping.action_scale * action
         first = 0
         clamped = 0
         for _, limit, *_, limits in JOINTS[name].values():
@@ -836,8 +842,8 @@ class AngleAxisTest(parameterized.TestCase):
     def test_map_of_the_original(self, name, i, part, zero, per_unit):
         mapping = self.make(name).map
         self.assertEqual(mapping.names[i], part)
-        self.assertAlmostEqual(mapping.centre[i], zero)
-        self.assertAlmostEqual(mapping.half_range[i], per_unit)
+        self.assertAlmostEqual(mapping.action_offset[i], zero)
+        self.assertAlmostEqual(mapping.action_scale[i], per_unit)
 
     def test_conversion(self):
         """Against the definition: theta about a normalised axis, in the source's frame."""
@@ -904,8 +910,8 @@ class AngleAxisTest(parameterized.TestCase):
         np.testing.assert_allclose(*torques, atol=1e-9)
 
     def test_refusals(self):
-        for options in ({'centre': np.zeros(22)}, {'half_range': 1.0}):
-            with self.assertRaisesRegex(ValueError, 'those of the original: no centre'):
+        for options in ({'action_offset': np.zeros(22)}, {'action_scale': 1.0}):
+            with self.assertRaisesRegex(ValueError, 'those of the original: no action_offset'):
                 Floating('biped3d', 'position', rotations='angle_axis', **options)
         with self.assertRaisesRegex(ValueError, "unknown way to describe rotations 'axis'"):
             Floating('biped3d', 'position', rotations='axis')
@@ -988,7 +994,7 @@ class ServoTest(parameterized.TestCase):
         action = 0.5 * rng.uniform(-1, 1, len(body.map))
         body.act(action)
         body.forward()
-        torque = body.map.half_range * action
+        torque = body.map.action_scale * action
         np.testing.assert_allclose(body.data.qfrc_actuator[body.dofs], torque)
 
     @parameterized.product(name=NAMES, model=('torque', 'velocity', 'position'))
@@ -1016,7 +1022,10 @@ class ServoTest(parameterized.TestCase):
         target = random_targets(name, np.random.default_rng(11), 0.8)
         body.act(body.map.action(target))
         # Rotation vectors reach 1.5 rad about every axis by default.
-        low, high = body.map.centre - body.map.half_range, body.map.centre + body.map.half_range
+        low, high = (
+            body.map.action_offset - body.map.action_scale,
+            body.map.action_offset + body.map.action_scale,
+        )
         if rotations == 'vector':
             target = np.clip(target, low, high)
         body.step(3)

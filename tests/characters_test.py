@@ -229,7 +229,7 @@ class FiguresTest(parameterized.TestCase):
     """Bodies are those of the original."""
 
     def test_all_planar_characters_are_here(self):
-        planar = [name for name, row in characters.CHARACTERS.items() if not row.spatial]
+        planar = [name for name, spec in characters.CHARACTERS.items() if not spec.spatial]
         self.assertCountEqual(planar, NAMES)
 
     @parameterized.parameters(*NAMES)
@@ -292,10 +292,12 @@ class FiguresTest(parameterized.TestCase):
     def test_joints(self, name):
         character, table = characters.make(name), JOINTS[name]
         model, _ = alone(name)
-        self.assertEqual(tuple(character.row.joints), tuple(table))  # order is that of the links
-        self.assertEqual(character.row.links, ('root', *table))
-        for (joint, row), figures in zip(table.items(), character.row.joints.values(), strict=True):
-            _, limit, kp, kd, weight, limits = row
+        self.assertEqual(tuple(character.spec.joints), tuple(table))  # order is that of the links
+        self.assertEqual(character.spec.links, ('root', *table))
+        for (joint, spec), figures in zip(
+            table.items(), character.spec.joints.values(), strict=True
+        ):
+            _, limit, kp, kd, weight, limits = spec
             compiled = model.joint(joint)
             slides = (name, joint) == ('hopper', 'leg')
             kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
@@ -356,18 +358,18 @@ class FiguresTest(parameterized.TestCase):
         ('biped2d_simbicon', 2.6, 'left_ankle', 0.2), ('hopper', 2, 'leg', 0.5),
     )  # fmt: skip
     def test_reward_weights(self, name, total, link, weight):
-        row = characters.CHARACTERS[name]
-        self.assertAlmostEqual(row.weights.sum(), 1, delta=1e-12)
-        self.assertAlmostEqual(row.weights[row.links.index(link)], weight / total, delta=1e-12)
+        spec = characters.CHARACTERS[name]
+        self.assertAlmostEqual(spec.weights.sum(), 1, delta=1e-12)
+        self.assertAlmostEqual(spec.weights[spec.links.index(link)], weight / total, delta=1e-12)
 
     @parameterized.parameters(*NAMES)
     def test_fall_links_and_end_effectors(self, name):
-        row, figures = characters.CHARACTERS[name], FIGURES[name]
-        self.assertCountEqual(row.fall_links, figures.fall.split())
-        self.assertEqual(row.end_effectors, tuple(figures.effectors.split()))
+        spec, figures = characters.CHARACTERS[name], FIGURES[name]
+        self.assertCountEqual(spec.fall_links, figures.fall.split())
+        self.assertEqual(spec.end_effectors, tuple(figures.effectors.split()))
         effectors = characters.make(name).end_effectors
-        self.assertEqual(tuple(body.name for body in effectors), row.end_effectors)
-        self.assertNotEmpty(row.description)
+        self.assertEqual(tuple(body.name for body in effectors), spec.end_effectors)
+        self.assertNotEmpty(spec.description)
 
     @parameterized.parameters(
         ('biped2d_simbicon', 'right_ankle left_ankle right_knee left_knee'), ('hopper', 'leg')
@@ -380,11 +382,11 @@ class FiguresTest(parameterized.TestCase):
         ('hopper', 0),
     )  # fmt: skip
     def test_mirror_pairs(self, name, count):
-        row = characters.CHARACTERS[name]
-        self.assertLen(row.mirror, count)
-        for right, left in row.mirror:
+        spec = characters.CHARACTERS[name]
+        self.assertLen(spec.mirror, count)
+        for right, left in spec.mirror:
             self.assertEqual(right.removeprefix('right'), left.removeprefix('left'))
-            self.assertIn(left, row.joints)
+            self.assertIn(left, spec.joints)
 
 
 class CollisionTest(parameterized.TestCase):
@@ -413,10 +415,10 @@ class CollisionTest(parameterized.TestCase):
 
     @parameterized.parameters(*NAMES)
     def test_ground_touches_all_but_tails_of_dog_and_goat(self, name):
-        row = characters.CHARACTERS[name]
+        spec = characters.CHARACTERS[name]
         ghosts = {f'tail{i}' for i in range(4)} if name in ('dog', 'goat') else set()
         floor = {next(iter(p - {'floor'})) for p in self.touching(name) if 'floor' in p}
-        self.assertEqual(floor, set(row.links) - ghosts)
+        self.assertEqual(floor, set(spec.links) - ghosts)
         solid = [geom.name for geom in characters.make(name).collision_geoms]
         self.assertCountEqual(solid, floor)
 
@@ -561,10 +563,10 @@ class OwnArenaTest(parameterized.TestCase):
             characters.make('rapter')
 
     def test_row_of_an_incomplete_file(self):
-        row = characters.CHARACTERS['biped2d']
-        joints = {**row.joints, 'third_leg': next(iter(row.joints.values()))}
+        spec = characters.CHARACTERS['biped2d']
+        joints = {**spec.joints, 'third_leg': next(iter(spec.joints.values()))}
         with self.assertRaisesRegex(ValueError, "biped2d.xml has no joint named 'third_leg'"):
-            characters.make(dataclasses.replace(row, joints=joints))
+            characters.make(dataclasses.replace(spec, joints=joints))
 
 
 if __name__ == '__main__':

@@ -16,10 +16,13 @@ import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, cli, evaluation, policies, rendering, resources, scripted, suite
-from trl_suite.commands import list as listing
-from trl_suite.commands import rollout
-from trl_suite.tasks.gait import GaitTask
+from trl_suite import cli, evaluation, policies, rendering, suite
+from trl_suite.cli import list as listing
+from trl_suite.cli import rollout
+from trl_suite.registry import catalogue
+from trl_suite.tasks.gait.task import GaitTask
+from trl_suite.tasks.navigation import scripted
+from trl_suite.util import resources
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SIZE = ('--size', '160x120')
@@ -66,8 +69,8 @@ class ListTest(CommandTest):
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
-        for line, row in zip(lines[1:-1], catalogue.ROWS, strict=True):
-            self.assertEndsWith(line, row.description)
+        for line, spec in zip(lines[1:-1], catalogue.SPECS, strict=True):
+            self.assertEndsWith(line, spec.description)
 
     @parameterized.parameters(
         (('--domain', 'imitation'), 27),
@@ -123,14 +126,18 @@ class InfoTest(CommandTest):
         out = self.output('info', id_)
         self.assertStartsWith(out, f'{id_}\n')
         self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
-        rules = suite.find(id_).rules
-        gait, steps, high = rules == 'gait', rules == 'footsteps', rules in ('hike', 'soccer')
+        rules = suite.find(id_).task_type
+        gait, steps, high = (
+            rules == 'gait',
+            rules == 'spatial_footsteps',
+            rules in ('goal_navigation', 'soccer'),
+        )
         for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
                       'Termination', 'Time', 'Differs'):  # fmt: skip
             self.assertIn(f'\n{title}', out)
         for title, shown in (
             ('Clip', not gait and not steps and not high), ('Gait', gait), ('Parameters', gait),
-            ('Steps', steps), ('Plans', steps or rules == 'footsteps2d'),
+            ('Steps', steps), ('Plans', steps or rules == 'planar_footsteps'),
         ):  # fmt: skip
             self.assertEqual(f'\n{title}:' in out, shown, title)
         self.assertEqual('\nFootstep controller\n' in out, high)
@@ -153,7 +160,7 @@ class InfoTest(CommandTest):
 
     def test_muscles_have_peak_forces(self):
         out = self.output('info', 'MTU_Biped2D_LLC_Imitate_Flat-v0')
-        self.assertIn('Action: 16 numbers in [-1, 1]; excitation = centre', out)
+        self.assertIn('Action: 16 numbers in [-1, 1]; excitation = action_offset', out)
         self.assertRegex(out, r'\n  right_VAS +0\.505 +0\.495 +6000\n')
         self.assertRegex(out, r'\n  strain +29 +45 +16 ')
 
@@ -169,7 +176,7 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 283 numbers', out)
         self.assertRegex(out, r'\n  terrain +0 +200 +200 +m .* to 10 m ahead')
         self.assertRegex(out, r'\n  velocity +241 +283 +42 ')
-        self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = centre', out)
+        self.assertIn('Action: 29 numbers in [-1, 1]; gait parameter = action_offset', out)
         self.assertRegex(
             out, r'\n  BackForceX +378.3 +432.7  N +push of the hind foot on the body, ahead'
         )
@@ -179,7 +186,7 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  Gather.Ankle +0.9304 +1.547  rad +a target\n')
         self.assertIn('\n  0.8 exp(-0.5 (v - 4)^2) + 0.2 / (1 + 10 s)\n', out)
         self.assertIn('a link other than toe, finger, ankle, wrist touches', out)
-        self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+looks')
+        self.assertRegex(out, r'root, spine0, .* head touches the ground in 4\s+samples')
         self.assertIn('turned by more than 144 degrees', out)
         self.assertIn('less than 0.5 m in 5 s', out)
         self.assertRegex(out, 'one cycle, at most 1.67 s; control 600 Hz, physics 1200 Hz;.*cut\n'
@@ -217,7 +224,9 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  left_ankle +50 +57 +99 +105\n')
         self.assertRegex(out, r'\n +115 +118 +3  m +first landing place from the left foot')
         self.assertRegex(out, r'\n +124 +125 +1  rad +planned heading')
-        self.assertIn('Action: 17 numbers in [-1, 1]; target rotation vector in rad = centre', out)
+        self.assertIn(
+            'Action: 17 numbers in [-1, 1]; target rotation vector in rad = action_offset', out
+        )
         self.assertRegex(out, r'\n  torso_x +0 +1 +200\n')
         self.assertRegex(out, r'\n  left_knee +-0\.4\d+ +1 +150\n')
         self.assertRegex(out, r'\n  right_hip +4\.5 +ball, up to 2\.57 +200 +300 +30 +0\.5\n')
@@ -252,15 +261,17 @@ class InfoTest(CommandTest):
         self.assertIn('Observation: 2155 numbers', out)
         for name, start, stop in (
             ('surface', 0, 2048), ('pose', 2048, 2105), ('velocity', 2105, 2153),
-            ('target', 2153, 2155),
+            ('goal', 2153, 2155),
         ):  # fmt: skip
             self.assertRegex(out, rf'\n  {name} +{start} +{stop} +{stop - start}  \S')
-        self.assertIn('Action: 5 numbers in [-1, 1]; footstep plan = centre + half range', out)
-        for name, centre, half_range, unit in (
+        self.assertIn(
+            'Action: 5 numbers in [-1, 1]; footstep plan = action_offset + action_scale', out
+        )
+        for name, action_offset, action_scale, unit in (
             ('first_x', '0.5', '1', 'm'), ('first_y', '0', '1', 'm'), ('second_x', '1', '2', 'm'),
             ('second_y', '0', '2', 'm'), ('turn', '0', '3.142', 'rad'),
         ):  # fmt: skip
-            self.assertRegex(out, rf'\n  {name} +{centre} +{half_range}  {unit}; ')
+            self.assertRegex(out, rf'\n  {name} +{action_offset} +{action_scale}  {unit}; ')
         self.assertRegex(out, r'\n  speed +0\.8  exp\(-1\.5 min\(0, v - 1\)\^2\)')
         self.assertRegex(out, r'\n  upright +0\.2  1\n')
         self.assertRegex(
@@ -270,7 +281,7 @@ class InfoTest(CommandTest):
             out, r'\nGoal\n  drawn up to 12 m .* nothing stands or moves\s+within 0\.25 m;\s'
         )
         self.assertRegex(out, r'within 1 m\s+of it, or after 50 to 100 s')
-        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+looks')
+        self.assertRegex(out, r'one of root, torso touches the ground in 4\s+samples')
         self.assertRegex(out, r'a step is 0\.5 s.*30 Hz, physics\s+300 Hz.*\s400 steps, 200 s')
         self.assertIn("\n  'PD_Biped3D_LLC_General_Step-v0'; ", out)
         out = self.output('info', 'PD_Biped3D_HLC_Soccer-v0')
@@ -311,7 +322,7 @@ class InfoTest(CommandTest):
             'straight on': 'straight on',
             'walks at 1.535 m/s': '3D walk',
             '27 of them': 'steps',
-            'option miss': 'footsteps',
+            'option max_landing_error': 'footsteps',
             'half a cycle of the walk': 'in the plane',
             'truly mirrored': 'mirrored',
             'slower than the steps': 'run',
@@ -328,7 +339,7 @@ class InfoTest(CommandTest):
             'cut after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
             'heights of its pillars': 'forest',
-            'a goal is reached or its time': 'hike',
+            'a goal is reached or its time': 'goal_navigation',
             'times of ball and goal': 'soccer',
         }
         tracking = {'clip', 'imitation', 'short'}
@@ -364,15 +375,18 @@ class InfoTest(CommandTest):
             ('PD_Biped3D_LLC_Symetric_Step-v0', stepping | {'mirrored'}),
             ('PD_Biped3D_LLC_Run_FootStep-v0', stepping - {'steps'} | {'run'}),
             ('PD_Biped3D_LLC_Trail_Step-v0', stepping | {'goal', 'completion'}),
-            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'hike', 'blocks'}),
-            ('PD_Biped3D_HLC_Forest-v0', planning - {'coarse'} | {'hike', 'forest', 'blocks'}),
+            ('PD_Biped3D_HLC_LargeBlocks-v0', planning | {'goal_navigation', 'blocks'}),
+            (
+                'PD_Biped3D_HLC_Forest-v0',
+                planning - {'coarse'} | {'goal_navigation', 'forest', 'blocks'},
+            ),
             (
                 'PD_Biped3D_HLC_DynamicsObstacles-v0',
-                planning - {'coarse'} | {'hike', 'moving'},
+                planning - {'coarse'} | {'goal_navigation', 'moving'},
             ),
-            ('PD_Biped3D_HLC_Conveyors-v0', planning - {'coarse'} | {'hike', 'belts'}),
+            ('PD_Biped3D_HLC_Conveyors-v0', planning - {'coarse'} | {'goal_navigation', 'belts'}),
             ('PD_Biped3D_HLC_Soccer-v0', planning | {'soccer'}),
-            ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'hike', 'completion'}),
+            ('PD_Biped3D_HLC_PathFollowing-v0', planning | {'goal_navigation', 'completion'}),
         ):
             with self.subTest(id_):
                 out = self.output('info', id_).split('\nDiffers')[1]
@@ -501,7 +515,7 @@ class RolloutTest(CommandTest):
 
     def test_no_ghost_above_a_controller(self):
         self.assert_refused(
-            'the task HighLevel has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
+            'the task HierarchicalNavigation has no reference clip', 'rollout', 'PD_Biped3D_HLC_Forest-v0', '--ghost',
             '--video', 'a.mp4', *SIZE,
         )  # fmt: skip
         self.assert_only()
@@ -537,7 +551,7 @@ class RolloutTest(CommandTest):
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
         ("unknown policy 'walk'; known: FILE.npz, clip, random, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
-        ('the task Imitation has no scripted policy; hikes and soccer have', GAPS, '--policy',
+        ('the task PlanarImitation has no scripted policy; goal navigation and soccer have', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),
         ("unknown policy 'cilp'; did you mean 'clip'", GAPS, '--policy', 'cilp'),
         ('no such file', GAPS, '--policy', 'none.npz'),
@@ -645,13 +659,13 @@ class EvaluateTest(CommandTest):
                 'policy': 'mine.npz',
                 'episodes': '5, seed 3',
                 'return': f'{expected["return"]:.2f} +- {expected["return_interval"]:.2f} '
-                f'(95 % confidence), {expected["fraction"]:.1%} of the maximum 256',
+                f'(95 % confidence), {expected["normalized_return"]:.1%} of the maximum 256',
                 'length': f'{expected["length"]:.1f} of 256 steps',
                 'distance': '{distance:.2f} m ({0:.2f} to {1:.2f}, 95 % confidence), median '
                 '{median_distance:.2f} m, at {speed:.2f} m/s'.format(
                     *expected['distance_interval'], **expected
                 ),
-                'full length': f'{expected["full"]:.0%} of the episodes',
+                'full length': f'{expected["completion_rate"]:.0%} of the episodes',
                 'falls': f'{expected["falls"]:.0%} of the episodes',
             },
         )
@@ -665,10 +679,10 @@ class EvaluateTest(CommandTest):
 
     def test_the_scripted_baseline(self):
         self.assert_refused('no scripted policy', 'evaluate', GAPS, '--policy', 'scripted')
-        row = dataclasses.replace(suite.find('PD_Biped3D_HLC_Forest-v0'), step_limit=5)
-        with mock.patch.object(suite, 'find', lambda id_: row):
-            out = self.output('evaluate', row.id, '--policy', 'scripted', '--episodes', '2')
-        expected = evaluation.evaluate(row, scripted.scripted, 2, factory=True)
+        spec = dataclasses.replace(suite.find('PD_Biped3D_HLC_Forest-v0'), step_limit=5)
+        with mock.patch.object(suite, 'find', lambda id_: spec):
+            out = self.output('evaluate', spec.id, '--policy', 'scripted', '--episodes', '2')
+        expected = evaluation.evaluate(spec, scripted.scripted, 2, factory=True)
         self.assertIn(f'  return       {expected["return"]:.2f} +- ', out)
         self.assertIn('of the maximum 5\n', out)
 
@@ -794,7 +808,7 @@ class ProgramTest(CommandTest):
 
 
 class ReadmeTest(CommandTest):
-    """What the README and the guide show."""
+    """What the README and the expert show."""
 
     text = ''.join(
         (pathlib.Path(__file__).parents[1] / name).read_text(encoding='utf-8')

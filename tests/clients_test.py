@@ -62,7 +62,7 @@ class GymnasiumTest(absltest.TestCase):
     def test_example(self):
         out = output('gymnasium_rollout')
         self.assertRegex(out, r'^one: return \d+\.\d, -?\d+\.\d\d m, fell: True\n')
-        # Random actions fell a walker within a second or so: 16 rows of 256 steps.
+        # Random actions fell a walker within a second or so: 16 simulations of 256 steps.
         self.assertGreater(int(re.search(r'\n16: (\d+) episodes', out)[1]), 50)
 
     def test_rows_say_how_they_are_reset(self):
@@ -85,7 +85,7 @@ class StableBaselinesTest(absltest.TestCase):
 
 @needs('torchrl', 'torchrl')
 class TorchRLTest(parameterized.TestCase):
-    """TorchRL's wrappers: of a single environment, and of rows on threads."""
+    """TorchRL's wrappers: of a single environment, and of simulations on threads."""
 
     def setUp(self):
         super().setUp()
@@ -93,22 +93,22 @@ class TorchRLTest(parameterized.TestCase):
 
         logging.getLogger('torchrl').setLevel('ERROR')
 
-    def make(self, rows, **options):
+    def make(self, num_envs, **options):
         from torchrl.envs import GymEnv, GymWrapper
 
-        if not rows:
+        if not num_envs:
             return GymEnv(f'trl_suite/{GAPS}', **options)
         return GymWrapper(
             gymnasium.make_vec(
-                f'trl_suite/{GAPS}', num_envs=rows, autoreset_mode='Disabled', **options
+                f'trl_suite/{GAPS}', num_envs=num_envs, autoreset_mode='Disabled', **options
             )
         )
 
-    @parameterized.product(rows=(0, 3), flat_observation=(True, False))
-    def test_specs(self, rows, flat_observation):
+    @parameterized.product(env_ids=(0, 3), flat_observation=(True, False))
+    def test_specs(self, num_envs, flat_observation):
         from torchrl.envs import check_env_specs
 
-        environment = self.make(rows, flat_observation=flat_observation)
+        environment = self.make(num_envs, flat_observation=flat_observation)
         check_env_specs(environment)
         blocks = {'terrain': 50, 'pose': 25, 'velocity': 24, 'phase': 5}
         sizes = {'observation': 104} if flat_observation else blocks
@@ -116,12 +116,12 @@ class TorchRLTest(parameterized.TestCase):
         self.assertEqual(found, sizes)
 
     @parameterized.parameters(0, 3)
-    def test_a_seed_is_an_episode(self, rows):
+    def test_a_seed_is_an_episode(self, num_envs):
         import torch
 
         rollouts = []
         for seed in (5, 5, 6):
-            environment = self.make(rows)
+            environment = self.make(num_envs)
             environment.set_seed(seed)
             torch.manual_seed(0)
             rollouts.append(environment.rollout(30, break_when_any_done=False))
@@ -129,7 +129,7 @@ class TorchRLTest(parameterized.TestCase):
         self.assertFalse((rollouts[0] == rollouts[2]).all())
 
     def test_rows_are_those_of_the_suite(self):
-        """What a rollout over ends of episodes says, in every row, a single environment does."""
+        """What a rollout over ends of episodes says, in every simulation, a single environment does."""
         import torch
 
         environment = self.make(3)
@@ -137,11 +137,11 @@ class TorchRLTest(parameterized.TestCase):
         torch.manual_seed(0)
         found = environment.rollout(60, break_when_any_done=False)
         self.assertGreater(int(found['next', 'done'].sum()), 3)
-        for row, seed in enumerate(np.random.SeedSequence(5).generate_state(3)):
+        for env_id, seed in enumerate(np.random.SeedSequence(5).generate_state(3)):
             single = trl_suite.gym.SuiteEnv(GAPS)
             single.reset(seed=int(seed))  # as TorchRL does when it is given a seed
             observation, _ = single.reset()
-            for step in found[row]:
+            for step in found[env_id]:
                 np.testing.assert_array_equal(step['observation'], observation)
                 observation, reward, terminated, truncated, _ = single.step(step['action'].numpy())
                 np.testing.assert_array_equal(step['next', 'observation'], observation)
@@ -153,7 +153,7 @@ class TorchRLTest(parameterized.TestCase):
 
     def test_page(self):
         names = run_page('torchrl')
-        self.assertEqual(names['rows'].batch_size, (16,))
+        self.assertEqual(names['simulations'].batch_size, (16,))
         self.assertEqual(names['one'].batch_size, ())
 
     @pytest.mark.slow
@@ -206,7 +206,7 @@ class ShimmyTest(parameterized.TestCase):
 @needs('ray', 'rllib')
 class RLlibTest(absltest.TestCase):
     def test_configuration(self):
-        configuration = load('rllib_ppo').configuration(GAPS, runners=3, rows=8, seed=7)
+        configuration = load('rllib_ppo').configuration(GAPS, runners=3, num_envs=8, seed=7)
         configuration.validate()
         self.assertEqual(configuration.total_train_batch_size, 3 * 8 * 32)
 
@@ -219,7 +219,7 @@ class RLlibTest(absltest.TestCase):
         ray.cloudpickle.register_pickle_by_value(example)
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level='ERROR')
         self.addCleanup(ray.shutdown)
-        algorithm = example.configuration(FLAT, runners=2, rows=16, seed=7).build_algo()
+        algorithm = example.configuration(FLAT, runners=2, num_envs=16, seed=7).build_algo()
         self.addCleanup(algorithm.stop)
         for updates in range(1, 4):
             found = algorithm.train()

@@ -10,8 +10,11 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from PIL import Image
 
-from trl_suite import acting, catalogue, characters, motion, policies, suite, terrain
-from trl_suite.commands import bench, doctor, gallery, machine
+from trl_suite import characters, motion, policies, suite, terrain
+from trl_suite.cli import bench, doctor, machine
+from trl_suite.environments import named_policies as acting
+from trl_suite.registry import catalogue
+from trl_suite.viewing import gallery
 
 GAPS = cli_test.GAPS
 CommandTest, run = cli_test.CommandTest, cli_test.run
@@ -107,10 +110,12 @@ class DoctorTest(CommandTest):
 class BenchTest(CommandTest):
     def test_measures(self):
         out = self.output(
-            'bench', 'plaid/dog_gaps', '--rows', '3', '--threads', '1', '--seconds', '0.05',
+            'bench', 'plaid/dog_gaps', '--num-envs', '3', '--threads', '1', '--seconds', '0.05',
             '--json', 'bench.json',
         )  # fmt: skip
-        self.assertStartsWith(out, 'PD_Dog2D_Gaps_Terrain-v0, 3 rows, 1 threads, random actions\n')
+        self.assertStartsWith(
+            out, 'PD_Dog2D_Gaps_Terrain-v0, 3 simulations, 1 threads, random actions\n'
+        )
         found = json.loads(pathlib.Path('bench.json').read_text())
         self.assertIn(found['machine'], out)
         self.assertIn(f'mujoco {machine.version("mujoco")}', found['machine'])
@@ -141,7 +146,7 @@ class GalleryTest(CommandTest):
         self.assertLen(set(paths), len(paths))
         shipped = len(policies.available())
         for folder, count in (
-            ('environments', len(catalogue.ROWS)), ('characters', len(characters.CHARACTERS)),
+            ('environments', len(catalogue.SPECS)), ('characters', len(characters.CHARACTERS)),
             ('terrains', len(terrain.PRESETS) + len(terrain.PRESETS3D)), ('curves', shipped),
             ('families', len(suite.TASKS_BY_DOMAIN)),
         ):  # fmt: skip
@@ -152,10 +157,10 @@ class GalleryTest(CommandTest):
         self.assertLen([item for item in items if item.source], 2 * shipped)
 
     def test_pictures(self):
-        out = self.output('gallery', '--only', 'Hopper2D_Terrain_Walls-', '--output', 'g')
+        out = self.output('gallery', '--filter', 'Hopper2D_Terrain_Walls-', '--output', 'g')
         self.assertEqual(out, '1 picture written to g, 0 failed\n')
         for only in ('characters/hopper', 'terrains/gaps.png', f'curves/{GAPS}', 'families/plaid'):
-            self.output('gallery', '--only', only, '--output', 'g')
+            self.output('gallery', '--filter', only, '--output', 'g')
         files = {path.name: path for path in pathlib.Path('g').rglob('*.*g')}
         strip = 'FSM_Hopper2D_Terrain_Walls-v0.jpg'
         self.assertCountEqual(files, [strip, 'hopper.jpg', 'gaps.png', f'{GAPS}.png', 'plaid.jpg'])
@@ -171,14 +176,14 @@ class GalleryTest(CommandTest):
         old = pathlib.Path('characters')
         old.mkdir()
         (old / 'dog.jpg').write_text('mine')
-        out = self.output('gallery', '--only', 'characters/dog', '--output', '.')
+        out = self.output('gallery', '--filter', 'characters/dog', '--output', '.')
         self.assertEqual(out, '0 pictures written to ., 0 failed\n')
         self.assertEqual((old / 'dog.jpg').read_text(), 'mine')
-        self.output('gallery', '--only', 'characters/dog', '--output', '.', '--again')
+        self.output('gallery', '--filter', 'characters/dog', '--output', '.', '--overwrite')
         self.assertGreater((old / 'dog.jpg').stat().st_size, 1000)
 
     def test_a_policy_that_was_replaced_is_drawn_again(self):
-        only = ('gallery', '--only', f'curves/{GAPS}', '--output', 'g')
+        only = ('gallery', '--filter', f'curves/{GAPS}', '--output', 'g')
         for digest, count in (('old', 1), ('old', 0), ('new', 1), ('new', 0)):
             with mock.patch.object(gallery, '_digest', lambda name, digest=digest: digest):
                 self.assertStartsWith(self.output(*only), f'{count} picture')
@@ -200,7 +205,7 @@ class GalleryTest(CommandTest):
         self.assertEqual((status, out), (1, '1 picture written to g, 1 failed\n'))
         self.assertEqual(err, 'a.png: no such thing\n')
         self.assertEqual([path.name for path in pathlib.Path('g').iterdir()], ['b.png'])
-        self.assert_refused("no picture matches 'cat'", 'gallery', '--only', 'cat')
+        self.assert_refused("no picture matches 'cat'", 'gallery', '--filter', 'cat')
 
     def test_noise_becomes_small(self):
         noise = np.random.default_rng(0).integers(0, 255, (150, 200, 3)).astype(np.uint8)

@@ -10,7 +10,7 @@ from dm_control import mjcf
 from dm_control.locomotion.arenas import floors
 
 from trl_suite import actuation, characters, controllers, terrain
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.controllers import dynamics, machine, parameters
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
@@ -23,7 +23,7 @@ COUNTS = {
     'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 7, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
     'biped2d_simbicon': (33, 28, 5, 7, 10, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
 }  # fmt: skip
-# Of base action 0, and the largest deviation of any base action from the centre, by name.
+# Of base action 0, and the largest deviation of any base action from the action_offset, by name.
 FIGURES = {
     'dog': {
         'TransTime': (0.125, 0), 'Cv': (0.014184, 0.034553), 'BackForceX': (378.334188, 432.678275),
@@ -117,17 +117,17 @@ class ParametersTest(parameterized.TestCase):
     def test_base_actions_of_the_original(self, name):
         gait = controllers.load(name, 'original')
         self.assertLen(gait.base_actions, len(gait.blends))
-        for parameter, (value, half_range) in FIGURES[name].items():
+        for parameter, (value, action_scale) in FIGURES[name].items():
             place = gait.place(parameter)
             self.assertAlmostEqual(gait.base_actions[0, place], value, places=6, msg=parameter)
-            self.assertAlmostEqual(gait.half_range[place], half_range, places=6, msg=parameter)
+            self.assertAlmostEqual(gait.action_scale[place], action_scale, places=6, msg=parameter)
         for number, values in BLENDS[name].items():
             for parameter, value in values.items():
                 found = gait.base_actions[number, gait.place(parameter)]
                 self.assertAlmostEqual(found, value, places=6, msg=parameter)
-        self.assertTrue((gait.half_range[gait.actions] > 0).all())
+        self.assertTrue((gait.action_scale[gait.actions] > 0).all())
         idle = np.delete(np.arange(len(gait.names)), gait.actions)
-        np.testing.assert_array_equal(gait.half_range[idle], 0)
+        np.testing.assert_array_equal(gait.action_scale[idle], 0)
 
     @parameterized.product(name=NAMES, base_actions=('default', 'original'))
     def test_actions_reach_base_actions(self, name, base_actions):
@@ -141,47 +141,47 @@ class ParametersTest(parameterized.TestCase):
     @parameterized.parameters(*NAMES)
     def test_sets_of_our_own(self, name):
         gait, original = controllers.load(name), controllers.load(name, 'original')
-        np.testing.assert_array_equal(gait.centre, original.centre)
+        np.testing.assert_array_equal(gait.action_offset, original.action_offset)
         tuned = set(json.loads((FOLDER / f'{name}.json').read_text()).get('tuning', {}))
         for a, b, _ in original.blends:
             self.assertNoCommonElements({a, b}, tuned)
         if gait.blends == original.blends:
             np.testing.assert_array_equal(gait.base_actions, original.base_actions)
         else:  # what the character does by itself can be chosen, too
-            np.testing.assert_array_equal(gait.base_actions[0], gait.centre)
+            np.testing.assert_array_equal(gait.base_actions[0], gait.action_offset)
 
     def test_what_action_0_means(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))
-        np.testing.assert_array_equal(dog.centre, dog.base_actions[0])
-        np.testing.assert_array_equal(hopper.centre, hopper.base_actions[0])
-        np.testing.assert_array_equal(raptor.centre, raptor.base_actions[1])
+        np.testing.assert_array_equal(dog.action_offset, dog.base_actions[0])
+        np.testing.assert_array_equal(hopper.action_offset, hopper.base_actions[0])
+        np.testing.assert_array_equal(raptor.action_offset, raptor.base_actions[1])
         biped = controllers.load('biped2d_simbicon')
         for parameter, value in (
             ('TransTime', 0.0825), ('Cv', 0.258612), ('Cd', 2.160335), ('Contact.RootPitch', -0.331847),
             ('Down.StanceHip', 0.665958), ('Up.SwingAnkle', 0.182327),
         ):  # fmt: skip
-            self.assertEqual(biped.centre[biped.place(parameter)], value)
+            self.assertEqual(biped.action_offset[biped.place(parameter)], value)
         goat = controllers.load('goat')
         for parameter, value in (
             ('TransTime', 0.125), ('Cv', 0.035053), ('BackForceX', 509.408108), ('FrontForceY', 363.495957),
             ('Extend.Hip', 1.2993), ('Gather.Ankle', 1.794969),
         ):  # fmt: skip
-            self.assertEqual(goat.centre[goat.place(parameter)], value)
+            self.assertEqual(goat.action_offset[goat.place(parameter)], value)
 
     @parameterized.parameters(*NAMES)
     def test_actions(self, name):
         gait = controllers.load(name)
         size, rng = len(gait.actions), np.random.default_rng(0)
-        np.testing.assert_array_equal(gait.vector(np.zeros((2, size))), [gait.centre] * 2)
+        np.testing.assert_array_equal(gait.vector(np.zeros((2, size))), [gait.action_offset] * 2)
         for sign in (1, -1):
             (vector,) = gait.vector(np.full((1, size), sign))
-            expected = gait.centre + sign * gait.half_range
+            expected = gait.action_offset + sign * gait.action_scale
             np.testing.assert_allclose(vector, expected, rtol=0, atol=1e-12)
             idle = np.delete(np.arange(len(vector)), gait.actions)
-            np.testing.assert_array_equal(vector[idle], gait.centre[idle])
+            np.testing.assert_array_equal(vector[idle], gait.action_offset[idle])
         one = np.zeros((1, size))
         one[0, 3] = 1.0
-        changed = np.flatnonzero(gait.vector(one)[0] != gait.centre)
+        changed = np.flatnonzero(gait.vector(one)[0] != gait.action_offset)
         np.testing.assert_array_equal(changed, gait.actions[3:4])
         actions = rng.uniform(-1, 1, (4, size))
         vectors = gait.vector(actions)
@@ -194,13 +194,13 @@ class ParametersTest(parameterized.TestCase):
             'targets': {'Hip': ['hip']}, 'misc': ['Gain'], 'states': ['Up', 'Down'],
             'state_parameters': ['Hip'], 'fixed': ['Gain'], 'absolute': [], 'target_speed': 1.0,
             'sets': {'a': [1, 2, 3], 'b': [2, 4, 6]}, 'base_actions': [['a', 'b', 0], ['a', 'b', 0.5]],
-            'centre': 'b', 'search_scale': {'Gain': 1, 'Hip': 2}, 'start': {},
+            'action_offset': 'b', 'search_scale': {'Gain': 1, 'Hip': 2}, 'start': {},
         }  # fmt: skip
         gait = parameters.read(good)
         self.assertEqual(gait.names, ('Gain', 'Up.Hip', 'Down.Hip'))
         np.testing.assert_array_equal(gait.base_actions, [[1, 2, 3], [1.5, 3, 4.5]])
-        np.testing.assert_array_equal(gait.centre, [2, 4, 6])
-        np.testing.assert_array_equal(gait.half_range, [1, 2, 3])
+        np.testing.assert_array_equal(gait.action_offset, [2, 4, 6])
+        np.testing.assert_array_equal(gait.action_scale, [1, 2, 3])
         np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
         for message, change in (
             ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),
@@ -220,7 +220,7 @@ class Rig:
     """A character and its gait in a world without a task."""
 
     def __init__(self, name, n=1, batch=False):
-        arena = PlanarTerrain(terrain.load('flat'))
+        arena = PlanarArena(terrain.load('flat'))
         self.character = characters.make(name)
         self.character.create_root_joints(arena.attach(self.character))
         self.gait = controllers.Gait(self.character, arena.ground_body, arena.mjcf_model)
@@ -236,13 +236,13 @@ class Rig:
             self.world = PhysicsWorld(self.physics, dynamics.FIELDS)
         arena.bind(self.world)
         self.gait.bind(self.world)
-        self.rows = np.arange(self.world.n)
-        for row in self.rows:
-            arena.begin_episode(row, terrain.Strip(arena.terrain, 0))
+        self.env_ids = np.arange(self.world.n)
+        for env_id in self.env_ids:
+            arena.begin_episode(env_id, terrain.PlanarGround(arena.terrain, 0))
         self.rules, self.name = self.gait.rules, name
-        self.joints = list(self.character.row.joints)
+        self.joints = list(self.character.spec.joints)
         self.touches(())
-        self.gait.begin(self.rows)
+        self.gait.begin(self.env_ids)
 
     @property
     def positions(self):
@@ -265,32 +265,32 @@ class Rig:
         return rng
 
     def put(self, q, v):
-        self.world.qpos[self.rows[:, None], self.rules.skeleton.qpos] = q
-        self.world.qvel[self.rows[:, None], self.rules.skeleton.dof] = v
-        self.world.forward(self.rows)
+        self.world.qpos[self.env_ids[:, None], self.rules.skeleton.qpos] = q
+        self.world.qvel[self.env_ids[:, None], self.rules.skeleton.dof] = v
+        self.world.forward(self.env_ids)
 
     def touches(self, links):
         """Makes the gait believe in contacts until the next step: names of links, or (n, L) bool."""
-        on = np.isin(self.character.row.links, links) if isinstance(links, tuple) else links
+        on = np.isin(self.character.spec.links, links) if isinstance(links, tuple) else links
         first, sensed = self.rules.machine.contact, self.world.sensordata
         if isinstance(self.world, BatchWorld):
             sensed = sensed.base
         else:
             sensed = self.physics.data.sensordata[None]
-        sensed[:, first : first + len(self.character.row.links)] = on
+        sensed[:, first : first + len(self.character.spec.links)] = on
 
-    def data(self, row=0):
-        """The engine's own view of one row, and the columns of its degrees of freedom."""
-        model = self.world.models[row]
+    def data(self, env_id=0):
+        """The engine's own view of one simulation, and the columns of its degrees of freedom."""
+        model = self.world.models[env_id]
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = self.world.qpos[row], self.world.qvel[row]
+        data.qpos[:], data.qvel[:] = self.world.qpos[env_id], self.world.qvel[env_id]
         mujoco.mj_forward(model, data)
         names = [f'{self.name}/root_{axis}/' for axis in ('x', 'z', 'pitch')]
         names += [f'{self.name}/{joint}' for joint in self.joints]
         return model, data, [model.joint(name).dofadr[0] for name in names]
 
     def set(self, **values):
-        """Parameters by name ('Down.Hip' as Down__Hip) for all rows."""
+        """Parameters by name ('Down.Hip' as Down__Hip) for all simulations."""
         for name, value in values.items():
             place = self.gait.parameters.place(name.replace('__', '.'))
             self.gait.state.vector[:, place] = value
@@ -298,8 +298,8 @@ class Rig:
 
 def enter(rig):
     """Has all machines enter the states that they are in."""
-    for row in rig.rows:
-        machine.enter(row, rig.rules)
+    for env_id in rig.env_ids:
+        machine.enter(env_id, rig.rules)
 
 
 def inertia(model, data, columns):
@@ -332,10 +332,10 @@ def sole(model, data, link, name='dog'):
     return body, data.xpos[body] + data.xmat[body].reshape(3, 3) @ (x, 0, z)
 
 
-def dense_pd(rig, row, off=(), wanted=None):
-    """Stable PD of one row, from the formula, with matrices of the engine."""
-    model, data, columns = rig.data(row)
-    links = rig.character.row.joints.values()
+def dense_pd(rig, env_id, off=(), wanted=None):
+    """Stable PD of one simulation, from the formula, with matrices of the engine."""
+    model, data, columns = rig.data(env_id)
+    links = rig.character.spec.joints.values()
     kp = np.array(
         [0, 0, 0, *(0 if n in off else j.kp for n, j in zip(rig.joints, links, strict=True))]
     )
@@ -345,7 +345,7 @@ def dense_pd(rig, row, off=(), wanted=None):
     full_kd = np.array([0, 0, 0, *(joint.kd for joint in links)])  # stays in the matrix
     q, v = data.qpos[columns], data.qvel[columns]
     target = np.zeros(len(q))
-    target[3:] = rig.gait.state.target[row] if wanted is None else wanted
+    target[3:] = rig.gait.state.target[env_id] if wanted is None else wanted
     for hip in rig.rules.machine.legs[:, 0]:
         dof, name = 3 + hip, rig.joints[hip]
         angle = world_angle(data, model.body(f'{rig.name}/{name}').id)
@@ -366,16 +366,16 @@ class DynamicsTest(parameterized.TestCase):
         rig.scatter(1)
         skeleton, mechanics = rig.rules.skeleton, rig.rules.mechanics
         size = len(skeleton.dof)
-        matrices = np.zeros((len(rig.rows), size, size))
-        for row in rig.rows:
-            dynamics.write_inertia(row, skeleton, mechanics.M, matrices)
-            model, data, columns = rig.data(row)
-            np.testing.assert_allclose(matrices[row], inertia(model, data, columns), atol=1e-10)
-            forces = mechanics.qfrc_bias[row, skeleton.dof]
+        matrices = np.zeros((len(rig.env_ids), size, size))
+        for env_id in rig.env_ids:
+            dynamics.write_inertia(env_id, skeleton, mechanics.M, matrices)
+            model, data, columns = rig.data(env_id)
+            np.testing.assert_allclose(matrices[env_id], inertia(model, data, columns), atol=1e-10)
+            forces = mechanics.qfrc_bias[env_id, skeleton.dof]
             np.testing.assert_allclose(forces, bias(model, data, columns), atol=1e-9)
-            np.testing.assert_array_equal(rig.velocities[row], data.qvel[columns])
-            np.linalg.cholesky(matrices[row])
-        mass = sum(model.body(f'{name}/{link}').mass[0] for link in rig.character.row.links)
+            np.testing.assert_array_equal(rig.velocities[env_id], data.qvel[columns])
+            np.linalg.cholesky(matrices[env_id])
+        mass = sum(model.body(f'{name}/{link}').mass[0] for link in rig.character.spec.links)
         self.assertAlmostEqual(skeleton.mass, mass)
         self.assertAlmostEqual(matrices[0, 0, 0], mass, places=9)
 
@@ -386,31 +386,33 @@ class DynamicsTest(parameterized.TestCase):
         skeleton, mechanics, joints = rig.rules.skeleton, rig.rules.mechanics, len(rig.joints)
         coefficients, constants = dynamics.frame(np.arange(joints), skeleton, rig.world)
         angles = rig.positions @ coefficients.T + constants + rig.positions[:, 3:]
-        for row in rig.rows:
-            model, data, columns = rig.data(row)
+        for env_id in rig.env_ids:
+            model, data, columns = rig.data(env_id)
             root = model.body(f'{name}/root').id
             mujoco.mj_subtreeVel(model, data)
-            speed = dynamics.com_speed(row, skeleton, mechanics.M, rig.world.qvel)
+            speed = dynamics.com_speed(env_id, skeleton, mechanics.M, rig.world.qvel)
             self.assertAlmostEqual(speed, data.subtree_linvel[root, 0], places=9)
             for joint, link in enumerate(rig.joints):
                 angle = world_angle(data, model.body(f'{name}/{link}').id)
-                self.assertAlmostEqual(np.cos(angles[row, joint] - angle), 1.0, places=9, msg=link)
-                self.assertLess(abs(np.sin(angles[row, joint] - angle)), 1e-9)
+                self.assertAlmostEqual(
+                    np.cos(angles[env_id, joint] - angle), 1.0, places=9, msg=link
+                )
+                self.assertLess(abs(np.sin(angles[env_id, joint] - angle)), 1e-9)
             for leg, hip in enumerate(rig.rules.machine.legs[:, 0]):
                 found = machine.hip_angle(
-                    row, leg, rig.rules.machine, skeleton, rig.world.qpos
+                    env_id, leg, rig.rules.machine, skeleton, rig.world.qpos
                 )  # fmt: skip
-                own = rig.positions[row, 3 + hip]
-                self.assertAlmostEqual(found + own, angles[row, hip], places=12)
-            for link in rng.choice(rig.character.row.links, 6, replace=False):
-                body, found = model.body(f'{name}/{link}').id, np.ones((row + 1, 5, 3 + joints))
+                own = rig.positions[env_id, 3 + hip]
+                self.assertAlmostEqual(found + own, angles[env_id, hip], places=12)
+            for link in rng.choice(rig.character.spec.links, 6, replace=False):
+                body, found = model.body(f'{name}/{link}').id, np.ones((env_id + 1, 5, 3 + joints))
                 point = data.xipos[body] + rng.uniform(-0.2, 0.2, 3)
                 dynamics.write_jacobian(
-                    row, body, point[0], point[2], 2, skeleton, mechanics.xanchor, found
+                    env_id, body, point[0], point[2], 2, skeleton, mechanics.xanchor, found
                 )
                 expected = jacobian(model, data, columns, body, point)
-                np.testing.assert_allclose(found[row, 2:4], expected, atol=1e-10, err_msg=link)
-                np.testing.assert_array_equal(found[row, [0, 1, 4]], 1.0)
+                np.testing.assert_allclose(found[env_id, 2:4], expected, atol=1e-10, err_msg=link)
+                np.testing.assert_array_equal(found[env_id, [0, 1, 4]], 1.0)
 
     @parameterized.parameters(*NAMES)
     def test_gravity(self, name):
@@ -420,11 +422,11 @@ class DynamicsTest(parameterized.TestCase):
         kinds = world.models[0].jnt_type[skeleton.joint]
         slides = (kinds != mujoco.mjtJoint.mjJNT_HINGE) & (np.arange(len(kinds)) >= 3)
         self.assertEqual(int(slides.sum()), int(name == 'hopper'))
-        for row in rig.rows:
-            _, data, columns = rig.data(row)
+        for env_id in rig.env_ids:
+            _, data, columns = rig.data(env_id)
             at_rest = -data.qfrc_bias[columns]
             for k in np.flatnonzero(~slides).tolist():  # of slides of joints: no
-                found = dynamics.weight(row, k, skeleton, world.subtree_com, world.xanchor)
+                found = dynamics.weight(env_id, k, skeleton, world.subtree_com, world.xanchor)
                 self.assertAlmostEqual(found, at_rest[k], delta=1e-9)
 
     def test_solve(self):
@@ -448,11 +450,11 @@ class DynamicsTest(parameterized.TestCase):
         rig.scatter(4)
         gait, feet = rig.gait, rig.gait.parameters.feet
         rig.touches(feet)
-        gait.state.number[:] = rig.rows % 4
+        gait.state.number[:] = rig.env_ids % 4
         enter(rig)
-        together = gait.torques(rig.rows)
-        for rows in ([0], [1, 3], [2], [4]):
-            np.testing.assert_array_equal(gait.torques(np.array(rows)), together[rows])
+        together = gait.torques(rig.env_ids)
+        for env_ids in ([0], [1, 3], [2], [4]):
+            np.testing.assert_array_equal(gait.torques(np.array(env_ids)), together[env_ids])
 
 
 class LawTest(parameterized.TestCase):
@@ -466,13 +468,13 @@ class LawTest(parameterized.TestCase):
         targets, torque = gait.state.target, rig.rules.scratch.torque
         targets[...] = rng.uniform(-4, 4, targets.shape)
         count = len(rig.joints)
-        for row in rig.rows:
-            machine.stable_pd(row, count, rig.rules)
-            np.testing.assert_allclose(torque[row], dense_pd(rig, row), rtol=1e-8, atol=1e-7)
-            machine.stable_pd(row, count - 1, rig.rules)
-            expected = dense_pd(rig, row, off=(rig.joints[-1],))
-            np.testing.assert_allclose(torque[row], expected, rtol=1e-8, atol=1e-7)
-            self.assertEqual(torque[row, -1], 0.0)
+        for env_id in rig.env_ids:
+            machine.stable_pd(env_id, count, rig.rules)
+            np.testing.assert_allclose(torque[env_id], dense_pd(rig, env_id), rtol=1e-8, atol=1e-7)
+            machine.stable_pd(env_id, count - 1, rig.rules)
+            expected = dense_pd(rig, env_id, off=(rig.joints[-1],))
+            np.testing.assert_allclose(torque[env_id], expected, rtol=1e-8, atol=1e-7)
+            self.assertEqual(torque[env_id, -1], 0.0)
 
     def test_world_angles_are_wrapped(self):
         rig = Rig('raptor')
@@ -495,11 +497,11 @@ class LawTest(parameterized.TestCase):
         rig = Rig(name)
         gait, figures = rig.gait, controllers.load(name)
         vector = np.random.default_rng(0).uniform(-2, 2, len(figures.names))
-        gait.apply(rig.rows, vector[None])
+        gait.apply(rig.env_ids, vector[None])
         vector = np.where(np.isin(figures.names, ABSOLUTE[name]), np.abs(vector), vector)
         np.testing.assert_array_equal(gait.state.vector[0], vector)
         value = lambda parameter: vector[figures.names.index(parameter)]  # noqa: E731
-        files = {joint: each.target for joint, each in rig.character.row.joints.items()}
+        files = {joint: each.target for joint, each in rig.character.spec.joints.items()}
         for number, state in enumerate(figures.states):
             gait.state.number[:] = number
             enter(rig)
@@ -544,7 +546,7 @@ class LawTest(parameterized.TestCase):
         rig.set(**{f'{name_of}__RootPitch': 0.4, f'{name_of}__SwingHip': 0.6})
         enter(rig)
         rig.touches((f'{stance_leg}_{foot}',) if loaded else (f'{swing_leg}_{foot}', 'root'))
-        found = gait.torques(rig.rows)[0]
+        found = gait.torques(rig.env_ids)[0]
 
         model, data, columns = rig.data()
         mujoco.mj_subtreeVel(model, data)
@@ -577,7 +579,7 @@ class LawTest(parameterized.TestCase):
         gait.state.number[:] = state
         enter(rig)
         rig.touches(('knee', *feet))
-        found = gait.torques(rig.rows)[0]
+        found = gait.torques(rig.env_ids)[0]
 
         model, data, columns = rig.data()
         mujoco.mj_subtreeVel(model, data)
@@ -627,7 +629,7 @@ class LawTest(parameterized.TestCase):
         rig.set(**{f'{STATES["hopper"][state]}__Knee': rig.positions[0, 4]})
         enter(rig)
         rig.touches(('leg',) if landed else ('root', 'hip'))
-        found = gait.torques(rig.rows)[0]
+        found = gait.torques(rig.env_ids)[0]
         self.assertLess(abs(found[1]), 179.0)  # the leg's limit hides nothing
         model, data, columns = rig.data()
         pitch, rate = data.qpos[columns[2]], data.qvel[columns[2]]
@@ -645,15 +647,16 @@ class LawTest(parameterized.TestCase):
         rig = Rig(name, 40, batch=True)
         rng = rig.scatter(9, speed=30.0)
         gait, limits = rig.gait, rig.character.torque_limits
-        spread = np.maximum(5 * np.abs(gait.parameters.half_range), 3.0)
+        spread = np.maximum(5 * np.abs(gait.parameters.action_scale), 3.0)
         gait.apply(
-            rig.rows, gait.parameters.centre + rng.normal(size=gait.state.vector.shape) * spread
+            rig.env_ids,
+            gait.parameters.action_offset + rng.normal(size=gait.state.vector.shape) * spread,
         )
-        gait.state.number[:] = rig.rows % 4
+        gait.state.number[:] = rig.env_ids % 4
         enter(rig)
-        touching = rng.random((40, len(rig.character.row.links))) < 0.5
+        touching = rng.random((40, len(rig.character.spec.links))) < 0.5
         rig.touches(touching)
-        torques = gait.torques(rig.rows)
+        torques = gait.torques(rig.env_ids)
         self.assertTrue((np.abs(torques) <= limits).all())
         self.assertTrue((np.abs(torques) == limits).any())
         self.assertTrue((np.abs(torques) < limits).any())
@@ -668,7 +671,7 @@ class MachineTest(parameterized.TestCase):
         gait.state.number[:], gait.state.phase[:] = state, phase
         enter(rig)
         rig.touches(links)
-        (ended,) = gait.advance(rig.rows)
+        (ended,) = gait.advance(rig.env_ids)
         return int(gait.state.number[0]), bool(ended)
 
     def test_bound(self):
@@ -705,11 +708,11 @@ class MachineTest(parameterized.TestCase):
             rig = Rig(name)
             steps = 0
             while rig.gait.state.number[0] == 0:
-                rig.gait.advance(rig.rows)
+                rig.gait.advance(rig.env_ids)
                 steps += 1
             self.assertAlmostEqual(steps * DT, duration, delta=1.01 * DT)
             self.assertEqual(rig.gait.state.phase[0], 0.0)
-            rig.gait.advance(rig.rows)
+            rig.gait.advance(rig.env_ids)
             self.assertAlmostEqual(rig.gait.state.phase[0], 0.0 if name == 'dog' else DT / duration,
                                    delta=DT / duration)  # fmt: skip
 
@@ -719,7 +722,7 @@ class MachineTest(parameterized.TestCase):
         gait.state.number[:], gait.state.phase[:], gait.state.stance[:] = 3, 0.4, 1
         vector = gait.parameters.base_actions[2:3].copy()
         vector[0, :3] *= -1
-        gait.apply(rig.rows, vector)
+        gait.apply(rig.env_ids, vector)
         self.assertEqual(
             (gait.state.number[0], gait.state.phase[0], gait.state.stance[0]), (0, 0.0, 1)
         )
@@ -771,15 +774,15 @@ class MachineTest(parameterized.TestCase):
     def test_hop_begins_in_the_air_and_goes_on_at_touch_down(self):
         rig = Rig('hopper')
         gait = rig.gait
-        gait.apply(rig.rows, gait.parameters.base_actions[3:4])
+        gait.apply(rig.env_ids, gait.parameters.base_actions[3:4])
         self.assertEqual(gait.state.number[0], 0)  # the first action: still in descent
         np.testing.assert_array_equal(gait.state.vector, gait.parameters.base_actions[3:4])
         self.assertEqual(self.leave(rig, 0, ('leg',)), (0, True))
-        gait.apply(rig.rows, gait.parameters.base_actions[4:5])
+        gait.apply(rig.env_ids, gait.parameters.base_actions[4:5])
         self.assertEqual(gait.state.number[0], 1)
         self.assertEqual(gait.state.target[0, 0], gait.parameters.base_actions[4, 3])
-        gait.begin(rig.rows)
-        gait.apply(rig.rows, gait.parameters.base_actions[3:4])
+        gait.begin(rig.env_ids)
+        gait.apply(rig.env_ids, gait.parameters.base_actions[3:4])
         self.assertEqual(gait.state.number[0], 0)
 
     @parameterized.parameters(*NAMES)
@@ -788,15 +791,15 @@ class MachineTest(parameterized.TestCase):
         start(rig)
         run(rig, 100)
         saved = [array.copy() for array in rig.gait.state]
-        worlds = [rig.world.get_state(row) for row in rig.rows]
+        worlds = [rig.world.get_state(env_id) for env_id in rig.env_ids]
         expected = run(rig, 300)
         other = Rig(name, 2, batch=True)
         start(other)
         run(other, 37)
         for array, values in zip(other.gait.state, saved, strict=True):
             array[...] = values
-        for row, world in enumerate(worlds):
-            other.world.set_state(row, world)
+        for env_id, world in enumerate(worlds):
+            other.world.set_state(env_id, world)
         np.testing.assert_array_equal(run(other, 300), expected)
 
 
@@ -810,18 +813,18 @@ def start(rig):
         dof = 3 + rig.gait.number[name]
         q[:, dof], v[:, dof] = angle, rate
     rig.put(q, v)
-    rig.gait.begin(rig.rows)
+    rig.gait.begin(rig.env_ids)
 
 
 def run(rig, steps):
     """Default gait; returns all positions."""
     gait, found = rig.gait, []
     for _ in range(steps):
-        rig.world.ctrl[:] = gait.torques(rig.rows)
+        rig.world.ctrl[:] = gait.torques(rig.env_ids)
         rig.world.step(2)
-        ended = np.flatnonzero(gait.advance(rig.rows))
+        ended = np.flatnonzero(gait.advance(rig.env_ids))
         if len(ended):
-            gait.apply(ended, np.tile(gait.parameters.centre, (len(ended), 1)))
+            gait.apply(ended, np.tile(gait.parameters.action_offset, (len(ended), 1)))
         found.append(rig.world.qpos.copy())
     return np.array(found)
 
@@ -839,7 +842,7 @@ class AloneTest(parameterized.TestCase):
         for joint in dog.joints:
             joint.damping = joint.armature = 0
         physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-        world, rows = PhysicsWorld(physics, dynamics.FIELDS), np.arange(1)
+        world, env_ids = PhysicsWorld(physics, dynamics.FIELDS), np.arange(1)
         gait.bind(world)
         begin, skeleton = gait.parameters.start, gait.rules.skeleton
         places, rates = skeleton.qpos, skeleton.dof
@@ -848,15 +851,15 @@ class AloneTest(parameterized.TestCase):
         for name, (angle, rate) in begin['joints'].items():
             dof = 3 + gait.number[name]
             world.qpos[0, places[dof]], world.qvel[0, rates[dof]] = angle, rate
-        world.forward(rows)
-        gait.begin(rows)
+        world.forward(env_ids)
+        gait.begin(env_ids)
         cycles, down = 0, 0
-        trunk = [gait.link[name] for name in dog.row.fall_links]
+        trunk = [gait.link[name] for name in dog.spec.fall_links]
         for _ in range(3 * 600):
-            world.ctrl[0] = gait.torques(rows)[0]
+            world.ctrl[0] = gait.torques(env_ids)[0]
             world.step(2)
-            if gait.advance(rows)[0]:
-                gait.apply(rows, gait.parameters.centre[None])
+            if gait.advance(env_ids)[0]:
+                gait.apply(env_ids, gait.parameters.action_offset[None])
                 cycles += 1
             down += (world.sensordata[0, gait.rules.machine.contact + np.array(trunk)] > 0).any()
         self.assertBetween(cycles, 5, 9)

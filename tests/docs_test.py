@@ -6,8 +6,9 @@ import re
 
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, describe, suite
+from trl_suite import describe, suite
 from trl_suite.describe import options
+from trl_suite.registry import build, catalogue
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -59,7 +60,7 @@ class PagesTest(absltest.TestCase):
 
     def test_numbers_in_the_readme(self):
         text = (ROOT / 'README.md').read_text(encoding='utf-8')
-        self.assertIn(f'{len(catalogue.ROWS)} environments', text)
+        self.assertIn(f'{len(catalogue.SPECS)} environments', text)
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of them are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
@@ -71,31 +72,31 @@ class WordsTest(parameterized.TestCase):
     )
     def test_what_is_built_on_other_ground_is_told_the_same(self, id_):
         """Pages of environments that differ by their ground share what was built."""
-        row = suite.find(id_)
+        spec = suite.find(id_)
         other = next(
-            each for each in catalogue.ROWS
-            if each.terrain != row.terrain and each.options == row.options
-            and (each.rules, each.character, each.clip) == (row.rules, row.character, row.clip)
+            each for each in catalogue.SPECS
+            if each.terrain != spec.terrain and each.options == spec.options
+            and (each.task_type, each.character, each.clip) == (spec.task_type, spec.character, spec.clip)
         )  # fmt: skip
-        own, shared = (suite.build_row(each, {}, {}) for each in (row, other))
-        self.assertEqual(list(describe.sections(row, own)), list(describe.sections(row, shared)))
+        own, shared = (suite.build_environment(each, {}, {}) for each in (spec, other))
+        self.assertEqual(list(describe.sections(spec, own)), list(describe.sections(spec, shared)))
 
     @parameterized.parameters(
-        ('journey', '1 to 3 m ahead of the walker along x'), ('hike', 'up to 3 m from the walker'),
+        ('direct_navigation', '1 to 3 m ahead of the walker along x'), ('goal_navigation', 'up to 3 m from the walker'),
     )  # fmt: skip
     def test_goals_of_open_ground(self, task, words):
-        row = suite.combine('biped3d_mocap', terrain='plane', task=task)
-        told = dict(describe.sections(row, suite.build_row(row, {}, {})))
+        spec = suite.combine('biped3d_mocap', terrain='plane', task=task)
+        told = dict(describe.sections(spec, suite.build_environment(spec, {}, {})))
         self.assertIn(words, told['Goal'])
         self.assertIn('at the origin', told['Start'])
 
     def test_every_option_is_explained(self):
-        known = {name for row in catalogue.ROWS for name in suite.task_options(row)}
-        known |= set(suite.task_options(suite.combine('dog', task='walk')))
-        self.assertEqual(known - {'interface'}, set(options.MEANINGS))
-        row = suite.find('PD_Biped3D_HLC_Forest-v0')
-        table = options.options(row, suite.task_options(row)).parts[0]
-        meanings = {name: (default, meaning) for name, default, meaning in table.cells}
+        for spec in (*catalogue.SPECS, suite.combine('dog', task='walk')):
+            for option in build.task_options(spec):
+                self.assertNotEmpty(option.meaning, f'{option.name} of {spec.id}')
+        spec = suite.find('PD_Biped3D_HLC_Forest-v0')
+        table = options.options(spec).parts[0]
+        meanings = {name: (default, meaning) for name, default, _, meaning in table.cells}
         self.assertIn('frame', meanings['interface'][1])
         self.assertEqual(meanings['step_limit'][0], 400)
 

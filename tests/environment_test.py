@@ -1,4 +1,4 @@
-"""Tests of trl_suite.environment, over every environment of the catalogue."""
+"""Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
 import dm_env
 import numpy as np
@@ -9,9 +9,9 @@ from dm_env import test_utils
 from helpers import links_on_ground
 
 from trl_suite import characters, motion, suite, terrain
-from trl_suite.arenas import PlanarTerrain
-from trl_suite.environment import Environment
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.arenas import PlanarArena
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.imitation.planar import PlanarImitation
 
 # Links and joints of each figure; muscles where it has any.
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
@@ -53,12 +53,12 @@ EXAMPLES = (
 
 def is_gait(id_):
     """Whether a step lasts a whole cycle, some 300 control steps."""
-    return suite.find(id_).rules == 'gait'
+    return suite.find(id_).task_type == 'gait'
 
 
 def is_high(id_):
     """Whether a step lasts a whole footstep, up to 15 control steps."""
-    return suite.find(id_).rules in ('hike', 'soccer')
+    return suite.find(id_).task_type in ('goal_navigation', 'soccer')
 
 
 # Steps of 1/30 s.
@@ -81,7 +81,7 @@ def expected_blocks(id_):
         if ground in ('DynamicsObstacles', 'Conveyors', 'Conveyors_Wide'):
             sizes = {'surface': 2048}
         ball = {'ball': 9} if ground == 'Soccer' else {}
-        return sizes | {'pose': 57, 'velocity': 48, 'target': 2} | ball
+        return sizes | {'pose': 57, 'velocity': 48, 'goal': 2} | ball
     if figure == 'Biped3D':
         links = 16 if 'FULL' in id_ else 8
         sizes = {'terrain': 1024} if '_Terrain-' in id_ else {}
@@ -94,10 +94,10 @@ def expected_blocks(id_):
             )
         if '_Imitate' in id_ and 'FULL' not in id_:
             track = 'Track' in id_
-            return sizes | ({'target': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
+            return sizes | ({'reference': 6 * links + 1} if track else {'phase': 5}) | {'goal': 2}
         mirrored = 'Symetric' in id_
         return sizes | {'phase': 3 if mirrored else 5, 'contact': 2, 'plan': 7 if mirrored else 13}
-    if suite.find(id_).rules == 'footsteps2d':
+    if suite.find(id_).task_type == 'planar_footsteps':
         return {'pose': 25, 'velocity': 24, 'phase': 5, 'contact': 2, 'plan': 13}
     if is_gait(id_):
         links = GAIT_LINKS[figure]
@@ -107,7 +107,7 @@ def expected_blocks(id_):
     sizes |= {'pose': 2 * links + 1, 'velocity': 2 * links}
     if id_.startswith('MTU'):
         sizes['strain'] = units
-    return sizes | ({'target': 4 * links + 1} if 'LLC' in id_ else {'phase': 5})
+    return sizes | ({'reference': 4 * links + 1} if 'LLC' in id_ else {'phase': 5})
 
 
 def random_actions(environment, steps, seed=0):
@@ -267,7 +267,8 @@ def every_row(id_):
                     with (
                         self.subTest(str(options)),
                         self.assertRaisesRegex(
-                            RuntimeError, 'trl_suite.environment.Environment, not.*composer'
+                            RuntimeError,
+                            'trl_suite.environments.environment.Environment, not.*composer',
                         ),
                     ):
                         environment.step(np.zeros(len(task.action_map)))
@@ -407,7 +408,7 @@ class EpisodeTest(parameterized.TestCase):
         self.assertTrue(environment.info['fell'])
         self.assertFalse(environment.info['diverged'])
         self.assertEqual(set(environment.info['reward_terms'].values()), {0.0})
-        fall_links = environment.task.character.row.fall_links
+        fall_links = environment.task.character.spec.fall_links
         self.assertNotEmpty(links_on_ground(environment) & set(fall_links))
         step = environment.step(action)
         self.assertTrue(step.first())
@@ -516,8 +517,8 @@ class ObservableTest(parameterized.TestCase):
     """A user's own observables beside the blocks."""
 
     def build(self, **options):
-        row = suite.find('PD_Dog2D_Gaps_Terrain-v0')
-        task = suite.build_task(row)
+        spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
+        task = suite.build_task(spec)
         observables = task.character.observables
         for name in ('joints_pos', 'bodies_pos', 'root_pos'):
             getattr(observables, name).enabled = True
@@ -570,15 +571,15 @@ class ObservableTest(parameterized.TestCase):
 class HookTest(parameterized.TestCase):
     """Substeps run in C: hooks between them are refused, not forgotten."""
 
-    def task(self, cls=Imitation):
+    def task(self, cls=PlanarImitation):
         return cls(
-            characters.make('biped2d'), PlanarTerrain(terrain.load('flat')),
+            characters.make('biped2d'), PlanarArena(terrain.load('flat')),
             motion.load('biped2d_walk'),
         )  # fmt: skip
 
     @parameterized.parameters('before_substep', 'after_substep')
     def test_refused(self, hook):
-        hooked = type('Hooked', (Imitation,), {hook: lambda self, *_: None})
+        hooked = type('Hooked', (PlanarImitation,), {hook: lambda self, *_: None})
         with self.assertRaisesRegex(ValueError, f'{hook} hook.*composer.Environment'):
             Environment(self.task(hooked))
         environment = Environment(self.task())

@@ -69,10 +69,10 @@ class EvaluateTest(parameterized.TestCase):
 
     def test_gaits(self):
         """Rows whose steps last differently."""
-        row = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
-        found = evaluation.evaluate(row, evaluation.zero, 3, 5, factory=True)
+        spec = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
+        found = evaluation.evaluate(spec, evaluation.zero, 3, 5, factory=True)
         returns, lengths, distances, fell, _ = alone(
-            row.id, found['seeds'], lambda environment, _: np.zeros(28), step_limit=12
+            spec.id, found['seeds'], lambda environment, _: np.zeros(28), step_limit=12
         )
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
         self.assertEqual((found['distances'], found['fell']), (distances, fell))
@@ -95,27 +95,29 @@ class EvaluateTest(parameterized.TestCase):
 
     def test_doing_nothing_falls_early(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 10, factory=True)
-        self.assertEqual((found['falls'], found['full'], found['diverged']), (1, 0, 0))
+        self.assertEqual((found['falls'], found['completion_rate'], found['diverged']), (1, 0, 0))
         self.assertEqual(found['fell'], [True] * 10)
         self.assertLess(max(found['lengths']), 128)
-        self.assertLess(found['fraction'], 0.3)
-        self.assertGreater(found['fraction'], 0)
+        self.assertLess(found['normalized_return'], 0.3)
+        self.assertGreater(found['normalized_return'], 0)
 
     def test_episodes_that_are_cut(self):
         # A step limit that all reach: the rewards of three steps and no fall.
-        row = dataclasses.replace(suite.find(GAPS), step_limit=3)
-        found = evaluation.evaluate(row, make(GAPS), 4)
-        self.assertEqual((found['full'], found['falls'], found['lengths']), (1, 0, [3] * 4))
+        spec = dataclasses.replace(suite.find(GAPS), step_limit=3)
+        found = evaluation.evaluate(spec, make(GAPS), 4)
+        self.assertEqual(
+            (found['completion_rate'], found['falls'], found['lengths']), (1, 0, [3] * 4)
+        )
         self.assertEqual(found['step_limit'], 3)
-        self.assertEqual(found['fraction'], found['return'] / 3)
-        self.assertGreater(found['fraction'], 0.3)
+        self.assertEqual(found['normalized_return'], found['return'] / 3)
+        self.assertGreater(found['normalized_return'], 0.3)
 
     def test_a_fall_in_the_last_step_is_not_full_length(self):
         found = evaluation.evaluate(FLAT, evaluation.zero, 3, factory=True)
-        row = dataclasses.replace(suite.find(FLAT), step_limit=found['lengths'][0])
-        again = evaluation.evaluate(row, evaluation.zero, 1, factory=True)
+        spec = dataclasses.replace(suite.find(FLAT), step_limit=found['lengths'][0])
+        again = evaluation.evaluate(spec, evaluation.zero, 1, factory=True)
         self.assertEqual((again['lengths'], again['fell']), (found['lengths'][:1], [True]))
-        self.assertEqual(again['full'], 0)
+        self.assertEqual(again['completion_rate'], 0)
 
     def test_summary(self):
         found = evaluation.evaluate('plaid/biped_gaps', make(GAPS), 5, 3)
@@ -125,7 +127,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertAlmostEqual(found['return'], returns.mean())
         deviation = np.sqrt(((returns - returns.mean()) ** 2).sum() / 4)
         self.assertAlmostEqual(found['return_interval'], 1.96 * deviation / np.sqrt(5))
-        self.assertAlmostEqual(found['fraction'], returns.mean() / 256)
+        self.assertAlmostEqual(found['normalized_return'], returns.mean() / 256)
         for one, many in (('length', 'lengths'), ('distance', 'distances'), ('falls', 'fell')):
             self.assertAlmostEqual(found[one], np.mean(found[many]))
         for name in LISTS:
@@ -144,7 +146,7 @@ class EvaluateTest(parameterized.TestCase):
     def test_options_of_the_task(self):
         blind = 'PD_Biped2D_Flat-v0'
         expected = evaluation.evaluate(blind, make(blind), 2)
-        found = evaluation.evaluate(FLAT, make(blind), 2, task_kwargs={'terrain_samples': 0})
+        found = evaluation.evaluate(FLAT, make(blind), 2, task_kwargs={'terrain_observation': 0})
         self.assertEqual(found['returns'], expected['returns'])
 
     def test_refuses(self):

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, characters, policies
+from trl_suite import characters, policies
+from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import compare_transfer
 import evaluate_plans
-import guide
+import expert
 import ppo
 import ppo_settings
 import train_all
@@ -22,7 +23,7 @@ import train_all
 class JobsTest(parameterized.TestCase):
     def test_every_environment_is_trained_but_for_most_gaits(self):
         ids = {id_ for id_, _ in train_all.jobs('*')}
-        gaits = {id_ for id_, row in catalogue.BY_ID.items() if row.rules == 'gait'}
+        gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.task_type == 'gait'}
         self.assertEqual(ids, set(catalogue.BY_ID) - gaits | set(train_all.GAITS))
 
     def test_actuation_models_are_compared_with_three_seeds(self):
@@ -45,8 +46,8 @@ class JobsTest(parameterized.TestCase):
             start = ppo_settings.settings_for(id_).start
             if start in catalogue.BY_ID:
                 own, other = (
-                    (list(characters.CHARACTERS[row.character].joints), row.actuation)
-                    for row in (catalogue.BY_ID[id_], catalogue.BY_ID[start])
+                    (list(characters.CHARACTERS[spec.character].joints), spec.actuation)
+                    for spec in (catalogue.BY_ID[id_], catalogue.BY_ID[start])
                 )
                 self.assertEqual(own, other, id_)
 
@@ -95,12 +96,12 @@ class TrimTest(absltest.TestCase):
 
 class TransferTest(parameterized.TestCase):
     def test_flat_ground_of_every_row(self):
-        for row in catalogue.ROWS:
-            if row.domain == 'plaid':
-                flat = catalogue.BY_ID[compare_transfer.flat_ground(row)]
+        for spec in catalogue.SPECS:
+            if spec.domain == 'plaid':
+                flat = catalogue.BY_ID[compare_transfer.flat_ground(spec)]
                 self.assertEqual(
                     (flat.terrain, flat.character, dict(flat.options)),
-                    ('flat', row.character, dict(row.options)),
+                    ('flat', spec.character, dict(spec.options)),
                 )
 
 
@@ -147,21 +148,21 @@ class GuideTest(parameterized.TestCase):
             ((2.1, 0.5), (1.0, 0.0), 1.0, (1.5, 0.0)),  # back
             ((1.5, 0.0), (1.7, 0.0), 1.0, (1.7, 0.0)),  # no farther than the goal
         ):
-            aim = guide.on_trail(trail, np.array(place), np.array(goal), ahead)
+            aim = expert.on_trail(trail, np.array(place), np.array(goal), ahead)
             np.testing.assert_allclose(aim + place, expected, atol=1e-9)
 
     def test_a_way_on_a_map(self):
-        map_ = guide.Map()
+        map_ = expert.Map()
         x, y = map_.places.T
         np.testing.assert_allclose(map_.places[map_.middle], 0)
-        self.assertEqual(np.abs(map_.places[map_.rim]).max(1).min(), guide.REACH)
+        self.assertEqual(np.abs(map_.places[map_.rim]).max(1).min(), expert.REACH)
         even = np.ones(len(x))
         for goal in ((3.0, 0.0), (0.0, -4.0), (-20.0, 0.0), (9.0, 4.0)):  # there is nothing
             aim = map_.aim(even, np.array(goal))
             np.testing.assert_allclose(aim, goal)
         # A wall ahead that reaches farther to the right than to the left.
         wall = (np.abs(x - 1) < 0.2) & (y < 1) & (y > -4)
-        aim = map_.aim(even + guide.WALL * wall, np.array([3.0, 0.0]))
+        aim = map_.aim(even + expert.WALL * wall, np.array([3.0, 0.0]))
         self.assertGreater(aim[1], 0.6)
         self.assertLess(np.linalg.norm(aim), 2.0)
 
@@ -171,24 +172,26 @@ class GuideTest(parameterized.TestCase):
         ('PD_Biped2D_Flat-v0', {}),
     )
     def test_ways_that_it_does_not_know(self, id_, options):
-        rows = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
-        with self.assertRaisesRegex(ValueError, 'the guide knows no way for the task'):
-            guide.guide(rows)
+        environments = VectorEnvironment(id_, 1, 1, seed=0, task_kwargs=options)
+        with self.assertRaisesRegex(ValueError, 'the expert knows no way for the task'):
+            expert.expert(environments)
 
     @parameterized.parameters('PathFollowing', 'LargeBlocks', 'DynamicsObstacles')
     def test_it_arrives_where_it_is_dangerous(self, name):
         """20 s of 8 episodes, towards goals at the least speed that is asked of who has learnt it."""
-        rows = VectorEnvironment(f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled')
-        policy, observation = guide.guide(rows), rows.reset()
+        environments = VectorEnvironment(
+            f'PD_Biped3D_HLC_{name}-v0', 8, 0, seed=3, autoreset='disabled'
+        )
+        policy, observation = expert.expert(environments), environments.reset()
         fell, speed = 0, np.zeros(8)
         for _ in range(40):
             action = policy(observation)
             self.assertEqual(action.shape, (8, 5))
-            step = rows.step(action)
+            step = environments.step(action)
             ended = step.terminated | step.truncated
             fell += ended.sum()
             speed += step.info['speed'] / 40
-            observation = rows.reset(ended) if ended.any() else step.observation
+            observation = environments.reset(ended) if ended.any() else step.observation
         self.assertLessEqual(fell, 1)
         self.assertGreater(speed.mean(), 0.6)
 

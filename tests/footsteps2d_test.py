@@ -7,8 +7,8 @@ from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_single
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
-from trl_suite.tasks import rewards
-from trl_suite.tasks.plans import StraightPlans
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.plans import StraightPlans
 from trl_suite.vector import VectorEnvironment
 
 ID = 'PD_Biped2D_LLC_Flat_Step-v0'
@@ -36,9 +36,9 @@ def held(environment):
 
 def walked(n, switches, **options):
     """Landing places of n walkers whose clocks run, before and after each switch of stance."""
-    rows = VectorEnvironment(ID, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
-    rows.reset()
-    task, found = rows._task, []
+    environments = VectorEnvironment(ID, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
+    environments.reset()
+    task, found = environments._task, []
     while len(found) < switches:
         before = task.plan.landing.copy()
         task.finish_step(np.arange(n))  # the physics stands still
@@ -172,7 +172,7 @@ class PlanTest(parameterized.TestCase):
     def test_places_lie_on_the_ground(self, preset):
         environment = suite.build(
             'biped2d_full', terrain=preset, task='footsteps',
-            task_kwargs={'random': 3, 'plans': {'length': (0.6, 0.7)}, 'terrain_samples': 50},
+            task_kwargs={'random': 3, 'plans': {'length': (0.6, 0.7)}, 'terrain_observation': 50},
         )  # fmt: skip
         task = environment.task
         self.assertEqual(environment.observation_spec()['terrain'].shape, (50,))
@@ -302,8 +302,8 @@ class LandingTest(parameterized.TestCase):
         self.assertEqual(environment.info['landing_error'], error)  # stays until the next one
 
     @parameterized.parameters((0.01, True), (50.0, False), (None, False))
-    def test_a_miss(self, miss, ends):
-        environment, _ = started(start_phase=0.3, miss=miss)
+    def test_a_miss(self, max_landing_error, ends):
+        environment, _ = started(start_phase=0.3, max_landing_error=max_landing_error)
         for i in range(1, 7):
             step = environment.step(environment.task.clip_action(0))
             self.assertEqual(step.last(), ends and i == 6)
@@ -317,7 +317,7 @@ class LandingTest(parameterized.TestCase):
             self.assertEqual(environment.info['landing_error'], 0)
 
     def test_what_breaks_down_lands_nowhere(self):
-        environment, _ = started(start_phase=0.4, miss=5.0)
+        environment, _ = started(start_phase=0.4, max_landing_error=5.0)
         for _ in range(2):
             kept = environment.step(ZERO).observation
         environment.physics.data.qpos[environment.task.figure.pose_qpos[0]] = np.nan
@@ -333,7 +333,7 @@ class LandingTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """Seeds decide; state and pickles go on bit for bit; many rows are single ones."""
+    """Seeds decide; state and pickles go on bit for bit; many simulations are single ones."""
 
     def advance(self, environment, seed):
         task = environment.task
@@ -342,7 +342,7 @@ class SaveTest(parameterized.TestCase):
             lambda _: (task.plan.landing_error, task.plan.landing[0].ravel(), task.reference_pose(0)),
         )  # fmt: skip
 
-    @parameterized.parameters({}, {'plans': VARIED, 'miss': 0.5})
+    @parameterized.parameters({}, {'plans': VARIED, 'max_landing_error': 0.5})
     def test_goes_on_in_the_middle_of_a_step(self, **options):
         environment, other = (suite.make(ID, {'random': seed, **options}) for seed in (6, 9))
         for each in (environment, other):
@@ -359,7 +359,7 @@ class SaveTest(parameterized.TestCase):
         np.testing.assert_array_equal(first, again)
         self.assertTrue((first != another).any())
 
-    @parameterized.product(n=(1, 2, 5), options=({}, {'plans': VARIED, 'miss': 0.5}))
+    @parameterized.product(n=(1, 2, 5), options=({}, {'plans': VARIED, 'max_landing_error': 0.5}))
     def test_rows_are_single_environments(self, n, options):
         assert_rows_are_singles(ID, n, 45, 19, options, scale=0.2)
 
@@ -407,11 +407,11 @@ class HelperTest(parameterized.TestCase):
         ({'plans': {'change': 1.5}}, 'change is 1.5'),
         ({'plans': {'width': (0.1, 0.2)}}, "unknown option of plans 'width'"),
         ({'plans': 0.5}, 'plans is 0.5; expected StraightPlans'),
-        ({'miss': 0}, 'miss is 0'), ({'miss': np.nan}, 'miss is nan'),
+        ({'max_landing_error': 0}, 'max_landing_error is 0'), ({'max_landing_error': np.nan}, 'max_landing_error is nan'),
         ({'footstep_scale': -1}, 'footstep_scale is -1'),
         ({'footstep_scale': np.inf}, 'footstep_scale is inf'),
-        ({'terrain_samples': 1}, 'terrain_samples is 1'), ({'start_phase': 1}, 'start_phase is 1'),
-        ({'target': True}, "unknown option.*'target'"),
+        ({'terrain_observation': 1}, 'terrain_observation is 1'), ({'start_phase': 1}, 'start_phase is 1'),
+        ({'reference_observation': True}, "unknown option.*'reference_observation'"),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
         with self.assertRaisesRegex(ValueError, message):

@@ -21,14 +21,14 @@ from helpers import (
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite, terrain
-from trl_suite.tasks import rewards
-from trl_suite.tasks.plans import Plans, Pushes
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.plans import Plans, Pushes
 from trl_suite.vector import VectorEnvironment
 
 GENERAL, MIRRORED = 'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Symetric_Step-v0'
 RUN, TRAIL = 'PD_Biped3D_LLC_Run_FootStep-v0', 'PD_Biped3D_LLC_Trail_Step-v0'
 BUMPS, FULL = 'PD_Biped3D_LLC_Bumps_Step-v0', 'PD_Biped3D_FULL_Imitate-Steps-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'footsteps']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'spatial_footsteps']
 SCALES = {'pose': 2, 'velocity': 0.005, 'end_effector': 5, 'com': 10, 'root': 10}
 SIDE = {RIGHT: -1, LEFT: 1}
 
@@ -54,18 +54,18 @@ def walked(n, switches, id_=GENERAL, **options):
       A list over the switches: landing places before and after, headings before and after, stance
       after. The physics stands still.
     """
-    rows = VectorEnvironment(id_, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
-    rows.reset()
-    task, found = rows._task, []
+    environments = VectorEnvironment(id_, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
+    environments.reset()
+    task, found = environments._task, []
     while len(found) < switches:
         before = task.landing.copy(), task.heading.copy()
         everyone = task.world.all_ids
-        task.apply_action(np.zeros((n, len(rows.action_map))), everyone)
+        task.apply_action(np.zeros((n, len(environments.action_map))), everyone)
         task.finish_step(everyone)
         if task.plan.landed.any():
             assert task.plan.landed.all()
             found.append((*before, task.landing.copy(), task.heading.copy(), int(task.stance[0])))
-    return rows, found
+    return environments, found
 
 
 class ClockTest(parameterized.TestCase):
@@ -137,7 +137,7 @@ class ClockTest(parameterized.TestCase):
 
     @parameterized.parameters((GENERAL, 22), (RUN, 22), (FULL, 45))
     def test_actions_of_the_original(self, id_, size):
-        environment, step = started(id_, centre='original')
+        environment, step = started(id_, action_offset='original')
         self.assertEqual(environment.action_spec().shape, (size,))
         self.assertTrue(environment.step(np.zeros(size)).mid())
         self.assertLen(step.observation['plan'], 13)
@@ -167,8 +167,8 @@ class PlanTest(parameterized.TestCase):
         stances = []
         for landing, _, after, heading, stance in found:
             np.testing.assert_array_equal(after[:, 0], landing[:, 1])
-            for row in range(4):
-                way = flattened(heading[row])[:2, :2] @ (after[row, 1] - after[row, 0])[:2]
+            for env_id in range(4):
+                way = flattened(heading[env_id])[:2, :2] @ (after[env_id, 1] - after[env_id, 0])[:2]
                 np.testing.assert_allclose(way, [length, SIDE[stance] * width], atol=1e-9)
             stances.append(stance)
         self.assertEqual(stances, [LEFT, RIGHT] * 6)
@@ -234,8 +234,8 @@ class PlanTest(parameterized.TestCase):
         self.assertGreater(np.ptp(lengths[0]), 0.3)  # drawn anew at every start
 
     def test_plans_made_from_the_root(self):
-        rows, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
-        task = rows._task
+        environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
+        task = environments._task
         measured = task.figure.measure()
         lengths, widths, turns = [], [], []
         for _, _, after, heading, stance in found:
@@ -366,11 +366,11 @@ class GoalTest(parameterized.TestCase):
         self.assertEqual(task.heading[0], before)
 
     def test_the_walk_on_the_trail_goes_on(self):
-        rows, found = walked(20, 4, TRAIL)
-        task = rows._task
-        for row in range(20):
-            spawn = task.travel.origin[row]
-            way = task.goal[row, :2] - spawn[:2]
+        environments, found = walked(20, 4, TRAIL)
+        task = environments._task
+        for env_id in range(20):
+            spawn = task.travel.origin[env_id]
+            way = task.goal[env_id, :2] - spawn[:2]
             # Within the next segments of the trail, which are 2 m long.
             self.assertLess(np.hypot(*way), 9)
         self.assertLen(found, 4)
@@ -574,8 +574,8 @@ class LandingTest(parameterized.TestCase):
             self.assertEqual(environment.info['landing_error'], error)  # stays until the next one
 
     @parameterized.parameters((0.01, True), (50.0, False), (None, False))
-    def test_a_miss(self, miss, ends):
-        environment, _ = started(start_phase=0.3, miss=miss)
+    def test_a_miss(self, max_landing_error, ends):
+        environment, _ = started(start_phase=0.3, max_landing_error=max_landing_error)
         for i in range(1, 7):
             step = environment.step(np.zeros(17))
             self.assertEqual(step.last(), ends and i == 6)  # 0.2 of a cycle later
@@ -590,7 +590,7 @@ class LandingTest(parameterized.TestCase):
 
     @parameterized.parameters({}, {'goal': True}, {'plans': {'from_root': 1.0}})
     def test_what_breaks_down_lands_nowhere(self, **options):
-        environment, _ = started(start_phase=0.4, miss=5.0, **options)
+        environment, _ = started(start_phase=0.4, max_landing_error=5.0, **options)
         for _ in range(2):
             kept = environment.step(np.zeros(17)).observation
         environment.physics.data.qpos[environment.task.figure.pose_qpos[:2]] = np.nan
@@ -611,7 +611,7 @@ class LandingTest(parameterized.TestCase):
     @parameterized.parameters(*IDS)
     def test_a_fall_ends_it(self, id_):
         environment, _ = started(id_)
-        fall = set(environment.task.character.row.fall_links)
+        fall = set(environment.task.character.spec.fall_links)
         size, rng = len(environment.action_map), np.random.default_rng(0)
         for _ in range(300):
             step = environment.step(rng.uniform(-1, 1, size))
@@ -644,9 +644,9 @@ class StartTest(parameterized.TestCase):
             self.assertTrue(environment.step(np.zeros(17)).mid())
 
     def test_phases_are_uniform(self):
-        rows = VectorEnvironment(GENERAL, 400, 1, seed=0)
-        rows.reset()
-        assert_uniform(rows._task.phase, 0, 1)
+        environments = VectorEnvironment(GENERAL, 400, 1, seed=0)
+        environments.reset()
+        assert_uniform(environments._task.phase, 0, 1)
 
     def test_pose_is_that_of_the_straight_step(self):
         steps = motion.load_steps('biped3d_mocap')
@@ -685,7 +685,7 @@ class MovingGroundTest(parameterized.TestCase):
     def test_among_moving_boxes(self):
         environment = suite.build(
             'biped3d_mocap', terrain='dynamic_obstacles3d', task='footsteps',
-            task_kwargs={'random': 2, 'goal': True, 'terrain_map': True},
+            task_kwargs={'random': 2, 'goal': True, 'terrain_observation': 'height'},
         )  # fmt: skip
         for _ in range(3):
             step = environment.reset()
@@ -715,17 +715,21 @@ class PushTest(parameterized.TestCase):
                                       + [True] * 3)  # fmt: skip
 
     @parameterized.parameters((0.03, True), (0.1, False))
-    def test_who_was_pushed_may_miss(self, grace, ends):
+    def test_who_was_pushed_may_miss(self, grace_period, ends):
         # A push is over after 4/30 s, when grace begins; the foot lands after 6/30 s.
         pushes = {'force': (0, 0), 'duration': (1 / 30,) * 2, 'interval': (0.1, 0.1)}
-        environment, _ = started(start_phase=0.3, miss=0.01, grace=grace, pushes=pushes)
+        environment, _ = started(
+            start_phase=0.3, max_landing_error=0.01, grace_period=grace_period, pushes=pushes
+        )
         for i in range(1, 7):
             self.assertEqual(environment.step(np.zeros(17)).last(), ends and i == 6)
 
     @parameterized.parameters((0.0, True), (0.6, False))
-    def test_who_is_to_turn_sharply_may_miss(self, grace, ends):
+    def test_who_is_to_turn_sharply_may_miss(self, grace_period, ends):
         # The plan turns when a foot lands, after 6/30 s; the next one lands 15/30 s later.
-        environment, _ = started(start_phase=0.3, miss=1e-3, grace=grace, plans={'sharp': 1.0})
+        environment, _ = started(
+            start_phase=0.3, max_landing_error=1e-3, grace_period=grace_period, plans={'sharp': 1.0}
+        )
         environment.task.state.excused[0] = 6
         for _ in range(6):
             self.assertFalse(held(environment).last())
@@ -734,12 +738,12 @@ class PushTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many rows are single ones."""
+    """State and pickles go on bit for bit; many simulations are single ones."""
 
     OPTIONS = (
-        (GENERAL, {}), (TRAIL, {'terrain_map': True}), (MIRRORED, {'plans': {'from_root': 0.5}}),
-        (RUN, {}), (FULL, {}), (BUMPS, {'mirrored': True, 'terrain_map': True, 'pushes': {}}),
-        (GENERAL, {'goal': True, 'mirrored': True, 'miss': 0.3}),
+        (GENERAL, {}), (TRAIL, {'terrain_observation': 'height'}), (MIRRORED, {'plans': {'from_root': 0.5}}),
+        (RUN, {}), (FULL, {}), (BUMPS, {'mirrored': True, 'terrain_observation': 'height', 'pushes': {}}),
+        (GENERAL, {'goal': True, 'mirrored': True, 'max_landing_error': 0.3}),
     )  # fmt: skip
 
     def advance(self, environment, seed):
@@ -763,7 +767,7 @@ class SaveTest(parameterized.TestCase):
     def test_on_moving_ground(self, preset):
         environment, other = (
             suite.build('biped3d_mocap', terrain=preset, task='footsteps',
-                        task_kwargs={'random': seed, 'terrain_map': True})
+                        task_kwargs={'random': seed, 'terrain_observation': 'height'})
             for seed in (6, 7)
         )  # fmt: skip
         environment.reset()
@@ -822,16 +826,16 @@ class HelperTest(parameterized.TestCase):
         ({'plans': {'lenght': (0.5, 0.5)}}, "unknown option of plans 'lenght'; did you mean 'length'"),
         ({'plans': 0.5}, 'plans is 0.5'),
         ({'pushes': {'power': 1}}, "unknown option of pushes 'power'"),
-        ({'pushes': {'force': (3, 2)}}, 'force is'), ({'grace': -1}, 'grace is -1'),
-        ({'miss': 0}, 'miss is 0'), ({'miss': np.nan}, 'miss is nan'),
+        ({'pushes': {'force': (3, 2)}}, 'force is'), ({'grace_period': -1}, 'grace_period is -1'),
+        ({'max_landing_error': 0}, 'max_landing_error is 0'), ({'max_landing_error': np.nan}, 'max_landing_error is nan'),
         ({'footstep_scale': -1}, 'footstep_scale is -1'),
         ({'footstep_scale': ()}, 'footstep_scale is '),
         ({'footstep_scale': (1, np.inf)}, r'footstep_scale is \(1, inf'),
         ({'heading_scale': -1}, 'heading_scale is -1'),
         ({'start_phase': 1}, 'start_phase is 1'), ({'substeps': 5}, 'substeps is 5'),
-        ({'centre': 'mean'}, "unknown centre of position control 'mean'"),
-        ({'half_range': -1}, 'half_range is -1'),
-        ({'target': True}, "unknown option.*'target'"),
+        ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
+        ({'action_scale': -1}, 'action_scale is -1'),
+        ({'reference_observation': True}, "unknown option.*'reference_observation'"),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
         with self.assertRaisesRegex(ValueError, message):

@@ -23,7 +23,7 @@ GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
 SHORT = {'step_limit': 20}  # so that random actions meet both ends: falls and the limit
 SMALL = {'height': 48, 'width': 64}
-LONG = ('gait', 'hike', 'soccer')  # rules of tasks whose steps last many control steps
+LONG = ('gait', 'goal_navigation', 'soccer')  # rules of tasks whose steps last many control steps
 # Two for each Box: what has no bounds is declared without.
 UNAVOIDABLE = ('space minimum value is -infinity', 'space maximum value is infinity')
 
@@ -64,8 +64,10 @@ def every_id(id_):
     It is built once for all tests, as building takes most of the time. Gymnasium's checker would
     build another to draw it and one to close it: both are done here with the one.
     """
-    row = suite.find(id_)
-    scale = 0.3 if row.rules == 'gait' else 1.0  # of wilder gaits a cycle lasts until it is cut
+    spec = suite.find(id_)
+    scale = (
+        0.3 if spec.task_type == 'gait' else 1.0
+    )  # of wilder gaits a cycle lasts until it is cut
 
     class EveryId(Same, absltest.TestCase):
         @classmethod
@@ -105,7 +107,7 @@ def every_id(id_):
             flat = [theirs.reset().observation['observations']]
             ours = [observation]
             env.action_space.seed(0)
-            for _ in range(2 if row.rules in LONG else 4):
+            for _ in range(2 if spec.task_type in LONG else 4):
                 action = scale * env.action_space.sample()
                 observation, reward, terminated, truncated, info = env.step(action)
                 time_step = theirs.step(action)
@@ -119,7 +121,7 @@ def every_id(id_):
             np.testing.assert_array_equal(ours, np.array(flat, np.float32))
 
         def test_vector_entry_point_is_the_sync_vector(self):
-            limit = 1 if row.rules in LONG else 3
+            limit = 1 if spec.task_type in LONG else 3
             options = {'num_envs': 2, 'task_kwargs': {'step_limit': limit}}
             ours = gymnasium.make_vec(
                 f'trl_suite/{id_}',
@@ -144,16 +146,19 @@ def every_id(id_):
             env = SuiteEnv(self.env.unwrapped.environment, flat_observation=False)
             blocks = env.environment.blocks
             self.assertEqual(list(env.observation_space.spaces), list(blocks))  # terrain first
-            if row.options.get('terrain_samples') or row.rules == 'gait':
+            if (
+                spec.options.get('terrain_observation') in (50, 'height')
+                or spec.task_type == 'gait'
+            ):
                 self.assertEqual(next(iter(env.observation_space)), 'terrain')
             for name, box in env.observation_space.items():
                 low, high = (0, 1) if name == 'phase' else (-np.inf, np.inf)
                 self.assertEqual((box.low == low).all() and (box.high == high).all(), True)
             # All of PLAiD, the planar footsteps, and in three dimensions all but the one that
             # observes a target and those above a controller, which are not told the phase.
-            self.assertEqual('phase' in blocks, row.domain == 'plaid' or row.rules == 'footsteps2d' or (
-                'spatial' in row.tags and 'hierarchical' not in row.tags
-                and not row.options.get('target')
+            self.assertEqual('phase' in blocks, spec.domain == 'plaid' or spec.task_type == 'planar_footsteps' or (
+                'spatial' in spec.tags and 'hierarchical' not in spec.tags
+                and not spec.options.get('reference_observation')
             ))  # fmt: skip
             for each in (env, self.env):
                 action = each.action_space
@@ -505,10 +510,10 @@ class WrapperTest(parameterized.TestCase):
             _, reward, terminated, truncated, info = env.step(env.action_space.sample())
             sums, lengths = sums + reward, lengths + ~fresh
             ended = terminated | truncated
-            for row in np.flatnonzero(ended):
-                self.assertAlmostEqual(info['episode']['r'][row], sums[row], places=5)
-                self.assertEqual(info['episode']['l'][row], lengths[row])
-                self.assertTrue(info['_episode'][row])
+            for env_id in np.flatnonzero(ended):
+                self.assertAlmostEqual(info['episode']['r'][env_id], sums[env_id], places=5)
+                self.assertEqual(info['episode']['l'][env_id], lengths[env_id])
+                self.assertTrue(info['_episode'][env_id])
                 episodes += 1
             sums[ended] = lengths[ended] = 0
             fresh = ended if mode == 'NextStep' else fresh

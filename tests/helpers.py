@@ -1,4 +1,4 @@
-"""What several test modules share: looks at a simulation, and checks of rows and of saved states."""
+"""What several test modules share: looks at a simulation, and checks of simulations and of saved states."""
 
 import pathlib
 import pickle
@@ -24,7 +24,7 @@ STEP_WEIGHTS = {  # of the reward of footsteps
 
 
 def body(environment, field, link):
-    name = environment.task.character.row.name
+    name = environment.task.character.spec.name
     return getattr(environment.physics.named.data, field)[f'{name}/{link}'].copy()
 
 
@@ -40,7 +40,7 @@ def heading_of(environment):
 
 def ground(environment, x, y):
     """Height of three-dimensional ground, by a copy of it, m."""
-    return terrain.Ground.from_state(environment.task.arena.grounds[0].state()).height(x, y)
+    return terrain.SpatialGround.from_state(environment.task.arena.grounds[0].state()).height(x, y)
 
 
 def links_on_ground(environment):
@@ -78,67 +78,69 @@ def assert_uniform(values, low, high):
     assert distance < 1.95 / np.sqrt(len(share)), distance
 
 
-# Rows and single environments, saved states.
+# Simulations and single environments, saved states.
 
 
 def assert_rows_are_singles(
     id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2
 ):
-    """Checks that rows return what single environments with their seeds do, bit for bit.
+    """Checks that simulations return what single environments with their seeds do, bit for bit.
 
-    One single environment plays the rows, one after the other: building many would take most of the
+    One single environment plays the simulations, one after the other: building many would take most of the
     time, and what it did before must not matter either.
 
     Args:
       id_: of the environment.
-      n: rows.
-      steps: of all rows; those that end begin anew.
+      n: simulations.
+      steps: of all simulations; those that end begin anew.
       step_limit: after which episodes are cut.
       options: of the task.
-      scale: of the random actions, a number or one for each row, (n, 1).
-      seed: of the rows.
-      num_threads: of the rows.
+      scale: of the random actions, a number or one for each simulation, (n, 1).
+      seed: of the simulations.
+      num_threads: of the simulations.
 
     Returns:
-      What the rows returned, a list of `Step`, and how many episodes ended.
+      What the simulations returned, a list of `Step`, and how many episodes ended.
     """
     options = options or {}
-    rows = VectorEnvironment(id_, n, num_threads, seed, step_limit=step_limit, task_kwargs=options)
-    rng, size = np.random.default_rng(0), len(rows.action_map)
+    environments = VectorEnvironment(
+        id_, n, num_threads, seed, step_limit=step_limit, task_kwargs=options
+    )
+    rng, size = np.random.default_rng(0), len(environments.action_map)
     actions = [scale * rng.uniform(-1, 1, (n, size)) for _ in range(steps)]
-    first, found = rows.reset(), []
+    first, found = environments.reset(), []
     for action in actions:
-        found.append(rows.step(action))
-    task_kwargs = {'random': int(rows.seeds[0]), 'step_limit': step_limit, **options}
+        found.append(environments.step(action))
+    task_kwargs = {'random': int(environments.seeds[0]), 'step_limit': step_limit, **options}
     one, ends = suite.make(id_, task_kwargs, {'flat_observation': True}), 0
-    for row, own in enumerate(rows.seeds.tolist()):
-        if row:
+    for env_id, own in enumerate(environments.seeds.tolist()):
+        if env_id:
             one.random_state.seed(own)
-        where = f'{id_}, row {row}'
+        where = f'{id_}, simulation {env_id}'
         expected = one.reset().observation['observations']
-        np.testing.assert_array_equal(first[row], expected, f'{where}, reset')
+        np.testing.assert_array_equal(first[env_id], expected, f'{where}, reset')
         for i, (step, action) in enumerate(zip(found, actions, strict=True)):
-            time_step, where = one.step(action[row]), f'{id_}, row {row}, step {i}'
+            time_step, where = one.step(action[env_id]), f'{id_}, simulation {env_id}, step {i}'
             expected = time_step.observation['observations']
-            np.testing.assert_array_equal(step.observation[row], expected, where)
+            np.testing.assert_array_equal(step.observation[env_id], expected, where)
             last, cut = time_step.last(), time_step.discount == 1
-            ours = step.reward[row], step.terminated[row], step.truncated[row]
+            ours = step.reward[env_id], step.terminated[env_id], step.truncated[env_id]
             theirs = time_step.reward or 0.0, last and not cut, last and cut
             np.testing.assert_equal(ours, theirs, where)
-            _assert_same_info(step.info, one.info, row, where)
+            _assert_same_info(step.info, one.info, env_id, where)
             ends += last
-    rows.close()
+    environments.close()
     one.close()
     return found, ends
 
 
-def _assert_same_info(of_rows, of_one, row, where):
+def _assert_same_info(of_rows, of_one, env_id, where):
     assert set(of_rows) == set(of_one), where
     for name, value in of_one.items():
         if isinstance(value, dict):
-            _assert_same_info(of_rows[name], value, row, f'{where}, {name}')
+            _assert_same_info(of_rows[name], value, env_id, f'{where}, {name}')
         else:
-            np.testing.assert_array_equal(of_rows[name][row], value, f'{where}, {name}')
+            np.testing.assert_array_equal(of_rows[name][env_id], value, f'{where}, {name}')
 
 
 def advance(environment, seed, steps, scale, look=lambda environment: ()):

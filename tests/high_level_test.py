@@ -24,8 +24,9 @@ from helpers import (
     heading_of,
 )
 
-from trl_suite import evaluation, policies, rendering, scripted, suite
-from trl_suite.controllers import llc
+from trl_suite import evaluation, policies, rendering, suite
+from trl_suite.controllers import footstep_controller
+from trl_suite.tasks.navigation import hierarchical_rules, scripted
 from trl_suite.vector import VectorEnvironment
 
 PREFIX = 'PD_Biped3D_HLC_'
@@ -38,11 +39,15 @@ STILL = 0.8 * np.exp(-1.5) + 0.2  # what standing still earns
 AHEAD = np.zeros(5)  # two steps of half a metre, straight on
 
 
+def shipped_controller():
+    return footstep_controller.load(policies.reference(hierarchical_rules.CONTROLLER))
+
+
 def started(id_=FOREST, **options):
     """An environment of few surprises, after a reset."""
     options = {'random': 8, 'step_limit': None, 'start_phases': (0.0,), **options}
-    row = id_ if not isinstance(id_, str) else suite.find(id_)
-    environment = suite.build_row(row, options, {})
+    spec = id_ if not isinstance(id_, str) else suite.find(id_)
+    environment = suite.build_environment(spec, options, {})
     return environment, environment.reset()
 
 
@@ -84,15 +89,15 @@ def moved(task, walker=(0, 0), ball=None, each=None):
     """Instead of physics: the walker glides at a velocity, m/s, and so does the ball."""
     world, pose = task.world, task.figure.pose_qpos
 
-    def step(nstep, rows=None):
-        rows = np.arange(world.n) if rows is None else rows
-        world.qpos[rows[:, None], pose[:2]] += np.array(walker) / 30
+    def step(nstep, env_ids=None):
+        env_ids = np.arange(world.n) if env_ids is None else env_ids
+        world.qpos[env_ids[:, None], pose[:2]] += np.array(walker) / 30
         if ball is not None:
-            world.qpos[rows[:, None], task.ball.qpos[:3]] += np.array(ball) / 30
+            world.qpos[env_ids[:, None], task.ball.qpos[:3]] += np.array(ball) / 30
         if each is not None:
             each()
         if np.any(walker) or ball is not None or each is not None:
-            world.forward(rows)
+            world.forward(env_ids)
 
     with mock.patch.object(world, 'step', step):
         yield
@@ -128,23 +133,23 @@ class ClockTest(parameterized.TestCase):
             self.assertTrue(environment.info['landed'])
 
     def test_start_phases_are_drawn_evenly(self):
-        rows = VectorEnvironment(BLOCKS, 200, 1, seed=0)
-        rows.reset()
-        phases = np.round(rows.task.phase, 9)
+        specs = VectorEnvironment(BLOCKS, 200, 1, seed=0)
+        specs.reset()
+        phases = np.round(specs.task.phase, 9)
         self.assertEqual(set(phases), {0.1, 0.6})
         self.assertAlmostEqual((phases == 0.1).mean(), 0.5, delta=4 * np.sqrt(0.25 / 200))
 
     def test_rows_switch_each_in_its_time(self):
-        rows = VectorEnvironment(
+        specs = VectorEnvironment(
             PLANE, 12, 2, seed=1, task_kwargs={'start_phases': (0.0, 0.1, 0.6), 'controller': idle}
         )
-        rows.reset()
-        phases = np.round(rows.task.phase, 9)
+        specs.reset()
+        phases = np.round(specs.task.phase, 9)
         self.assertLen(set(phases), 3)
-        step = rows.step(np.zeros((12, 5)))
+        step = specs.step(np.zeros((12, 5)))
         np.testing.assert_allclose(step.info['duration'], np.where(phases == 0, 0.5, 0.4))
         self.assertTrue(step.info['landed'].all())
-        np.testing.assert_array_equal(rows.task.stance, np.where(phases < 0.5, LEFT, RIGHT))
+        np.testing.assert_array_equal(specs.task.stance, np.where(phases < 0.5, LEFT, RIGHT))
 
 
 class PlanTest(parameterized.TestCase):
@@ -193,7 +198,7 @@ class PlanTest(parameterized.TestCase):
             found.append((observation.copy(), feet, heading, task.phase[0]))
             return default(observation)
 
-        default = llc.load()
+        default = shipped_controller()
         environment, _ = started(SOCCER, controller=controller)
         task = environment.task
         for step in range(2):
@@ -350,7 +355,7 @@ class GoalTest(parameterized.TestCase):
             bearing, distance = 0.7, 4.0  # to the left
             task.goal[0, :2] = root[:2] + distance * turned((np.cos(0.7), np.sin(0.7)), heading)
             task.observe()
-            found = environment.observation()['target']
+            found = environment.observation()['goal']
             np.testing.assert_allclose(found, [bearing, distance], atol=1e-9)
 
     def test_it_is_drawn_anew_when_reached(self):
@@ -367,28 +372,28 @@ class GoalTest(parameterized.TestCase):
                 # On the plane within 3 m along x and along y of the root; observed at once.
                 self.assertLessEqual(np.abs(task.goal[0] - root)[:2].max(), 3)
                 away = np.hypot(*(task.goal[0] - root)[:2])
-                self.assertAlmostEqual(step.observation['target'][1], away, delta=1e-9)
+                self.assertAlmostEqual(step.observation['goal'][1], away, delta=1e-9)
         environment.reset()
         self.assertEqual(environment.info['goals_reached'], 0)
 
     def test_it_is_drawn_anew_by_a_timer(self):
         n, steps = 12, 420
-        rows = VectorEnvironment(
+        specs = VectorEnvironment(
             PLANE, n, 1, seed=0, step_limit=None, task_kwargs={'controller': idle}
         )
-        rows.reset()
-        task, begun, lasted = rows.task, np.zeros(n), []
+        specs.reset()
+        task, begun, lasted = specs.task, np.zeros(n), []
         with moved(task), mock.patch.object(task.arena, 'goal', lambda *_: next(far)):
             far = (np.array([100.0 + i, 0, 0]) for i in range(1000))
-            for row in range(n):
+            for env_id in range(n):
                 task.figure.measure()
-                task.begin_goal(row)
+                task.begin_goal(env_id)
             before = task.goal.copy()
             for i in range(1, steps + 1):
-                rows.step(np.zeros((n, 5)))
-                for row in np.flatnonzero((task.goal != before).any(1)):
-                    lasted.append(0.5 * i - begun[row])
-                    begun[row] = 0.5 * i
+                specs.step(np.zeros((n, 5)))
+                for env_id in np.flatnonzero((task.goal != before).any(1)):
+                    lasted.append(0.5 * i - begun[env_id])
+                    begun[env_id] = 0.5 * i
                 before = task.goal.copy()
         self.assertGreaterEqual(len(lasted), 2 * n)
         # 50 to 100 s, looked at every half second.
@@ -397,11 +402,11 @@ class GoalTest(parameterized.TestCase):
 
     @parameterized.parameters(*IDS)
     def test_goals_of_all_grounds(self, id_):
-        rows = VectorEnvironment(id_, 8, 1, seed=4)
-        observation = rows.reset()
-        self.assertTrue(np.isfinite(rows.task.goal).all())
-        self.assertLen(np.unique(rows.task.goal[:, 0]), 8)
-        distance = observation[:, rows.blocks['target']][:, 1]
+        specs = VectorEnvironment(id_, 8, 1, seed=4)
+        observation = specs.reset()
+        self.assertTrue(np.isfinite(specs.task.goal).all())
+        self.assertLen(np.unique(specs.task.goal[:, 0]), 8)
+        distance = observation[:, specs.blocks['goal']][:, 1]
         reach = {SOCCER: 10.0, TRAIL: 22.0}.get(id_, 48 * np.sqrt(2))
         self.assertBetween(distance.max(), 1.0, reach)
 
@@ -448,11 +453,11 @@ class MapTest(parameterized.TestCase):
         ((), 0, 0),
     )  # fmt: skip
     def test_sight(self, sight, heights, velocities):
-        _, step = started(MOVERS, sight=sight)
+        _, step = started(MOVERS, terrain_observation=sight)
         sizes = {name: value.size for name, value in step.observation.items()}
         self.assertEqual(sizes.pop('terrain', 0), heights)
         self.assertEqual(sizes.pop('surface', 0), velocities)
-        self.assertEqual(sizes, {'pose': 57, 'velocity': 48, 'target': 2})
+        self.assertEqual(sizes, {'pose': 57, 'velocity': 48, 'goal': 2})
 
 
 class BallTest(parameterized.TestCase):
@@ -468,10 +473,10 @@ class BallTest(parameterized.TestCase):
         self.assertGreater(model.geom_priority['ball'], model.geom_priority['plane'])
 
     def test_velocity_halves_in_a_second(self):
-        rows = VectorEnvironment(SOCCER, 2, 1, seed=0)
+        specs = VectorEnvironment(SOCCER, 2, 1, seed=0)
         environment, _ = started(SOCCER)
-        rows.reset()
-        for task in (environment.task, rows.task):
+        specs.reset()
+        for task in (environment.task, specs.task):
             world, qpos, dof = task.world, task.ball.qpos, task.ball.dof
             world.qpos[:, qpos[:3]] = 0, 0, 60
             world.qvel[:, dof] = 2, -1, 0, 6, 3, -2
@@ -533,9 +538,9 @@ class BallTest(parameterized.TestCase):
         np.testing.assert_array_equal(seen, np.zeros((60, 2)))
 
     def test_where_ball_and_goal_are_put(self):
-        rows = VectorEnvironment(SOCCER, 300, 1, seed=0)
-        rows.reset()
-        task = rows.task
+        specs = VectorEnvironment(SOCCER, 300, 1, seed=0)
+        specs.reset()
+        task = specs.task
         root = task.world.xpos[:, task.figure.links[0], :2]
         ball = task.world.qpos[:, task.ball.qpos]
         away, shot = ball[:, :2] - root, task.goal[:, :2] - ball[:, :2]
@@ -559,7 +564,7 @@ class BallTest(parameterized.TestCase):
             task.goal[0] = *(place + 4 * turned((np.cos(2.0), np.sin(2.0)), heading)), 0
             task.observe()
             found = environment.observation()
-            np.testing.assert_allclose(found['target'], [2.0, 4.0], atol=1e-9)
+            np.testing.assert_allclose(found['goal'], [2.0, 4.0], atol=1e-9)
             expected = [
                 bearing, distance, 0.3, *turned((1, 2), -heading), 3, *turned((4, 5), -heading), 6,
             ]  # fmt: skip
@@ -567,25 +572,25 @@ class BallTest(parameterized.TestCase):
 
     def test_timers(self):
         n, steps = 10, 430
-        rows = VectorEnvironment(
+        specs = VectorEnvironment(
             SOCCER, n, 1, seed=0, step_limit=None, task_kwargs={'controller': idle}
         )
-        rows.reset()
-        task = rows.task
+        specs.reset()
+        task = specs.task
         lasted, begun = {'ball': [], 'goal': []}, {'ball': np.zeros(n), 'goal': np.zeros(n)}
         # The first step is shorter where the phase is 0.1 or 0.6.
         with moved(task):
             now = np.zeros(n)
             before = {}
             for i in range(steps):
-                step = rows.step(np.zeros((n, 5)))
+                step = specs.step(np.zeros((n, 5)))
                 now += step.info['duration']
                 places = {'ball': task.world.qpos[:, task.ball.qpos[:2]], 'goal': task.goal.copy()}
                 for name, place in places.items():
                     if i:
-                        for row in np.flatnonzero((place != before[name]).any(1)):
-                            lasted[name].append(now[row] - begun[name][row])
-                            begun[name][row] = now[row]
+                        for env_id in np.flatnonzero((place != before[name]).any(1)):
+                            lasted[name].append(now[env_id] - begun[name][env_id])
+                            begun[name][env_id] = now[env_id]
                 before = places
         assert_uniform(lasted['ball'], 100, 200.5)
         assert_uniform(lasted['goal'], 50, 100.5)
@@ -675,7 +680,10 @@ class FrameTest(parameterized.TestCase):
         options = {'start_phases': (0.1,), 'random': 3}
         plan, first = started(id_, **options)
         frame, begun = started(id_, interface='frame', **options)
-        controller, rng = llc.load(), np.random.default_rng(0)
+        controller, rng = (
+            shipped_controller(),
+            np.random.default_rng(0),
+        )
         for name, value in first.observation.items():
             np.testing.assert_array_equal(begun.observation[name], value)
         for i in range(4):
@@ -733,20 +741,20 @@ class ControllerTest(FolderTest):
         return environment.physics.data.qpos.copy()
 
     def test_all_ways_to_name_it(self):
-        shipped = policies.reference(llc.DEFAULT)
+        shipped = policies.reference(hierarchical_rules.CONTROLLER)
         path = self.folder / 'mine.npz'
         policies.save(shipped, path)
         expected = self.positions()
         for source in (
-            llc.DEFAULT, 'deeploco/llc_general_step', path, str(path), shipped, llc.load(),
+            hierarchical_rules.CONTROLLER, 'deeploco/llc_general_step', path, str(path), shipped, shipped_controller(),
             lambda observation: shipped(observation),
         ):  # fmt: skip
             with self.subTest(source=str(source)):
                 np.testing.assert_array_equal(self.positions(controller=source), expected)
-        self.assertIsNone(llc.load(idle).policy)
-        self.assertIsNotNone(llc.load(path).policy)
-        controller = llc.load()
-        self.assertIs(llc.load(controller), controller)
+        self.assertIsNone(footstep_controller.load(idle).policy)
+        self.assertIsNotNone(footstep_controller.load(path).policy)
+        controller = shipped_controller()
+        self.assertIs(footstep_controller.load(controller), controller)
 
     def test_one_of_ones_own(self):
         def mine(observation):
@@ -754,9 +762,9 @@ class ControllerTest(FolderTest):
             return [[0.0] * 17] * len(observation)
 
         calls = []
-        rows = VectorEnvironment(PLANE, 3, 1, seed=0, task_kwargs={'controller': mine})
-        rows.reset()
-        rows.step(np.zeros((3, 5)))
+        environments = VectorEnvironment(PLANE, 3, 1, seed=0, task_kwargs={'controller': mine})
+        environments.reset()
+        environments.step(np.zeros((3, 5)))
         self.assertEqual(calls, [(3, 125)] * 15)
         self.assertTrue((self.positions(controller=mine) != self.positions()).any())
 
@@ -764,8 +772,8 @@ class ControllerTest(FolderTest):
         (lambda n: np.zeros((n, 16)), r'shape \(1, 16\); expected \(1, 17\)'),
         (lambda n: np.zeros((n, 18)), r'shape \(1, 18\)'), (lambda n: np.zeros(17), r'shape \(17,\)'),
         (lambda n: np.zeros((n + 1, 17)), r'shape \(2, 17\)'), (lambda n: np.zeros(()), r'shape \(\)'),
-        (lambda n: np.full((n, 17), np.nan), 'no finite action for row 0'),
-        (lambda n: np.full((n, 17), np.inf), 'no finite action for row 0'),
+        (lambda n: np.full((n, 17), np.nan), 'no finite action for simulation 0'),
+        (lambda n: np.full((n, 17), np.inf), 'no finite action for simulation 0'),
         (lambda n: None, r'no numbers|shape'), (lambda n: 'left', 'no numbers'),
         (lambda n: [[1, 2], [3]], 'no numbers'),
     )  # fmt: skip
@@ -781,10 +789,12 @@ class ControllerTest(FolderTest):
         def half(observation):
             return np.where(np.arange(len(observation))[:, None] == 2, np.nan, np.zeros((1, 17)))
 
-        rows = VectorEnvironment(PLANE, 4, 1, seed=0, task_kwargs={'controller': half})
-        rows.reset()
-        with self.assertRaisesRegex(ValueError, 'controller half gives no finite action for row 2'):
-            rows.step(np.zeros((4, 5)))
+        environments = VectorEnvironment(PLANE, 4, 1, seed=0, task_kwargs={'controller': half})
+        environments.reset()
+        with self.assertRaisesRegex(
+            ValueError, 'controller half gives no finite action for simulation 2'
+        ):
+            environments.step(np.zeros((4, 5)))
 
     def test_errors_of_the_function_are_its_own(self):
         def broken(observation):
@@ -800,17 +810,15 @@ class ControllerTest(FolderTest):
         np.testing.assert_array_equal(ones, far)
 
     def test_unknown(self):
-        with self.assertRaisesRegex(ValueError, f"did you mean '{llc.DEFAULT}'"):
+        with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical_rules.CONTROLLER}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
-        with self.assertRaisesRegex(FileNotFoundError, llc.DEFAULT):
-            llc.load('PD_Biped3D_LLC_Genral_Step-v0')
         with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
-            llc.load('FSM_Goat2D_Terrain_Cliffs-v0')  # gaits of the goat are not trained
+            started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0')  # nobody trained the goat
         with self.assertRaises(FileNotFoundError):
-            llc.load(self.folder / 'none.npz')
+            footstep_controller.load(self.folder / 'none.npz')
         (self.folder / 'broken.npz').write_bytes(b'no')
         with self.assertRaisesRegex(ValueError, 'broken.npz'):
-            llc.load(str(self.folder / 'broken.npz'))
+            footstep_controller.load(str(self.folder / 'broken.npz'))
 
     def test_one_that_observes_something_else(self):
         task = suite.build_task(suite.find('PD_Biped3D_LLC_Symetric_Step-v0'))
@@ -826,7 +834,7 @@ class ControllerTest(FolderTest):
             started(PLANE, controller=policy)
 
     def test_another_body_is_a_warning(self):
-        shipped = policies.reference(llc.DEFAULT)
+        shipped = policies.reference(hierarchical_rules.CONTROLLER)
         with warnings.catch_warnings():
             warnings.simplefilter('error')
             started(PLANE)  # no warning
@@ -841,7 +849,7 @@ class ScriptedTest(parameterized.TestCase):
     """The hand-written policy."""
 
     def test_walks_from_goal_to_goal(self):
-        rows = VectorEnvironment(
+        environments = VectorEnvironment(
             PLANE,
             6,
             1,
@@ -850,26 +858,28 @@ class ScriptedTest(parameterized.TestCase):
             autoreset='disabled',
             task_kwargs={'goal_distance': (3, 5)},
         )
-        policy, observation, rewards = scripted.scripted(rows), rows.reset(), []
+        policy, observation, rewards = scripted.scripted(environments), environments.reset(), []
         fell = np.zeros(6, bool)
         for _ in range(60):  # half a minute
-            step = rows.step(policy(observation))
+            step = environments.step(policy(observation))
             fell |= step.terminated
             rewards.append(step.reward[~fell].mean())
-            observation = rows.reset(step.terminated) if step.terminated.any() else step.observation
+            observation = (
+                environments.reset(step.terminated) if step.terminated.any() else step.observation
+            )
         self.assertLessEqual(fell.sum(), 1)
         self.assertGreaterEqual(step.info['goals_reached'][~fell].mean(), 3)
         self.assertGreater(np.mean(rewards), 0.8)  # standing still earns 0.38
 
     @parameterized.parameters(*IDS)
     def test_on_every_row(self, id_):
-        rows = VectorEnvironment(id_, 3, 1, seed=1)
-        policy, observation = scripted.scripted(rows), rows.reset()
+        environments = VectorEnvironment(id_, 3, 1, seed=1)
+        policy, observation = scripted.scripted(environments), environments.reset()
         for _ in range(6):
             action = policy(observation)
             self.assertEqual(action.shape, (3, 5))
             self.assertLessEqual(np.abs(action).max(), 1)
-            step = rows.step(action)
+            step = environments.step(action)
             self.assertFalse(step.terminated.any())
             observation = step.observation
 
@@ -913,7 +923,7 @@ class ScriptedTest(parameterized.TestCase):
     def test_gets_behind_the_ball(self):
         ball = np.zeros((2, 9))
         ball[:, 1] = 2.0  # straight on
-        parts = {'ball': ball, 'target': np.array([[0.0, 5.0], [np.pi / 2, 5.0]])}
+        parts = {'ball': ball, 'goal': np.array([[0.0, 5.0], [np.pi / 2, 5.0]])}
         bearing, distance = scripted.towards_ball(parts)
         self.assertAlmostEqual(bearing[0], 0)
         self.assertGreater(distance[0], 2)  # through it, towards the goal
@@ -922,11 +932,13 @@ class ScriptedTest(parameterized.TestCase):
         np.testing.assert_allclose(place, [2, -0.7], atol=1e-9)
 
     def test_single_and_many_agree(self):
-        row = dataclasses.replace(suite.find(BLOCKS), step_limit=5)
-        found = evaluation.evaluate(row, scripted.scripted, 3, 1, factory=True)
+        spec = dataclasses.replace(suite.find(BLOCKS), step_limit=5)
+        found = evaluation.evaluate(spec, scripted.scripted, 3, 1, factory=True)
         self.assertIs(evaluation.BASELINES['scripted'], scripted.scripted)
         for seed, total in zip(found['seeds'], found['returns'], strict=True):
-            environment = suite.build_row(row, {'random': seed}, {'flat_observation': True})
+            environment = suite.build_environment(
+                spec, {'random': seed}, {'flat_observation': True}
+            )
             policy, step, mine = scripted.scripted(environment), environment.reset(), 0.0
             while not step.last():
                 step = environment.step(policy(step.observation['observations'][None])[0])
@@ -934,7 +946,7 @@ class ScriptedTest(parameterized.TestCase):
             self.assertEqual(mine, total)
 
     @parameterized.parameters(
-        ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task Footsteps has no scripted policy'),
+        ('PD_Biped3D_LLC_General_Step-v0', {}, 'the task SpatialFootsteps has no scripted policy'),
         (FOREST, {'interface': 'frame'}, "needs the interface 'plan', not 'frame'"),
     )
     def test_other_tasks_are_refused(self, id_, options, message):
@@ -956,11 +968,11 @@ class ScriptedTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many rows are single ones."""
+    """State and pickles go on bit for bit; many simulations are single ones."""
 
     OPTIONS = (
         *((id_, {}) for id_ in IDS), (SOCCER, {'interface': 'frame'}),
-        (MOVERS, {'interface': 'frame', 'sight': ('height', 'velocity')}),
+        (MOVERS, {'interface': 'frame', 'terrain_observation': ('height', 'velocity')}),
     )  # fmt: skip
 
     def advance(self, environment, seed, steps=5):
@@ -1054,7 +1066,9 @@ class PictureTest(parameterized.TestCase):
 
     def test_no_ghost(self):
         environment, _ = started(FOREST)
-        with self.assertRaisesRegex(ValueError, 'the task HighLevel has no reference clip'):
+        with self.assertRaisesRegex(
+            ValueError, 'the task HierarchicalNavigation has no reference clip'
+        ):
             rendering.frame(environment, 60, 80, ghost=True)
 
 
@@ -1063,8 +1077,8 @@ class OptionTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'interface': 'plans'}, "unknown interface 'plans'; did you mean 'plan'"),
-        ({'sight': 'heigth'}, "unknown sight 'heigth'; did you mean 'height'"),
-        ({'sight': ('height', 'colour')}, "unknown sight 'colour'"),
+        ({'terrain_observation': 'heigth'}, "unknown terrain_observation 'heigth'; did you mean 'height'"),
+        ({'terrain_observation': ('height', 'colour')}, "unknown terrain_observation 'colour'"),
         ({'target_speed': 0}, 'target_speed is 0'), ({'target_speed': np.nan}, 'target_speed is nan'),
         ({'goal_reached': -1}, 'goal_reached is -1'), ({'goal_reached': np.inf}, 'goal_reached is'),
         ({'start_phases': ()}, 'start_phases is'), ({'start_phases': (0.1, 1.0)}, 'start_phases is'),
@@ -1077,11 +1091,11 @@ class OptionTest(parameterized.TestCase):
         ({'step_length': 'long'}, "step_length is 'long'; expected a number"),
         ({'start_phases': 0.5}, 'start_phases is 0.5; expected a list of numbers'),
         ({'start_phases': '12'}, "start_phases is '12'; expected a list of numbers"),
-        ({'sight': None}, 'sight is None; expected a list of strings'),
+        ({'terrain_observation': None}, 'terrain_observation is None; expected a string or a list of strings'),
         ({'goal_reached': [1]}, r'goal_reached is \[1\]; expected a number or None'),
         ({'substeps': 10.5}, 'substeps is 10.5; expected a whole number'),
-        ({'blend': np.nan}, 'blend is nan; expected a number'),
-        ({'blend': True}, 'blend is True; expected a number'),
+        ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),
+        ({'terrain_level': True}, 'terrain_level is True; expected a number'),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
         for id_ in (FOREST, SOCCER):

@@ -15,13 +15,13 @@ from helpers import (
 )
 
 from trl_suite import motion, suite, terrain
-from trl_suite.tasks import rewards
+from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 PLANE, HILLS = 'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills-v0'
 STEPS, TRACK = 'PD_Biped3D_Imitate-Steps-v0', 'PD_Biped3D_Imitate-Track-v0'
 RUN, STAIRS = 'PD_Biped3D_Imitate-Run-v0', 'PD_Biped3D_Imitate-Stairs-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'imitation3d']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'spatial_imitation']
 WEIGHTS = {'pose': 0.5, 'velocity': 0.05, 'end_effector': 0.15, 'com': 0.2, 'root': 0.1}
 SCALES = {'pose': 2, 'velocity': 0.005, 'end_effector': 40, 'com': 10, 'root': 10}
 # Raw reward weights: root, torso, then hip, knee and ankle of the right and of the left leg.
@@ -39,7 +39,7 @@ class Probe:
 
     def __init__(self, environment, flat=False):
         self.environment, self.task = environment, environment.task
-        self.row = self.task.character.row
+        self.spec = self.task.character.spec
         self.named = environment.physics.named
         self.flat = flat
 
@@ -49,7 +49,7 @@ class Probe:
         return ground(self.environment, x, y)
 
     def body(self, field, link):
-        return getattr(self.named.data, field)[f'{self.row.name}/{link}']
+        return getattr(self.named.data, field)[f'{self.spec.name}/{link}']
 
     @property
     def root(self):
@@ -64,7 +64,7 @@ class Probe:
         """Angular velocity of a link and velocity of its centre of mass, world axes."""
         model, data = self.environment.physics.model.ptr, self.environment.physics.data.ptr
         result = np.zeros(6)
-        body = model.body(f'{self.row.name}/{link}').id
+        body = model.body(f'{self.spec.name}/{link}').id
         # Of the body's inertial frame, in world axes.
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, result, 0)
         return result[:3], result[3:]
@@ -73,7 +73,7 @@ class Probe:
         turn, root = flattened(self.heading), self.root
         under = float(self.ground(root[0], root[1]))
         pose, velocity = [root[2:] - under], []
-        for link in self.row.links:
+        for link in self.spec.links:
             pose.append(turn @ (self.body('xipos', link) - root))
             matrix = turn @ self.body('xmat', link).reshape(3, 3)
             wxyz = np.zeros(4)
@@ -92,16 +92,16 @@ class Probe:
 
     def features(self):
         """What the reward compares."""
-        turn, root, row = flattened(self.heading), self.root, self.row
-        mass = np.array([self.named.model.body_mass[f'{row.name}/{n}'] for n in row.links])
+        turn, root, spec = flattened(self.heading), self.root, self.spec
+        mass = np.array([self.named.model.body_mass[f'{spec.name}/{n}'] for n in spec.links])
         share = mass / mass.sum()
-        com = share @ [self.body('xipos', n) for n in row.links]
-        com_velocity = share @ [self.velocity(n)[1] for n in row.links]
+        com = share @ [self.body('xipos', n) for n in spec.links]
+        com_velocity = share @ [self.velocity(n)[1] for n in spec.links]
         rotations, rates = [turn @ self.body('xmat', 'root').reshape(3, 3)], []
         rates.append(turn @ self.velocity('root')[0])
-        for joint, ball in zip(row.joints, self.task.character.spherical, strict=True):
-            qpos = self.named.data.qpos[f'{row.name}/{joint}']
-            rates.append(self.named.data.qvel[f'{row.name}/{joint}'])
+        for joint, ball in zip(spec.joints, self.task.character.spherical, strict=True):
+            qpos = self.named.data.qpos[f'{spec.name}/{joint}']
+            rates.append(self.named.data.qvel[f'{spec.name}/{joint}'])
             if ball:
                 matrix = np.zeros(9)
                 mujoco.mju_quat2Mat(matrix, qpos)
@@ -144,7 +144,7 @@ class ObservationTest(parameterized.TestCase):
         *((id_, steps) for id_ in (HILLS, STEPS, STAIRS, RUN) for steps in (0, 4, 14))
     )
     def test_terrain_pose_and_velocity(self, id_, steps):
-        environment, step = started(id_, steps, terrain_map=True)
+        environment, step = started(id_, steps, terrain_observation='height')
         self.assertEqual(list(step.observation)[:3], ['terrain', 'pose', 'velocity'])
         for name, value in Probe(environment).blocks().items():
             # Height grids are kept in single precision.
@@ -154,7 +154,7 @@ class ObservationTest(parameterized.TestCase):
             )
 
     def test_the_map_is_that_of_the_arena(self):
-        environment, step = started(HILLS, 6, terrain_map=True)
+        environment, step = started(HILLS, 6, terrain_observation='height')
         probe = Probe(environment)
         expected = environment.task.arena.height_map(probe.root[None, :2], probe.heading[None])
         self.assertEqual(step.observation['terrain'].shape, (1024,))
@@ -206,7 +206,7 @@ class ObservationTest(parameterized.TestCase):
         expected = [blocks['pose'][:1], links[:, :3].ravel(),
                     blocks['velocity'].reshape(8, 6)[:, :3].ravel()]  # fmt: skip
         # The task interpolates a table of the clip, best where velocities are its slope.
-        target, expected = step.observation['target'], np.concatenate(expected)
+        target, expected = step.observation['reference'], np.concatenate(expected)
         np.testing.assert_allclose(target[:25], expected[:25], atol=1e-4)
         np.testing.assert_allclose(target[25:], expected[25:], atol=5e-3)
 
@@ -235,10 +235,10 @@ class ObservationTest(parameterized.TestCase):
             'goal': slice(110, 112),
         })  # fmt: skip
         blocks = suite.make(TRACK).blocks
-        self.assertEqual((blocks['target'], blocks['goal']), (slice(105, 154), slice(154, 156)))
+        self.assertEqual((blocks['reference'], blocks['goal']), (slice(105, 154), slice(154, 156)))
 
     @parameterized.parameters(
-        ('position', {}, 17), ('position', {'centre': 'original'}, 22), ('torque', {}, 17),
+        ('position', {}, 17), ('position', {'action_offset': 'original'}, 22), ('torque', {}, 17),
         ('velocity', {}, 17),
     )  # fmt: skip
     def test_actions(self, actuation, options, size):
@@ -248,7 +248,7 @@ class ObservationTest(parameterized.TestCase):
         self.assertEqual(max(part.stop for part in environment.blocks.values()), 112)
 
     def test_actions_of_the_full_body(self):
-        for options, size in (({}, 35), ({'centre': 'original'}, 45)):
+        for options, size in (({}, 35), ({'action_offset': 'original'}, 45)):
             environment = suite.build('biped3d_full_mocap', task_kwargs=options)
             self.assertEqual(environment.action_spec().shape, (size,))
             # 113 for the pose of 16 links, 96 for their velocities, phase and goal.
@@ -345,7 +345,7 @@ class RewardTest(parameterized.TestCase):
         mujoco.mju_axisAngle2Quat(turn, vector, 0.2)
         weights = RAW / RAW.sum()
         for i, (joint, ball) in enumerate(
-            zip(task.character.row.joints, task.character.spherical, strict=True), 1
+            zip(task.character.spec.joints, task.character.spherical, strict=True), 1
         ):
             kept = data.qpos[f'biped3d/{joint}'].copy()
             if ball:
@@ -422,10 +422,10 @@ class StartTest(parameterized.TestCase):
         np.testing.assert_allclose(data.qvel[task.figure.pose_dof], rate, atol=1e-12)
 
     def test_phases_are_uniform(self):
-        rows = VectorEnvironment(PLANE, 800, 1, seed=0)
-        rows.reset()
-        self.assertLess(rows._task.phase.max(), 1)
-        assert_uniform(rows._task.phase, 0, 1)
+        environments = VectorEnvironment(PLANE, 800, 1, seed=0)
+        environments.reset()
+        self.assertLess(environments._task.phase.max(), 1)
+        assert_uniform(environments._task.phase, 0, 1)
 
     def test_start_phase(self):
         environment, step = started(HILLS, start_phase=0.6)
@@ -447,9 +447,11 @@ class StartTest(parameterized.TestCase):
 
     def test_blend_chooses_the_parameters(self):
         content = {'Type': 'var3d_checkers', 'Params': [{'Slope': 0.0}, {'Slope': 0.2}]}
-        for blend, height in ((0.0, 0.0), (0.5, 0.1), (1.0, 0.2)):
+        for terrain_level, height in ((0.0, 0.0), (0.5, 0.1), (1.0, 0.2)):
             environment = suite.build(
-                'biped3d', terrain=content, task_kwargs={'random': 0, 'blend': blend}
+                'biped3d',
+                terrain=content,
+                task_kwargs={'random': 0, 'terrain_level': terrain_level},
             )
             environment.reset()
             grid = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-4, 4, 81))
@@ -533,10 +535,10 @@ class MovingGroundTest(parameterized.TestCase):
 
 
 class SaveTest(parameterized.TestCase):
-    """State and pickles go on bit for bit; many rows are single ones."""
+    """State and pickles go on bit for bit; many simulations are single ones."""
 
     OPTIONS = (
-        (HILLS, {'terrain_map': True}), (STEPS, {'mirrored': True, 'terrain_map': True}),
+        (HILLS, {'terrain_observation': 'height'}), (STEPS, {'mirrored': True, 'terrain_observation': 'height'}),
         (TRACK, {}),
     )  # fmt: skip
 
@@ -553,7 +555,7 @@ class SaveTest(parameterized.TestCase):
         assert_goes_on(environment, other, self.advance)
 
     @parameterized.parameters(
-        *OPTIONS, (PLANE, {'centre': 'original'}), (STAIRS, {'start_phase': 0.4}),
+        *OPTIONS, (PLANE, {'action_offset': 'original'}), (STAIRS, {'start_phase': 0.4}),
     )  # fmt: skip
     def test_rows_are_single_environments(self, id_, options):
         assert_rows_are_singles(id_, 4, 22, 9, options)
@@ -563,7 +565,7 @@ class HelperTest(parameterized.TestCase):
     """What a task tells beyond the time step, and what it refuses."""
 
     @parameterized.parameters(
-        ('position', {}), ('position', {'centre': 'posture'}), ('velocity', {}),
+        ('position', {}), ('position', {'action_offset': 'posture'}), ('velocity', {}),
         ('position', {'mirrored': True, 'start_phase': 0.6}),
     )  # fmt: skip
     def test_clip_action(self, actuation, options):
@@ -605,14 +607,14 @@ class HelperTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'substeps': 5}, 'substeps is 5'), ({'substeps': 10.5}, 'substeps is 10.5'),
-        ({'centre': 'mean'}, "unknown centre of position control 'mean'"),
-        ({'half_range': 0}, 'half_range is 0'), ({'half_range': np.inf}, 'half_range is inf'),
-        ({'half_range': 1.0, 'centre': 'original'}, 'give no half_range'),
+        ({'action_offset': 'mean'}, "unknown action_offset 'mean'"),
+        ({'action_scale': 0}, 'action_scale is 0'), ({'action_scale': np.inf}, 'action_scale is inf'),
+        ({'action_scale': 1.0, 'action_offset': 'original'}, 'give no action_scale'),
         ({'start_phase': 1.0}, 'start_phase is 1.0'), ({'start_phase': -0.1}, 'start_phase is -0.1'),
         ({'start_phase': np.nan}, 'start_phase is nan'),
-        ({'mirrored': True, 'target': True}, 'mirrored observations need the phase'),
-        ({'blend': np.nan}, 'blend is nan; expected a number'),
-        ({'terrain_samples': 50}, "unknown option.*'terrain_samples'"),
+        ({'mirrored': True, 'reference_observation': True}, 'mirrored observations need the phase'),
+        ({'terrain_level': np.nan}, 'terrain_level is nan; expected a number'),
+        ({'terrain_observation': 50}, "terrain_observation is 50; expected a string"),
         ({'plans': {}}, "unknown option.*'plans'"),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
@@ -621,9 +623,9 @@ class HelperTest(parameterized.TestCase):
 
     def test_parts_that_do_not_fit(self):
         for arguments, message in (
-            (('biped3d', 'torque', None, 'imitation', None, {'half_range': 1.0}),
+            (('biped3d', 'torque', None, 'imitation', None, {'action_scale': 1.0}),
              'shape position control'),
-            (('biped3d', 'velocity', None, 'imitation', None, {'centre': 'posture'}),
+            (('biped3d', 'velocity', None, 'imitation', None, {'action_offset': 'posture'}),
              'shape position control'),
             (('biped3d', None, None, 'imitation', 'biped2d_walk'), "'biped2d_walk'.*free root"),
             (('biped3d', None, None, 'imitation', 'biped3d_full_walk'),

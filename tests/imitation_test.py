@@ -5,16 +5,16 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import characters, motion, suite, terrain
-from trl_suite.arenas import PlanarTerrain
-from trl_suite.environment import Environment
-from trl_suite.tasks import rewards
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.arenas import PlanarArena
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
 from trl_suite.vector import VectorEnvironment
 
 # One of each figure; the dog's links stand in another order than the engine's bodies.
 DOG, RAPTOR = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Raptor2D_Slopes_Terrain-v0'
 BIPED, MUSCLES = 'PD_Biped2D_Gaps_Terrain-v0', 'MTU_Dog2D_LLC_Imitate_Flat-v0'
-IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == 'imitation']
+IDS = [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == 'planar_imitation']
 EXAMPLES = (
     DOG, RAPTOR, BIPED, MUSCLES, 'Torque_Raptor2D_LLC_Imitate_Flat-v0', 'PD_Biped2D_Incline-v0',
     'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
@@ -39,10 +39,10 @@ class Probe:
 
     def __init__(self, environment):
         self.environment, self.task = environment, environment.task
-        self.name = self.task.character.row.name
-        self.links = self.task.character.row.links
+        self.name = self.task.character.spec.name
+        self.links = self.task.character.spec.links
         self.named = environment.physics.named
-        self.strip = terrain.Strip.from_state(self.task.arena.strips[0].state())
+        self.strip = terrain.PlanarGround.from_state(self.task.arena.grounds[0].state())
         first, count = -400, 2400
         heights, _ = self.strip.window(first, count)
         self.ground = lambda x: np.interp(x, (first + np.arange(count)) * 0.025, heights)
@@ -110,12 +110,12 @@ class Reference:
 
     def __init__(self, environment):
         task = environment.task
-        options = {'target': True} if task.actuation_model == 'muscle' else {}
+        config = PlanarImitationConfig(reference_observation=task.actuation_model == 'muscle')
         self.clip = task.clip
-        row = task.character.row
-        other = Imitation(
-            characters.make(row.name), PlanarTerrain(terrain.load('flat')), self.clip,
-            actuation_model=task.actuation_model, **options,
+        spec = task.character.spec
+        other = PlanarImitation(
+            characters.make(spec.name), PlanarArena(terrain.load('flat')), self.clip,
+            config, actuation_model=task.actuation_model,
         )  # fmt: skip
         self.environment = Environment(other, random=0)
         self.environment.reset()
@@ -160,7 +160,7 @@ class ObservationTest(parameterized.TestCase):
     @parameterized.parameters(DOG, RAPTOR, BIPED)
     def test_a_trunk_that_points_backwards_looks_backwards(self, id_):
         environment, _ = started(id_)
-        data, name = environment.physics.named.data, environment.task.character.row.name
+        data, name = environment.physics.named.data, environment.task.character.spec.name
         for pitch in (3.0, -2.5, 2 * np.pi + 0.1, -1.5):
             data.qpos[f'{name}/root_z/'] = 4.0
             data.qpos[f'{name}/root_x/'] = 2.6
@@ -191,7 +191,7 @@ class ObservationTest(parameterized.TestCase):
         probe = Reference(environment).at(float(environment.task.phase[0]))
         expected = probe.blocks()
         links = len(probe.links)
-        target = step.observation['target']
+        target = step.observation['reference']
         np.testing.assert_allclose(target[: 2 * links + 1], expected['pose'], atol=1e-4)
         scale = np.abs(expected['velocity']).max()
         np.testing.assert_allclose(
@@ -202,7 +202,7 @@ class ObservationTest(parameterized.TestCase):
         environment, step = started('PD_Biped2D_LLC_Imitate_Flat-v0')
         probe = Reference(environment).at(float(environment.task.phase[0]))
         np.testing.assert_allclose(
-            step.observation['target'][:15], probe.blocks()['pose'], atol=1e-4
+            step.observation['reference'][:15], probe.blocks()['pose'], atol=1e-4
         )
 
     def test_breakdown_of_the_documented_rows(self):
@@ -214,7 +214,7 @@ class ObservationTest(parameterized.TestCase):
         blocks = suite.make('Torque_Raptor2D_LLC_Imitate_Flat-v0').blocks
         self.assertEqual(blocks['pose'], slice(0, 39))
         self.assertEqual(blocks['velocity'], slice(39, 77))
-        self.assertEqual(blocks['target'], slice(77, 154))
+        self.assertEqual(blocks['reference'], slice(77, 154))
 
 
 def observed_terms(environment):
@@ -258,7 +258,7 @@ class RewardTest(parameterized.TestCase):
 
     def by_hand(self, environment):
         task = environment.task
-        name = task.character.row.name
+        name = task.character.spec.name
         found = Probe(environment).reward_features()
         wanted = Reference(environment).at(float(task.phase[0])).reward_features()
         weights = np.array(RAW[name]) / np.sum(RAW[name])
@@ -293,7 +293,7 @@ class RewardTest(parameterized.TestCase):
         task.observe()
         before = observed_terms(environment)['pose']
         weights = np.array(RAW[name]) / np.sum(RAW[name])
-        for i, joint in enumerate(('root_pitch/', *task.character.row.joints)):
+        for i, joint in enumerate(('root_pitch/', *task.character.spec.joints)):
             data.qpos[f'{name}/{joint}'] += 0.2
             environment.physics.forward()
             task.observe()
@@ -398,18 +398,18 @@ class ResetTest(parameterized.TestCase):
 
     def test_start_phases_between_numbers(self):
         pairs = ((0.1, 0.2), (0.5, 0.8))
-        rows = VectorEnvironment(BIPED, 400, 1, 5, task_kwargs={'start_phase': pairs})
-        rows.reset()
-        phases = rows.task.phase
+        specs = VectorEnvironment(BIPED, 400, 1, 5, task_kwargs={'start_phase': pairs})
+        specs.reset()
+        phases = specs.task.phase
         first, second = ((phases >= low) & (phases < high) for low, high in pairs)
         self.assertTrue((first | second).all())
         self.assertAlmostEqual(first.mean(), 0.25, delta=0.07)  # 3 standard deviations
         self.assertAlmostEqual(phases[second].mean(), 0.65, delta=0.02)
 
     def test_raptor_with_muscles_starts_in_the_air(self):
-        rows = VectorEnvironment('MTU_Raptor2D_LLC_Imitate_Flat-v0', 64, 1, 5)
-        rows.reset()
-        self.assertTrue((rows.task.phase % 0.5 >= 0.25).all())
+        specs = VectorEnvironment('MTU_Raptor2D_LLC_Imitate_Flat-v0', 64, 1, 5)
+        specs.reset()
+        self.assertTrue((specs.task.phase % 0.5 >= 0.25).all())
 
     def test_terrain_is_drawn_anew(self):
         environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': 3})
@@ -454,12 +454,14 @@ class ResetTest(parameterized.TestCase):
 
     def test_blend_chooses_the_parameters(self):
         reached = []
-        for blend in (0.0, 1.0):
+        for terrain_level in (0.0, 1.0):
             environment = suite.build(
-                'biped2d', terrain='gaps_curriculum', task_kwargs={'random': 0, 'blend': blend}
+                'biped2d',
+                terrain='gaps_curriculum',
+                task_kwargs={'random': 0, 'terrain_level': terrain_level},
             )
             environment.reset()
-            heights, vertical = environment.task.arena.strips[0].window(0, 4000)
+            heights, vertical = environment.task.arena.grounds[0].window(0, 4000)
             edges = np.flatnonzero(vertical)
             widths = np.diff(edges)[heights[edges[:-1]] < -1]
             reached.append(widths.mean() * 0.025)
@@ -477,7 +479,7 @@ class HelperTest(parameterized.TestCase):
         task, clip = environment.task, environment.task.clip
         time = float(task.phase[0]) * clip.duration
         wanted = (clip.pose if id_.startswith('PD') else clip.velocity)(time)[3:]
-        control = task.action_map.centre + task.action_map.half_range * task.clip_action(0)
+        control = task.action_map.action_offset + task.action_map.action_scale * task.clip_action(0)
         np.testing.assert_allclose(control, wanted, atol=1e-12)
 
     @parameterized.parameters('Torque_Dog2D_LLC_Imitate_Flat-v0', MUSCLES)
@@ -499,9 +501,9 @@ class HelperTest(parameterized.TestCase):
         self.assertAlmostEqual(speed, task.clip.speed, delta=0.3)
 
     @parameterized.parameters(
-        ({'terrain_samples': 1}, 'terrain_samples'), ({'terrain_samples': -1}, 'terrain_samples'),
-        ({'substeps': 3}, 'substeps'), ({'substeps': 4.5}, 'substeps'), ({'centre': 'mean'}, 'centre'),
-        ({'half_range': 0}, 'half_range'), ({'half_range': np.inf}, 'half_range'),
+        ({'terrain_observation': 1}, 'terrain_observation'), ({'terrain_observation': -1}, 'terrain_observation'),
+        ({'substeps': 3}, 'substeps'), ({'substeps': 4.5}, 'substeps'), ({'action_offset': 'mean'}, 'action_offset'),
+        ({'action_scale': 0}, 'action_scale'), ({'action_scale': np.inf}, 'action_scale'),
     )  # fmt: skip
     def test_options_out_of_range(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
@@ -515,7 +517,7 @@ class HelperTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'does not loop'):
             suite.build('biped2d', clip=once)
         with self.assertRaisesRegex(ValueError, 'shape position control'):
-            suite.build('biped2d', 'torque', task_kwargs={'half_range': 1.0})
+            suite.build('biped2d', 'torque', task_kwargs={'action_scale': 1.0})
 
 
 if __name__ == '__main__':

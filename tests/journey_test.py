@@ -4,7 +4,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.tasks import rewards
+from trl_suite.tasks.components import rewards
 from trl_suite.vector import VectorEnvironment
 
 TRAIL, FOREST, BLOCKS, MOVERS, SOCCER = (
@@ -26,7 +26,7 @@ def sizes(environment):
 
 def root_of(environment):
     """Place (3,) m and heading (rad) of the root."""
-    named, name = environment.physics.named.data, environment.task.character.row.name
+    named, name = environment.physics.named.data, environment.task.character.spec.name
     ahead = named.xmat[f'{name}/root'].reshape(3, 3)[:, 0]
     return named.xpos[f'{name}/root'].copy(), np.arctan2(ahead[1], ahead[0])
 
@@ -102,7 +102,7 @@ class ObservationTest(parameterized.TestCase):
 class RewardTest(parameterized.TestCase):
     def test_weights(self):
         """0.5, 0.05, 0.15, 0.2, 0.1, 0.05 and 0.1 over 1.15."""
-        weights = [weight for weight, _ in rewards.JOURNEY_TERMS.values()]
+        weights = [weight for weight, _ in rewards.DIRECT_TERMS.values()]
         expected = np.array([0.5, 0.05, 0.15, 0.2, 0.1, 0.05, 0.1]) / 1.15
         np.testing.assert_allclose(weights, expected)
         environment, _ = started(SOCCER)
@@ -113,7 +113,7 @@ class RewardTest(parameterized.TestCase):
         environment, _ = started(TRAIL)
         set_goal(environment, 10.0)
         found = terms(environment)
-        for name, (weight, _) in rewards.JOURNEY_TERMS.items():
+        for name, (weight, _) in rewards.DIRECT_TERMS.items():
             # Heading and way differ by what the pelvis turns in a step.
             least = 0.0 if name == 'proximity' else 0.95 * weight
             self.assertBetween(found[name], least, weight + 1e-12, name)
@@ -235,13 +235,13 @@ class OriginalTest(parameterized.TestCase):
 
 class BuildTest(absltest.TestCase):
     def test_any_character_and_ground(self):
-        environment = suite.build('biped3d', terrain='hills3d', task='journey')
+        environment = suite.build('biped3d', terrain='hills3d', task='direct_navigation')
         time_step = environment.reset()
         self.assertEqual(time_step.observation['goal'].shape, (2,))
 
     def test_not_in_the_plane(self):
-        with self.assertRaisesRegex(ValueError, "'dog' is planar; the task 'journey'"):
-            suite.build('dog', task='journey')
+        with self.assertRaisesRegex(ValueError, "'dog' is planar; the task 'direct_navigation'"):
+            suite.build('dog', task='direct_navigation')
 
 
 if __name__ == '__main__':

@@ -17,7 +17,7 @@ import learn_gaits
 
 HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
 TINY = learn_gaits.Settings(
-    samples=48, num_envs=4, guided=24, begin=16, greedy=0.25, capacity=100, minibatch=8, updates=1,
+    samples=48, num_envs=4, expert_cycles=24, begin=16, greedy=0.25, capacity=100, minibatch=8, updates=1,
     final_updates=2, convolutions=((4, 8, 2),), ground_units=8, hidden=(8, 6), write_every=16,
     evaluate_every=32, evaluation_episodes=2,
 )  # fmt: skip
@@ -25,9 +25,11 @@ TINY = learn_gaits.Settings(
 
 class LearnTest(absltest.TestCase):
     def test_transitions_and_retries(self):
-        settings = dataclasses.replace(TINY, guided=1e9, guide_epsilon=1.0, retry=1.0, retries=2)
+        settings = dataclasses.replace(
+            TINY, expert_cycles=1e9, expert_epsilon=1.0, retry=1.0, retries=2
+        )
         learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
-        learner.guide = None  # random base actions fall soon
+        learner.expert = None  # random base actions fall soon
         tried = []
         for _ in range(24):
             learner.collect()
@@ -42,8 +44,8 @@ class LearnTest(absltest.TestCase):
         # A fall has no reward; up to then there is more than that for being up.
         self.assertTrue((reward[discount > 0] >= 0.5 * (1 + 0.95 + 0.95**2) - 1e-6).all())
         self.assertIn(0.0, reward[discount == 0])
-        for row, past in enumerate(learner.past):
-            self.assertLessEqual(len(past), settings.back[1] + 1, row)
+        for env_id, past in enumerate(learner.past):
+            self.assertLessEqual(len(past), settings.back[1] + 1, env_id)
 
     def test_a_row_that_goes_back_is_where_it_was(self):
         learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, retry=1.0), 1)

@@ -433,10 +433,10 @@ class StepsTest(parameterized.TestCase):
         velocity = library.velocity(index, t, mirrored)
         self.assertEqual(pose.shape, (4, 17))
         self.assertEqual(velocity.shape, (4, 14))
-        for row in range(4):
-            clip = library.clip(index[row], mirrored[row])
-            np.testing.assert_allclose(pose[row], clip.pose(t[row]), atol=1e-12)
-            np.testing.assert_allclose(velocity[row], clip.velocity(t[row]), atol=1e-9)
+        for env_id in range(4):
+            clip = library.clip(index[env_id], mirrored[env_id])
+            np.testing.assert_allclose(pose[env_id], clip.pose(t[env_id]), atol=1e-12)
+            np.testing.assert_allclose(velocity[env_id], clip.velocity(t[env_id]), atol=1e-9)
 
     def test_broadcasts(self):
         library = steps()

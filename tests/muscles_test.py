@@ -7,8 +7,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 
-from trl_suite import actuation, characters, hill, suite
-from trl_suite.characters import muscles
+from trl_suite import actuation, characters, suite
+from trl_suite.actuation import hill, muscles
 
 TIMESTEP = 1 / 300  # s
 ISOMETRIC_ERROR = 0.05  # peak forces; largest error of the active force-length curve
@@ -191,8 +191,8 @@ class TableTest(parameterized.TestCase):
         for name, peak in (('plain', 6000), ('run', 5692.86906)):
             with suite.make(id_, task_kwargs={'random': 1, 'muscle_set': name}) as environment:
                 model = environment.physics.model
-                row = model.name2id('raptor/right_VAS', 'actuator')
-                self.assertAlmostEqual(model.actuator_gainprm[row, 2], peak, delta=0.01)
+                env_id = model.name2id('raptor/right_VAS', 'actuator')
+                self.assertAlmostEqual(model.actuator_gainprm[env_id, 2], peak, delta=0.01)
 
     @parameterized.parameters(*COUNTS)
     def test_muscles_pull_every_joint_both_ways(self, name):

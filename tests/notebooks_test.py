@@ -11,7 +11,8 @@ import types
 import pytest
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, terrain
+from trl_suite import terrain
+from trl_suite.registry import catalogue
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'colab'
@@ -21,7 +22,9 @@ NAMES = (
 )  # fmt: skip
 LARGEST = 600e3  # bytes
 COLUMNS = 100
-EXTRAS = {'trl_suite.stable_baselines': 'stable_baselines3'}  # module -> what it needs beside us
+EXTRAS = {
+    'trl_suite.adapters.stable_baselines': 'stable_baselines3'
+}  # module -> what it needs beside us
 _ID = re.compile(r'\b\w[\w-]*-v0\b')
 _FILE = re.compile(r'\b(?:docs|examples|trained)/[\w/]+\.\w+')
 _LINK = re.compile(r'\]\((?!https?:|#)([^)#]+)')

@@ -12,9 +12,10 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from scipy.spatial.transform import Rotation
 
-from trl_suite import clip_check, motion, retargeting, suite
-from trl_suite.mannequin import Mannequin
+from trl_suite import motion, retargeting, suite
 from trl_suite.motion import quaternion
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.retargeting import clip_check
 
 FILE_AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # ours from a file with y up, z forward
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
@@ -34,17 +35,17 @@ class Figure:
     """What a capture of a character's own motion would hold."""
 
     def __init__(self, character, clip, frames, spread_arms=False):
-        mannequin = Mannequin(character)
-        self.names = ('root', *mannequin.layout.joints)
-        self.parents = mannequin.parents()
-        self.offsets = mannequin.places()
+        viewer = KinematicViewer(character)
+        self.names = ('root', *viewer.layout.joints)
+        self.parents = viewer.parents()
+        self.offsets = viewer.places()
         self.offsets[1:] -= self.offsets[self.parents[1:]]
         self.times = np.linspace(0, clip.duration, frames)
         self.poses = clip.pose(self.times)
         turned = []
         for pose in self.poses:
-            mannequin.put(pose)
-            turned.append(mannequin.orientations())
+            viewer.put(pose)
+            turned.append(viewer.orientations())
         world = [rotations(column) for column in np.swapaxes(turned, 0, 1)]
         # Arms that point sideways at rest turn by so much less in all poses.
         self.rest = [Rotation.identity()] * len(self.names)
@@ -231,7 +232,7 @@ class ReadingTest(FolderTest):
                 clip.poses[:, column : column + len(expected)], [expected] * 2, atol=1e-12
             )
         # The root as high as ours stands, and what it travels in proportion.
-        size = Mannequin(PLAIN).standing()[2] / 0.9
+        size = KinematicViewer(PLAIN).standing()[2] / 0.9
         np.testing.assert_allclose(clip.displacement, [0.5 * size, 0, 0], atol=1e-9)
 
     def test_refusals(self):

@@ -17,10 +17,10 @@ import trimesh
 from absl.testing import absltest, parameterized
 
 from trl_suite import characters, cli, engine, gym, motion, suite, terrain
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
+from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.tasks import parts
-from trl_suite.tasks.walk import Walk
-from trl_suite.terrain import generators
+from trl_suite.tasks.walk.task import Walk
+from trl_suite.terrain.planar import generators
 from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
@@ -80,50 +80,50 @@ class CharacterTest(Folder):
         return characters.from_file(self.write(text), **{**PLANAR, **options})
 
     def test_urdf_keeps_masses_limits_and_efforts(self):
-        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
-        model = compiled(row)
+        spec = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        model = compiled(spec)
         np.testing.assert_array_equal(model.body_mass[1:], [5, 2])
         np.testing.assert_array_equal(model.jnt_range, [[-0.7, 0.4]])
         np.testing.assert_array_equal(model.jnt_actfrcrange, [[-35, 35]])
         self.assertEqual(
-            (row.name, row.links, tuple(row.joints)), ('two', ('trunk', 'leg'), ('hip',))
+            (spec.name, spec.links, tuple(spec.joints)), ('two', ('trunk', 'leg'), ('hip',))
         )
-        self.assertEqual(row.joints['hip'].kp, 35)  # the file has no servo: all at 1 rad
-        self.assertLen(row.notes, 1)
-        self.assertIn('hip 35', row.notes[0])
+        self.assertEqual(spec.joints['hip'].kp, 35)  # the file has no servo: all at 1 rad
+        self.assertLen(spec.notes, 1)
+        self.assertIn('hip 35', spec.notes[0])
 
     def test_fixed_links_stay_as_end_effectors(self):
         foot = '<link name="foot"/><joint name="f" type="fixed"><parent link="leg"/><child link="foot"/><origin xyz="0 0 -.4"/></joint></robot>'
         path = self.write(URDF.replace('</robot>', foot), 'two.urdf')
-        row = characters.from_file(path, **{**TWO, 'end_effectors': ('foot',)})
-        self.assertEqual(row.links, ('trunk', 'leg'))  # what has no mass is no link
-        suite.build(row, task='walk').reset()
+        spec = characters.from_file(path, **{**TWO, 'end_effectors': ('foot',)})
+        self.assertEqual(spec.links, ('trunk', 'leg'))  # what has no mass is no link
+        suite.build(spec, task='walk').reset()
 
     def test_actuators_key_frame_and_defaults(self):
-        row = self.planar()
-        self.assertFalse(row.spatial)
-        hip, knee, other = (row.joints[n] for n in ('right_hip', 'right_knee', 'left_hip'))
+        spec = self.planar()
+        self.assertFalse(spec.spatial)
+        hip, knee, other = (spec.joints[n] for n in ('right_hip', 'right_knee', 'left_hip'))
         self.assertEqual((hip.kp, hip.kd, hip.target), (90, 3, 0.2))
         self.assertEqual((knee.kp, knee.target), (50, -0.3))
-        model = compiled(row)
-        limits = dict(zip(row.joints, model.jnt_actfrcrange[:, 1], strict=True))
+        model = compiled(spec)
+        limits = dict(zip(spec.joints, model.jnt_actfrcrange[:, 1], strict=True))
         self.assertEqual((limits['right_hip'], limits['right_knee']), (70, 50))
         # The weight at the end of the leg, 0.84 m below the hip.
         self.assertAlmostEqual(limits['left_hip'], model.body_mass.sum() * 9.8 * 0.84, delta=1e-6)
         self.assertAlmostEqual(other.kd, other.kp / 10)
-        self.assertFalse([note for note in row.notes if 'without damping' in note])
+        self.assertFalse([note for note in spec.notes if 'without damping' in note])
         self.assertEqual(model.nu + model.nkey + model.nsensor, 0)
         np.testing.assert_allclose(model.jnt_range[1], [-2 * np.pi / 3, 0])
         self.assertEqual(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, 'floor'), -1)
 
     def test_damping_of_the_file_is_added(self):
         text = MJCF.replace('name="left_hip"', 'name="left_hip" damping="5"').replace('kv="3"', '')
-        row = self.planar(text)
-        hip, servo = row.joints['left_hip'], row.joints['right_hip']
+        spec = self.planar(text)
+        hip, servo = spec.joints['left_hip'], spec.joints['right_hip']
         self.assertAlmostEqual(hip.kd, hip.kp / 10 + 5)
         self.assertEqual((servo.kp, servo.kd), (90, 9))
         self.assertIn(
-            'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', row.notes
+            'servos without damping; kd, N m s/rad (slides: N s/m): right_hip 9', spec.notes
         )
 
     def test_what_has_no_name_in_the_file(self):
@@ -134,8 +134,8 @@ class CharacterTest(Folder):
             '<tendon><fixed><joint joint="left_knee" coef="1"/></fixed></tendon></mujoco>'
         )
         text = MJCF.replace('<geom size=".15', f'{things}<geom size=".15')
-        row = self.planar(text.replace('</mujoco>', rules))
-        environment = suite.build(row, terrain='slopes', task='walk', task_kwargs={'random': 0})
+        spec = self.planar(text.replace('</mujoco>', rules))
+        environment = suite.build(spec, terrain='slopes', task='walk', task_kwargs={'random': 0})
         environment.reset()
         self.assertTrue(np.isfinite(environment.step(np.zeros(4)).reward))
         model = environment.physics.model
@@ -164,9 +164,9 @@ class CharacterTest(Folder):
         text = URDF.replace('<box size=".1 .1 .4"/>', mesh).replace(
             '<collision>', looks + '<collision>'
         )
-        row = characters.from_file(self.write(text, 'urdf/two.urdf'), **TWO)
-        self.assertLen(row.assets, 1)
-        np.testing.assert_allclose(compiled(row).geom_size[0], [0.05, 0.05, 0.2], atol=1e-6)
+        spec = characters.from_file(self.write(text, 'urdf/two.urdf'), **TWO)
+        self.assertLen(spec.assets, 1)
+        np.testing.assert_allclose(compiled(spec).geom_size[0], [0.05, 0.05, 0.2], atol=1e-6)
 
     @parameterized.parameters('position', 'torque', 'velocity')
     def test_it_starts_on_the_ground(self, actuation):
@@ -182,8 +182,8 @@ class CharacterTest(Folder):
 
     @parameterized.parameters(*terrain.PRESETS3D)
     def test_every_spatial_preset(self, preset):
-        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
-        environment = suite.build(row, terrain=preset, task='walk', task_kwargs={'random': 2})
+        spec = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        environment = suite.build(spec, terrain=preset, task='walk', task_kwargs={'random': 2})
         environment.reset()
         for _ in range(2):
             self.assertTrue(np.isfinite(environment.step(np.ones(1)).reward))
@@ -195,29 +195,29 @@ class CharacterTest(Folder):
         self.assertTrue(np.isfinite(environment.step(np.ones(4)).reward))
 
     def test_imitation_of_a_clip(self):
-        row = self.planar()
+        spec = self.planar()
         poses = np.zeros((3, 7))
         poses[:, 0], poses[:, 1], poses[1, 3:] = (0, 0.5, 1), 0.8, (0.3, -0.2, -0.3, -0.4)
         clip = motion.Clip(
-            'steps', np.arange(3) / 2, poses, 'planar', tuple(row.joints), (1,) * 4, True
+            'steps', np.arange(3) / 2, poses, 'planar', tuple(spec.joints), (1,) * 4, True
         )
-        environment = suite.build(row, terrain='slopes', clip=clip, task_kwargs={'random': 0})
+        environment = suite.build(spec, terrain='slopes', clip=clip, task_kwargs={'random': 0})
         environment.reset()
         reward = environment.step(environment.task.clip_action(0)).reward
         self.assertBetween(reward, 0.5, 1)
         with self.assertRaisesRegex(ValueError, "no clip of its own; give clip=, or task='walk'"):
-            suite.build(row)
+            suite.build(spec)
 
     def test_spatial_imitation_of_a_clip(self):
-        row = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
+        spec = characters.from_file(self.write(URDF, 'two.urdf'), **TWO)
         poses = np.tile([0.0, 0, 0.8, 1, 0, 0, 0, 0], (3, 1))
         poses[1, -1] = 0.3
         clip = motion.Clip('nod', np.arange(3) / 2, poses, 'free', ('hip',), (1,), True)
-        environment = suite.build(row, terrain='hills3d', clip=clip, task_kwargs={'random': 0})
+        environment = suite.build(spec, terrain='hills3d', clip=clip, task_kwargs={'random': 0})
         environment.reset()
         self.assertGreater(environment.step(environment.task.clip_action(0)).reward, 0.5)
         with self.assertRaisesRegex(ValueError, 'no pairs of right and left'):
-            suite.build(row, clip=clip, task_kwargs={'mirrored': True})
+            suite.build(spec, clip=clip, task_kwargs={'mirrored': True})
 
     @parameterized.named_parameters(
         ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
@@ -245,9 +245,9 @@ class CharacterTest(Folder):
         self.assertRegex('; '.join(self.planar(MJCF.replace(before, after)).notes), message)
 
     def test_a_root_that_says_otherwise_is_noted(self):
-        row = self.planar(spatial=True)
-        self.assertTrue(row.spatial)
-        self.assertRegex(row.notes[0], 'spatial=True was given, .* two slides and a hinge')
+        spec = self.planar(spatial=True)
+        self.assertTrue(spec.spatial)
+        self.assertRegex(spec.notes[0], 'spatial=True was given, .* two slides and a hinge')
         self.assertEqual(self.planar(spatial=False).notes, self.planar().notes)
 
     @parameterized.named_parameters(
@@ -320,7 +320,7 @@ class TerrainTest(Folder):
 
     def rest(self, ground, x, y=0.0):
         """Returns where a ball of 0.1 m comes to lie that is dropped onto a terrain, (3,) m."""
-        arena = (SpatialTerrain if ground.spatial else PlanarTerrain)(ground)
+        arena = (SpatialArena if ground.spatial else PlanarArena)(ground)
         ball = arena.mjcf_model.worldbody.add('body', name='ball', pos=(x, y, 1.5))
         ball.add('freejoint')
         ball.add('geom', size=(0.1,), condim=6, friction=(1, 0.01, 0.005))
@@ -328,7 +328,9 @@ class TerrainTest(Folder):
         physics = mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())
         batch = engine.BatchWorld(physics, 1, 1)
         arena.bind(batch)
-        arena.begin_episode(0, (terrain.Ground if ground.spatial else terrain.Strip)(ground, 0))
+        arena.begin_episode(
+            0, (terrain.SpatialGround if ground.spatial else terrain.PlanarGround)(ground, 0)
+        )
         batch.step(5000)
         return batch.qpos[0, :3].copy()
 
@@ -352,11 +354,11 @@ class TerrainTest(Folder):
 
     @parameterized.product(preset=list(terrain.PRESETS3D)[::3], suffix=('.obj', '.glb', '.stl'))
     def test_a_written_mesh_read_again_has_the_same_heights(self, preset, suffix):
-        ground = terrain.Ground(terrain.load(preset), 3)
+        ground = terrain.SpatialGround(terrain.load(preset), 3)
         path = self.folder / f'ground{suffix}'
         terrain.save_mesh(ground, path, -4, 4)
         self.assertEqual([p.name for p in self.folder.iterdir()], [path.name])
-        again = terrain.Ground(terrain.from_mesh(path), 0)
+        again = terrain.SpatialGround(terrain.from_mesh(path), 0)
         i = 0.2 * np.arange(-19, 20)
         x, y = np.meshgrid(i, i, indexing='ij')
         # At an upright face a point may fall to either side.
@@ -366,10 +368,10 @@ class TerrainTest(Folder):
         self.assertTrue((found <= np.max(near, 0) + 1e-3).all())
 
     def test_a_strip_written_and_read_as_a_line(self):
-        strip = terrain.Strip(terrain.load('slopes_mixed'), 4)
+        strip = terrain.PlanarGround(terrain.load('slopes_mixed'), 4)
         terrain.save_mesh(strip, self.folder / 'strip.obj', -2, 12)
         mine = terrain.from_mesh(self.folder / 'strip.obj', terrain.SPACING, line=0.0)
-        again = terrain.Strip(mine, 0)
+        again = terrain.PlanarGround(mine, 0)
         x = np.arange(-60, 460) * terrain.SPACING
         np.testing.assert_allclose(again.height(x), strip.height(x), atol=1e-4)
         self.assertGreater(again.window(-60, 520)[1].sum(), 0)  # steep cells are faces
@@ -385,18 +387,24 @@ class TerrainTest(Folder):
         grey = np.zeros((5, 7), np.uint16)
         grey[0, 5] = 65535  # ahead and to the left: x = 2, y = 2 pixels
         imageio.imwrite(self.folder / 'hill.png', grey)
-        ground = terrain.Ground(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2), 0)
+        ground = terrain.SpatialGround(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2), 0)
         self.assertAlmostEqual(float(ground.height(0.4, 0.4)), 2)
         self.assertAlmostEqual(float(ground.height(0.2, 0.4)), -1)
         # Its rim goes on.
         self.assertAlmostEqual(float(ground.height(0.4, 9)), 2)
-        line = terrain.Strip(terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0)
+        line = terrain.PlanarGround(
+            terrain.from_image(self.folder / 'hill.png', 0.2, -1, 2, line=0.4), 0
+        )
         np.testing.assert_allclose(line.height([0.4, 0.3, 0.2]), [2, 0.5, -1])
 
     def test_starts_are_spread_by_the_seed(self):
         for draw, mine, at in (
-            (terrain.Strip, terrain.from_function(vee, start_span=5), lambda g: g.height(0)),
-            (terrain.Ground, terrain.from_function(bowl, start_span=5), lambda g: g.height(0, 0)),
+            (terrain.PlanarGround, terrain.from_function(vee, start_span=5), lambda g: g.height(0)),
+            (
+                terrain.SpatialGround,
+                terrain.from_function(bowl, start_span=5),
+                lambda g: g.height(0, 0),
+            ),
         ):
             heights = [float(at(draw(mine, seed))) for seed in range(20)]
             self.assertGreater(np.ptp(heights), 0.4)
@@ -406,7 +414,7 @@ class TerrainTest(Folder):
 
     def test_a_line_does_not_depend_on_when_it_is_asked(self):
         mine = terrain.from_function(vee)
-        whole, piecewise = terrain.Strip(mine, 0), terrain.Strip(mine, 0)
+        whole, piecewise = terrain.PlanarGround(mine, 0), terrain.PlanarGround(mine, 0)
         for x in (0, 30, -30, 90, -55):
             piecewise.height(x)
         x = np.linspace(-60, 95, 500)
@@ -417,19 +425,19 @@ class TerrainTest(Folder):
         mine = terrain.from_heights(np.random.default_rng(0).random((9, 9)), 0.3, start_span=1)
         again = pickle.loads(pickle.dumps(mine))
         self.assertEqual(again, mine)
-        grounds = [terrain.Ground(each, 5).height(0.3, 0.1) for each in (mine, again)]
+        grounds = [terrain.SpatialGround(each, 5).height(0.3, 0.1) for each in (mine, again)]
         self.assertEqual(*grounds)
 
     @parameterized.parameters(('biped2d', vee), ('biped3d', bowl))
     def test_a_batch_is_bit_for_bit_the_single_environments(self, character, function):
-        row = suite.combine(character, terrain=terrain.from_function(function, start_span=3))
-        many = VectorEnvironment(row, 3, seed=1)
+        spec = suite.combine(character, terrain=terrain.from_function(function, start_span=3))
+        many = VectorEnvironment(spec, 3, seed=1)
         actions = np.random.default_rng(0).uniform(-1, 1, (12, 3, len(many.action_map)))
         first = many.reset()
         seen = np.array([first, *(many.step(action).observation for action in actions)])
         for i in (0, 2):
             options = {'random': int(many.seeds[i])}
-            single = suite.build_row(row, options, {'flat_observation': True})
+            single = suite.build_environment(spec, options, {'flat_observation': True})
             np.testing.assert_array_equal(rolled(single, actions[:, i])[0], seen[:, i])
 
     @parameterized.named_parameters(
@@ -447,7 +455,7 @@ class TerrainTest(Folder):
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
         ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
-        ('large', lambda _: terrain.to_mesh(terrain.Ground(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
+        ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
     )  # fmt: skip
     def test_bad_input(self, make, message):
@@ -466,7 +474,7 @@ class TerrainTest(Folder):
             return terrain.from_function(wavelets)
 
         heights(1.0)
-        again = terrain.Strip(heights(0.5), 0)
+        again = terrain.PlanarGround(heights(0.5), 0)
         self.assertAlmostEqual(np.ptp(again.height(np.arange(0, 9, 0.1))), 1, delta=0.01)
 
     def test_another_lambda_of_the_same_name(self):
@@ -489,7 +497,7 @@ class TerrainTest(Folder):
         with self.assertRaisesRegex(
             ValueError, "terrain 'hole' returned nan at x = 3.* m; expected"
         ):
-            terrain.Strip(hole, 0).height(5.0)
+            terrain.PlanarGround(hole, 0).height(5.0)
 
     def test_missing_files(self):
         for make in (terrain.from_mesh, lambda path: terrain.from_image(path, 1)):
@@ -589,31 +597,31 @@ class TaskTest(parameterized.TestCase):
             np.testing.assert_array_equal(first.observation['pose'], second.observation['pose'])
 
     def test_gymnasium(self):
-        row = suite.combine('biped3d', terrain='hills3d', task='walk')
-        env = gym.SuiteEnv(row, task_kwargs=PARTS | {'terrain_view': True})
+        spec = suite.combine('biped3d', terrain='hills3d', task='walk')
+        env = gym.SuiteEnv(spec, task_kwargs=PARTS | {'terrain_observation': 'height'})
         observation, _ = env.reset(seed=1)
         self.assertEqual(observation.shape, (1024 + 57 + 48 + 2 + 3,))
-        envs = gym.SuiteVectorEnv(row, 2, task_kwargs=PARTS)
+        envs = gym.SuiteVectorEnv(spec, 2, task_kwargs=PARTS)
         envs.reset(seed=1)
         _, reward, *_ = envs.step(envs.action_space.sample())
         self.assertEqual(reward.shape, (2,))
 
     @parameterized.parameters('biped2d', 'biped3d')
     def test_a_task_of_the_users(self, character):
-        row = suite.combine(character, task=Rise)
+        spec = suite.combine(character, task=Rise)
         environment = suite.build(
-            character, task=Rise, task_kwargs={'random': 1, 'half_range': 1.0}
+            character, task=Rise, task_kwargs={'random': 1, 'action_scale': 1.0}
         )
         environment.reset()
         height = environment.step(np.zeros(environment.action_spec().shape)).reward
         self.assertBetween(height, 0.6, 1.0)
-        many = VectorEnvironment(row, 2, seed=0)
+        many = VectorEnvironment(spec, 2, seed=0)
         many.reset()
         np.testing.assert_allclose(
             many.step(np.zeros((2, len(many.action_map)))).reward, height, atol=0.05
         )
-        with self.assertRaisesRegex(ValueError, "unknown option .*'half_rang'.*'half_range'"):
-            suite.build(character, task=Rise, task_kwargs={'half_rang': 1})
+        with self.assertRaisesRegex(ValueError, "unknown option .*'action_scal'.*'action_scale'"):
+            suite.build(character, task=Rise, task_kwargs={'action_scal': 1})
 
     def test_walking_is_rewarded(self):
         environment = suite.build('biped3d', task='walk', task_kwargs={'random': 1})
@@ -621,7 +629,7 @@ class TaskTest(parameterized.TestCase):
         action = np.zeros(environment.action_spec().shape)
         standing = environment.step(action).reward
         self.assertBetween(standing, 0.25, 0.4)
-        environment.physics.data.qvel[0] = environment.task.pace
+        environment.physics.data.qvel[0] = environment.task.full_speed
         self.assertBetween(environment.step(action).reward, 0.8, 1.0)
 
     @parameterized.named_parameters(

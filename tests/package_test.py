@@ -92,7 +92,7 @@ class ImportTest(absltest.TestCase):
         code = """
             import sys
             from trl_suite import motion, terrain
-            terrain.Strip(terrain.load('slopes_mixed'), 0).height([0.0, 7.0])
+            terrain.PlanarGround(terrain.load('slopes_mixed'), 0).height([0.0, 7.0])
             motion.load('dog_bound').pose(0.1)
             assert 'mujoco' not in sys.modules and 'dm_control' not in sys.modules
         """
@@ -165,7 +165,8 @@ class WheelTest(absltest.TestCase):
             import pathlib
             import numpy as np
             import trl_suite
-            from trl_suite import motion, resources, suite
+            from trl_suite import motion, suite
+            from trl_suite.util import resources
             print(pathlib.Path(trl_suite.__file__).resolve())
             print(resources.directory('xml').resolve())
             print(resources.directory('mocap').resolve())

@@ -18,7 +18,10 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 import trl_suite
-from trl_suite import catalogue, motion, policies, resources, suite
+from trl_suite import motion, policies, suite
+from trl_suite.policies import files
+from trl_suite.registry import catalogue
+from trl_suite.util import resources
 from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
@@ -72,14 +75,14 @@ def plain(policy, observation):
         for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
     ]
     if line is not None:
-        rows = [[value] for value in x[: line.line]]
+        env_ids = [[value] for value in x[: line.line]]
         for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
             width, channels, filters = weight.shape
-            rows = [
+            env_ids = [
                 [
                     hidden(
                         sum(
-                            rows[start + w][c] * float(weight[w, c, o])
+                            env_ids[start + w][c] * float(weight[w, c, o])
                             for w in range(width)
                             for c in range(channels)
                         )
@@ -87,9 +90,9 @@ def plain(policy, observation):
                     )
                     for o in range(filters)
                 ]
-                for start in range(0, len(rows) - width + 1, stride)
+                for start in range(0, len(env_ids) - width + 1, stride)
             ]
-        x = [value for row in rows for value in row] + x[line.line :]
+        x = [value for row in env_ids for value in row] + x[line.line :]
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         x = [
             sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])
@@ -358,9 +361,9 @@ class FileTest(FolderTest):
         )  # fmt: skip
         policies.save(policy, self.folder / 'p.npz')
         again = policies.load(self.folder / 'p.npz')
-        for name in policies._OPTIONAL:
+        for name in files._OPTIONAL:
             np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
-            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+            self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(9, None)
     def test_convolutions_come_back(self, origin):
@@ -375,8 +378,8 @@ class FileTest(FolderTest):
         np.testing.assert_array_equal(again(observations), policy(observations))
         policies.save(again, self.folder / 'q.npz')
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
-        for name in (*policies._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
-            self.assertRegex(policies.__doc__, rf'\n    {name}\b')
+        for name in (*files._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
+            self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
     @parameterized.parameters(
         ({'line': None}, "'line': is missing"),
@@ -404,11 +407,11 @@ class FileTest(FolderTest):
         policies.save(make(), self.folder / 'p.npz')
         with np.load(self.folder / 'p.npz', allow_pickle=False) as data:
             arrays = dict(data)
-        for name in policies._FIELDS:
-            self.assertRegex(policies.__doc__, rf'\n    (\w+, )?{name}\b')
+        for name in files._FIELDS:
+            self.assertRegex(files.__doc__, rf'\n    (\w+, )?{name}\b')
         self.assertCountEqual(
             arrays,
-            {*policies._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
+            {*files._FIELDS, *(f'{kind}_{i}' for kind in ('weight', 'bias') for i in range(3))},
         )
         self.assertEqual((str(arrays['format']), int(arrays['version'])), ('trl_suite policy', 1))
         self.assertEqual(json.loads(str(arrays['info'])), make().info)
@@ -588,15 +591,19 @@ class ShippedTest(parameterized.TestCase):
         self.assertEqual(policies.available(), tuple(catalogue.BY_ID))
 
     def test_every_planar_row_that_tracks_a_clip_has_one(self):
-        rows = [row for row in catalogue.ROWS if row.rules == 'imitation' and 'planar' in row.tags]
-        self.assertLen(rows, 42)
-        self.assertContainsSubset([row.id for row in rows], policies.available())
+        specs = [
+            spec
+            for spec in catalogue.SPECS
+            if spec.task_type == 'planar_imitation' and 'planar' in spec.tags
+        ]
+        self.assertLen(specs, 42)
+        self.assertContainsSubset([spec.id for spec in specs], policies.available())
 
     @parameterized.parameters(
         *(
-            row.id
-            for row in catalogue.ROWS
-            if row.domain == 'plaid' and row.id in policies.available()
+            spec.id
+            for spec in catalogue.SPECS
+            if spec.domain == 'plaid' and spec.id in policies.available()
         )
     )
     def test_who_does_not_fall_gets_on(self, id_):

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from absl.testing import absltest, parameterized
 
-from trl_suite import catalogue, evaluation, policies
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import ppo
@@ -32,13 +33,13 @@ class PartsTest(parameterized.TestCase):
         found = ppo.advantages(reward, value, following, ended, 0.9, 0.8)
         error = reward + 0.9 * following - value
         for t in range(9):
-            for row in range(4):
+            for env_id in range(4):
                 expected = 0.0
                 for k in range(t, 9):
-                    expected += (0.9 * 0.8) ** (k - t) * error[k, row]
-                    if ended[k, row]:
+                    expected += (0.9 * 0.8) ** (k - t) * error[k, env_id]
+                    if ended[k, env_id]:
                         break
-                self.assertAlmostEqual(found[t, row], expected)
+                self.assertAlmostEqual(found[t, env_id], expected)
 
     def test_scales(self):
         random = np.random.default_rng(0)
@@ -58,8 +59,8 @@ class PartsTest(parameterized.TestCase):
     def test_every_environment_has_settings(self):
         for id_ in catalogue.BY_ID:
             settings = ppo_settings.settings_for(id_)
-            cycles = catalogue.BY_ID[id_].rules == 'gait'  # a step is 10 to 20 times longer
-            plans = catalogue.BY_ID[id_].rules in ('hike', 'soccer')
+            cycles = catalogue.BY_ID[id_].task_type == 'gait'  # a step is 10 to 20 times longer
+            plans = catalogue.BY_ID[id_].task_type in ('goal_navigation', 'soccer')
             least = 5e4 if cycles or plans else 2e5 if settings.start else 5e5
             self.assertGreaterEqual(settings.samples, least, id_)
             if settings.start:
@@ -186,7 +187,7 @@ class RunTest(parameterized.TestCase):
 
     def test_places_are_seen_in_a_straight_line(self):
         """By the network in training as by what it exports; and a start that saw them fits."""
-        id_, places = 'PD_Biped3D_HLC_Soccer-v0', ('target', 'ball')
+        id_, places = 'PD_Biped3D_HLC_Soccer-v0', ('goal', 'ball')
         settings = ppo_settings.Settings(**TINY, places=places, mirrored=True)
         trainer = ppo.Trainer(id_, 0, settings, 1)
         trainer.learn(trainer.collect())
@@ -198,7 +199,7 @@ class RunTest(parameterized.TestCase):
         observation, left = trainer.seen(trainer.observation)
         with torch.no_grad():
             inside = trainer.policy(trainer.scales(observation)).numpy()
-        inside = trainer.mirror.answered(inside, left)
+        inside = trainer.mirror.unmirror_action(inside, left)
         np.testing.assert_allclose(policy(trainer.observation), np.clip(inside, -1, 1), atol=1e-5)
         # What has not varied would not be taken over.
         policy = dataclasses.replace(policy, std=np.ones_like(policy.std))
@@ -238,11 +239,11 @@ class RunTest(parameterized.TestCase):
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
         trainer = ppo.Trainer(id_, 0, settings, 1)
         teacher = evaluation.BASELINES['scripted'](trainer.environments)
-        seen, shown = trainer.observation.copy(), teacher(trainer.observation)
-        before = np.abs(trainer.exported()(seen) - shown).mean()
+        seen, labels = trainer.observation.copy(), teacher(trainer.observation)
+        before = np.abs(trainer.exported()(seen) - labels).mean()
         trainer.imitate('scripted')
         self.assertEqual(trainer.samples, 160)
-        self.assertLess(np.abs(trainer.exported()(seen) - shown).mean(), before / 2)
+        self.assertLess(np.abs(trainer.exported()(seen) - labels).mean(), before / 2)
 
     def test_after_the_first_round_the_policy_walks(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
@@ -271,8 +272,8 @@ class RunTest(parameterized.TestCase):
         with tempfile.TemporaryDirectory() as name:
             trainer.imitate('scripted', pathlib.Path(name))
             self.assertEqual([point['samples'] for point in trainer.curve], [80])
-            shown = policies.load(pathlib.Path(name) / 'policy.npz')(trainer.observation)
-        self.assertGreater(np.abs(shown - before).mean(), 0.1)  # not the average, not yet begun
+            labels = policies.load(pathlib.Path(name) / 'policy.npz')(trainer.observation)
+        self.assertGreater(np.abs(labels - before).mean(), 0.1)  # not the average, not yet begun
 
     def test_a_run_ends_when_it_has_learnt_enough(self):
         trainer = ppo.Trainer(FLAT, 0, ppo_settings.Settings(**TINY, enough=0.9), 1)
@@ -280,34 +281,34 @@ class RunTest(parameterized.TestCase):
             ((), False), ((0.95,), False), ((0.95, 0.8), False), ((0.8, 0.95), False),
             ((0.8, 0.9, 0.91), True),
         ):  # fmt: skip
-            trainer.curve = [{'fraction': fraction} for fraction in fractions]
+            trainer.curve = [{'normalized_return': fraction} for fraction in fractions]
             self.assertEqual(trainer.has_learnt(), expected)
 
     def test_lessons_on_ever_higher_walls(self):
-        lessons = ppo_settings.rising(
+        stages = ppo_settings.rising(
             'mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5)
         )
-        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, stages=stages)
         trainer = first = ppo.Trainer('PD_Biped2D_Mixed_Terrain-v0', 0, settings, 1)
         heights = []
         for samples in (0, 100, 200):
             trainer.samples = samples
-            trainer.begin_lesson()
-            strips = (trainer.environments.task.arena.strips[i] for i in range(TINY['num_envs']))
+            trainer.begin_stage()
+            strips = (trainer.environments.task.arena.grounds[i] for i in range(TINY['num_envs']))
             ranges = {tuple(s.parameters[f'WallH{end}'] for end in ('Min', 'Max')) for s in strips}
             heights += ranges
         np.testing.assert_allclose(heights, [(0.1, 0.2), (0.175, 0.3), (0.25, 0.4)])
-        self.assertEqual(trainer.environments.row.terrain, 'mixed_humanoid')
-        self.assertEqual(first.row.terrain, 'mixed_humanoid')  # where it is evaluated
+        self.assertEqual(trainer.environments.spec.terrain, 'mixed_humanoid')
+        self.assertEqual(first.spec.terrain, 'mixed_humanoid')  # where it is evaluated
 
     def test_lessons_with_obstacles_close_together(self):
-        lessons = ppo_settings.crowded('slopes_mixed_humanoid')
-        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, lessons=lessons)
+        stages = ppo_settings.crowded('slopes_mixed_humanoid')
+        settings = ppo_settings.Settings(**{**TINY, 'samples': 300}, stages=stages)
         trainer = ppo.Trainer('PD_Biped2D_Slopes_Mixed_Terrain-v0', 0, settings, 1)
         spacings, types = [], []
         for samples in (0, 100, 200):
             trainer.samples = samples
-            trainer.begin_lesson()
+            trainer.begin_stage()
             ground = trainer.environments.task.arena.terrain
             types.append(ground.type)
             values = ground.parameters()
@@ -376,20 +377,20 @@ class RunTest(parameterized.TestCase):
         # Episodes last two steps: no target lacks the 7 that follow, discounted.
         self.assertGreater(float(batch['target'].min()), 7 * settings.gamma**2)
 
-    def test_what_ships_may_be_the_mean_over_ends_of_lessons(self):
-        samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a lesson
+    def test_what_ships_may_be_the_mean_over_ends_of_stages(self):
+        samples = TINY['num_envs'] * TINY['horizon']  # of an update, and of a curriculum stage
         settings = ppo_settings.Settings(
             **{**TINY, 'samples': 3 * samples},
-            lessons=ppo_settings.evenly([{}] * 3), lessons_averaged=2,
+            stages=ppo_settings.evenly([{}] * 3), stages_averaged=2,
         )  # fmt: skip
         ppo.train(FLAT, 0, settings, self.folder, threads=1, progress=False)
         first, second, best, last = (
             policies.load(self.folder / f'{name}.npz')
-            for name in ('lesson_1', 'lesson_2', 'policy', 'last')
+            for name in ('stage_1', 'stage_2', 'policy', 'last')
         )
         self.assertEqual([p.info['samples'] for p in (first, second)], [samples, 2 * samples])
-        self.assertFalse((self.folder / 'lesson_3.npz').exists())
-        self.assertEqual(best.info, last.info)  # the only one after all lessons
+        self.assertFalse((self.folder / 'stage_3.npz').exists())
+        self.assertEqual(best.info, last.info)  # the only one after all curriculum stages
         for part in ('mean', 'std', 'log_std'):
             expected = (getattr(second, part) + getattr(best, part)) / 2
             np.testing.assert_allclose(getattr(last, part), expected, rtol=1e-6, atol=1e-7)
@@ -400,9 +401,9 @@ class RunTest(parameterized.TestCase):
     @parameterized.parameters(0, 3)
     def test_no_more_ends_of_lessons_than_there_are(self, number):
         settings = ppo_settings.Settings(
-            **TINY, lessons=ppo_settings.evenly([{}] * 2), lessons_averaged=number
+            **TINY, stages=ppo_settings.evenly([{}] * 2), stages_averaged=number
         )
-        with self.assertRaisesRegex(ValueError, f'lessons_averaged: {number}; expected 1 to 2'):
+        with self.assertRaisesRegex(ValueError, f'stages_averaged: {number}; expected 1 to 2'):
             ppo.Trainer(FLAT, 0, settings, 1)
 
     def test_it_learns(self):
@@ -411,8 +412,8 @@ class RunTest(parameterized.TestCase):
         folder = self.folder / 'run'
         ppo.train(FLAT, 0, settings, folder, threads=1, progress=False)
         found = evaluation.evaluate(FLAT, policies.load(folder / 'last.npz'), 32, seed=1)
-        self.assertGreater(found['fraction'], 0.6)
-        self.assertGreater(found['full'], 0.9)
+        self.assertGreater(found['normalized_return'], 0.6)
+        self.assertGreater(found['completion_rate'], 0.9)
 
 
 if __name__ == '__main__':

@@ -14,6 +14,7 @@ from dm_control import composer
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
+from trl_suite.rendering import drawing
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -101,7 +102,7 @@ class GhostTest(parameterized.TestCase):
 
         def look(physics, scene):
             before = scene.ngeom
-            rendering._ghost(environment.task)(physics, scene)
+            drawing._ghost(environment.task)(physics, scene)
             for geom in scene.geoms[before : scene.ngeom]:
                 shown[geom.objid] = np.array(geom.pos), np.array(geom.rgba)
 
@@ -113,7 +114,7 @@ class GhostTest(parameterized.TestCase):
         ]  # fmt: skip
         self.assertCountEqual(shown, looks)
         for i, (position, colour) in shown.items():
-            beside = np.array([0, rendering.GHOST_BEHIND, -lift])
+            beside = np.array([0, drawing.GHOST_BEHIND, -lift])
             character = environment.physics.data.geom_xpos[i]
             np.testing.assert_allclose(position, character + beside, atol=1e-5)
             self.assertLess(colour[3], 1)
@@ -151,7 +152,7 @@ class GhostTest(parameterized.TestCase):
 
 class TerrainIsCurrentTest(parameterized.TestCase):
     def assert_drawn_around(self, environment, x):
-        ground, strip = drawn_ground(environment), environment.task.arena.strips[0]
+        ground, strip = drawn_ground(environment), environment.task.arena.grounds[0]
         for centre, _, top in ground:
             np.testing.assert_allclose(top, strip.height(centre), atol=1e-4)
         left, right = ground[:, 0] - ground[:, 1], ground[:, 0] + ground[:, 1]
@@ -302,7 +303,7 @@ class SpatialTest(FolderTest):
     def build(self, terrain, **options):
         environment = suite.build(
             'biped3d', terrain=terrain,
-            task_kwargs={'random': 1, 'terrain_map': True, 'start_phase': 0.0, **options},
+            task_kwargs={'random': 1, 'terrain_observation': 'height', 'start_phase': 0.0, **options},
         )  # fmt: skip
         environment.reset()
         return environment
@@ -350,8 +351,8 @@ class SpatialTest(FolderTest):
 
     def test_height_map_refusals(self):
         for make, options, message in (
-            (lambda: suite.make(GAPS), {}, 'the task Imitation.*no map'),
-            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, 'terrain_map=True'),
+            (lambda: suite.make(GAPS), {}, 'the task PlanarImitation.*no map'),
+            (lambda: suite.make('PD_Biped3D_Imitate-v0'), {}, "terrain_observation='height'"),
             (lambda: self.build('plane'), {'reach': 0}, 'reach is 0'),
             (lambda: self.build('plane'), {'path': self.folder / 'a.gif'}, "suffix '.gif'"),
         ):
@@ -365,7 +366,7 @@ class SpatialTest(FolderTest):
         )
         environment.reset()
         colours = []
-        ghost = rendering._ghost(environment.task)
+        ghost = drawing._ghost(environment.task)
 
         def look(physics, scene):
             before = scene.ngeom
@@ -378,7 +379,7 @@ class SpatialTest(FolderTest):
         environment.physics.render(48, 64, scene_callback=look)
         self.assertEqual({alpha for mover, alpha in colours if mover}, {0.0})
         shown = {round(alpha, 6) for mover, alpha in colours if not mover}
-        self.assertEqual(shown, {rendering.GHOST_COLOUR[3]})
+        self.assertEqual(shown, {drawing.GHOST_COLOUR[3]})
 
     def test_maps_of_terrain(self):
         for name, options in (('a', {}), ('b', {}), ('c', {'seed': 1}), ('d', {'draws': 1})):
@@ -413,7 +414,7 @@ class PlotTerrainTest(FolderTest):
             ('gaps', {'length': float('nan')}, 'length is nan'),
             ('gaps', {'length': -3.0}, 'length is -3.0'),
             ('gaps', {'seed': -1}, 'seed is -1'),
-            ('gaps', {'blend': float('nan')}, 'blend must be a number'),
+            ('gaps', {'terrain_level': float('nan')}, 'terrain_level must be a number'),
         ):
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 rendering.plot_terrain(terrain, self.folder / 'a.png', **options)
@@ -448,6 +449,7 @@ class MissingPartsTest(FolderTest):
         program = f"""
 import numpy as np
 from trl_suite import rendering, suite
+from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 environment.step(np.zeros(11))
@@ -469,6 +471,7 @@ except RuntimeError as error:
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite
+from trl_suite.rendering import drawing
 environment = suite.make({GAPS!r})
 environment.reset()
 print(rendering.frame(environment).std() > 10)

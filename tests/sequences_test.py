@@ -134,7 +134,7 @@ class Keeper(Counter):
 def made_up(id_, policy, episodes, seeds, threads):
     environment, stages = policy
     assert environment == id_ and min(seeds) >= 2**31 and len(seeds) == episodes
-    return {'fraction': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
+    return {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
 
 
 class RunTest(parameterized.TestCase):
@@ -224,7 +224,7 @@ class ExampleTest(absltest.TestCase):
         self.enterContext(
             mock.patch.object(
                 evaluation, 'evaluate',
-                lambda id_, policy, *_: {'fraction': float(np.abs(policy.weights[1]).mean())},
+                lambda id_, policy, *_: {'normalized_return': float(np.abs(policy.weights[1]).mean())},
             )
         )  # fmt: skip
         folder = self.enterContext(tempfile.TemporaryDirectory())

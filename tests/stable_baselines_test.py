@@ -18,8 +18,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from trl_suite import suite
+from trl_suite.adapters.stable_baselines import SuiteVecEnv
 from trl_suite.gym import SuiteEnv
-from trl_suite.stable_baselines import SuiteVecEnv
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
@@ -56,9 +56,9 @@ class StableBaselinesTest(parameterized.TestCase):
             self.assertEqual((our[1].dtype, our[2].dtype), (np.float32, bool))
             np.testing.assert_array_equal(our[2], their[2])
             self.assertEqual(ours.reset_infos, theirs.reset_infos)
-            for row, (one, other) in enumerate(zip(our[3], their[3], strict=True)):
-                self.assertEqual('terminal_observation' in one, our[2][row])
-                if our[2][row]:
+            for env_id, (one, other) in enumerate(zip(our[3], their[3], strict=True)):
+                self.assertEqual('terminal_observation' in one, our[2][env_id])
+                if our[2][env_id]:
                     limits += one['TimeLimit.truncated']
                     falls += one['fell']
                     self.compare(one.pop('terminal_observation'), other.pop('terminal_observation'))
@@ -81,10 +81,10 @@ class StableBaselinesTest(parameterized.TestCase):
         for _ in range(60):
             _, reward, done, infos = envs.step(random.uniform(-1, 1, (3, 6)))
             sums, lengths = sums + reward, lengths + 1
-            for row in np.flatnonzero(done):
-                self.assertAlmostEqual(infos[row]['episode']['r'], sums[row], places=4)
-                self.assertEqual(infos[row]['episode']['l'], lengths[row])
-                sums[row] = lengths[row] = 0
+            for env_id in np.flatnonzero(done):
+                self.assertAlmostEqual(infos[env_id]['episode']['r'], sums[env_id], places=4)
+                self.assertEqual(infos[env_id]['episode']['l'], lengths[env_id])
+                sums[env_id] = lengths[env_id] = 0
                 episodes += 1
         self.assertGreater(episodes, 6)
 

@@ -11,10 +11,10 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import motion, suite
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.characters import make
-from trl_suite.environment import Environment
-from trl_suite.tasks.imitation import Imitation
+from trl_suite.environments.environment import Environment
+from trl_suite.tasks.imitation.planar import PlanarImitation
 from trl_suite.terrain import load
 
 EXAMPLES = (
@@ -45,7 +45,7 @@ def advance(environment, steps, seed=0, scale=1.0):
 
 def walked(environment, distance):
     """Carries the character forward, so that the strip and its window have moved on."""
-    name = environment.task.character.row.name
+    name = environment.task.character.spec.name
     while environment.info['distance'] < distance:
         data = environment.physics.named.data
         data.qpos[f'{name}/root_x/'] += 1.1
@@ -160,7 +160,7 @@ class SaveTest(parameterized.TestCase):
         environment = suite.make(id_, {'random': 6, 'step_limit': None})
         environment.reset()
         walked(environment, 47)
-        low, high = environment.task.arena.strips[0].extent
+        low, high = environment.task.arena.grounds[0].extent
         self.assertGreater(high, 60)
         other = suite.make(id_, {'random': 79, 'step_limit': None})
         self.check(environment, other)
@@ -269,7 +269,7 @@ class PickleTest(parameterized.TestCase):
     def test_built_environments(self):
         environment = suite.build(
             'goat', 'position', {'Type': 'var2d_gaps', 'Params': [{'GapWMin': 0.3, 'GapWMax': 0.4}]},
-            clip=motion.load('dog_bound'), task_kwargs={'random': 1, 'terrain_samples': 20},
+            clip=motion.load('dog_bound'), task_kwargs={'random': 1, 'terrain_observation': 20},
         )  # fmt: skip
         environment.reset()
         advance(environment, 4, scale=0.2)
@@ -290,7 +290,9 @@ class PickleTest(parameterized.TestCase):
         np.testing.assert_array_equal(advance(twin, 30), advance(environment, 30))
 
     def test_one_that_nothing_can_build_again(self):
-        task = Imitation(make('biped2d'), PlanarTerrain(load('flat')), motion.load('biped2d_walk'))
+        task = PlanarImitation(
+            make('biped2d'), PlanarArena(load('flat')), motion.load('biped2d_walk')
+        )
         with self.assertRaisesRegex(TypeError, r'get_state\(\)'):
             pickle.dumps(Environment(task))
 

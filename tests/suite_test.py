@@ -10,7 +10,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 import trl_suite
-from trl_suite import catalogue, characters, motion, resources, suite, terrain
+from trl_suite import characters, motion, suite, terrain
+from trl_suite.registry import catalogue
+from trl_suite.util import resources
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 # The planar ids of tracking that the original registers: 21 of PLAiD and 9 of Imitation.
@@ -125,25 +127,25 @@ HIGH_LEVEL = {
 
 def ids_of(rules):
     """Rows of one task class."""
-    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).rules == rules]
+    return [id_ for id_ in suite.ALL_IDS if suite.find(id_).task_type == rules]
 
 
 def imitation_ids():
     """Rows of the two planar families of tracking."""
-    return ids_of('imitation')
+    return ids_of('planar_imitation')
 
 
 class CatalogueTest(parameterized.TestCase):
     """Every environment is a row."""
 
     def test_counts(self):
-        rows = [suite.find(id_) for id_ in imitation_ids()]
-        self.assertLen(rows, 42)
-        self.assertLen([row for row in rows if 'original' in row.tags], 30)
+        specs = [suite.find(id_) for id_ in imitation_ids()]
+        self.assertLen(specs, 42)
+        self.assertLen([spec for spec in specs if 'original' in spec.tags], 30)
         self.assertLen(ORIGINAL, 30)
         gaits = [suite.find(id_) for id_ in ids_of('gait')]
         self.assertLen(gaits, 43)
-        self.assertLen([row for row in gaits if 'original' in row.tags], 32)
+        self.assertLen([spec for spec in gaits if 'original' in spec.tags], 32)
 
     def test_the_originals_are_tagged(self):
         tagged = {id_ for id_ in imitation_ids() if 'original' in suite.find(id_).tags}
@@ -156,38 +158,38 @@ class CatalogueTest(parameterized.TestCase):
     def test_gaits(self):
         self.assertCountEqual(ids_of('gait'), GAITS)
         for id_, preset in GAITS.items():
-            row = suite.find(id_)
+            spec = suite.find(id_)
             figure = id_.split('_')[1]
-            self.assertEqual((row.terrain, row.character), (preset, FIGURES[figure]))
-            self.assertEqual((row.domain, row.actuation, row.clip), ('terrainrl', 'gait', None))
+            self.assertEqual((spec.terrain, spec.character), (preset, FIGURES[figure]))
+            self.assertEqual((spec.domain, spec.actuation, spec.clip), ('terrainrl', 'gait', None))
             ground = id_.split('_', 3)[3].removesuffix('-v0')
-            self.assertEqual(row.task, f'{figure[:-2]}_{ground}'.lower())
-            self.assertEqual((dict(row.options), row.step_limit), ({}, 5000))
+            self.assertEqual(spec.task, f'{figure[:-2]}_{ground}'.lower())
+            self.assertEqual((dict(spec.options), spec.step_limit), ({}, 5000))
 
     @parameterized.parameters(*list(GAITS)[::4])
     def test_what_an_id_of_a_gait_says(self, id_):
         environment = suite.make(id_, {'random': 0})
         task = environment.task
         self.assertEqual(task.arena.terrain.name, GAITS[id_])
-        self.assertEqual(task.character.row.name, FIGURES[id_.split('_')[1]])
+        self.assertEqual(task.character.spec.name, FIGURES[id_.split('_')[1]])
         self.assertEqual(task.interface, 'parameters')
         self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity'])
         self.assertEqual(environment.step_limit, 5000)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
     def test_three_dimensions(self):
-        self.assertCountEqual([*ids_of('imitation3d'), *ids_of('footsteps')], SPATIAL)
+        self.assertCountEqual([*ids_of('spatial_imitation'), *ids_of('spatial_footsteps')], SPATIAL)
         self.assertCountEqual(
-            [row.id for row in catalogue.ROWS if 'spatial' in row.tags],
+            [spec.id for spec in catalogue.SPECS if 'spatial' in spec.tags],
             [*SPATIAL, *HIGH_LEVEL, *HARD],
         )
         for id_, (task, ground, character, clip, original) in SPATIAL.items():
-            row = suite.find(id_)
-            self.assertEqual((row.task, row.terrain, row.character, row.clip),
+            spec = suite.find(id_)
+            self.assertEqual((spec.task, spec.terrain, spec.character, spec.clip),
                              (task, ground, character, clip))  # fmt: skip
-            self.assertEqual(row.actuation, 'position')
-            self.assertEqual(row.domain, 'imitation' if task.startswith('pd_') else 'deeploco')
-            self.assertEqual(row.tags, {'spatial', 'original' if original else 'completion'})
+            self.assertEqual(spec.actuation, 'position')
+            self.assertEqual(spec.domain, 'imitation' if task.startswith('pd_') else 'deeploco')
+            self.assertEqual(spec.tags, {'spatial', 'original' if original else 'completion'})
         self.assertLen([values for values in SPATIAL.values() if values[-1]], 10)
 
     @parameterized.parameters(*SPATIAL)
@@ -197,30 +199,30 @@ class CatalogueTest(parameterized.TestCase):
         task = environment.task
         self.assertEqual(task.arena.terrain.name, ground)
         self.assertTrue(task.arena.terrain.spatial)
-        self.assertEqual(task.character.row.name, character)
+        self.assertEqual(task.character.spec.name, character)
         self.assertEqual(task.motion.name, clip)
         self.assertEqual(task.actuation_model, 'position')
         self.assertEqual(task.mirrored, 'Symetric' in id_)
         # The others are blind, as in the original.
         self.assertEqual('terrain' in environment.blocks, '_Terrain-' in id_)
-        self.assertEqual('target' in environment.blocks, 'Track' in id_)
+        self.assertEqual('reference' in environment.blocks, 'Track' in id_)
         self.assertEqual(environment.step_limit, 256)
         self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 300)
 
     def test_high_level(self):
-        self.assertCountEqual([*ids_of('hike'), *ids_of('soccer')], HIGH_LEVEL)
+        self.assertCountEqual([*ids_of('goal_navigation'), *ids_of('soccer')], HIGH_LEVEL)
         self.assertEqual(ids_of('soccer'), ['PD_Biped3D_HLC_Soccer-v0'])
         for id_, (ground, _, _, original) in HIGH_LEVEL.items():
-            row = suite.find(id_)
+            spec = suite.find(id_)
             self.assertEqual(
-                (row.domain, row.terrain, row.actuation), ('deeploco', ground, 'position')
+                (spec.domain, spec.terrain, spec.actuation), ('deeploco', ground, 'position')
             )
             character = 'biped3d_mocap_run' if id_.endswith('_Run-v0') else 'biped3d_mocap'
-            self.assertEqual((row.character, row.clip), (character, character))
-            self.assertEqual(row.step_limit, 667 if character.endswith('run') else 400)  # 200 s
+            self.assertEqual((spec.character, spec.clip), (character, character))
+            self.assertEqual(spec.step_limit, 667 if character.endswith('run') else 400)  # 200 s
             self.assertEqual(
-                row.tags, {'spatial', 'hierarchical', 'original' if original else 'completion'}
+                spec.tags, {'spatial', 'hierarchical', 'original' if original else 'completion'}
             )
 
     @parameterized.parameters(*HIGH_LEVEL)
@@ -245,15 +247,15 @@ class CatalogueTest(parameterized.TestCase):
 
     @parameterized.parameters(*HARD)
     def test_without_hierarchy(self, id_):
-        row, environment = suite.find(id_), suite.make(id_, {'random': 0})
+        spec, environment = suite.find(id_), suite.make(id_, {'random': 0})
         original = 'Soccer' not in id_
-        self.assertEqual(row.domain, 'deeploco')
+        self.assertEqual(spec.domain, 'deeploco')
         self.assertEqual(
-            row.tags, {'spatial', 'flat_control', 'original' if original else 'completion'}
+            spec.tags, {'spatial', 'flat_control', 'original' if original else 'completion'}
         )
         task = environment.task
         self.assertEqual(
-            (task.arena.terrain.name, task.character.row.name), (HARD[id_], 'biped3d_mocap')
+            (task.arena.terrain.name, task.character.spec.name), (HARD[id_], 'biped3d_mocap')
         )
         self.assertEqual('terrain' in environment.blocks, original)
         self.assertEqual('ball' in environment.blocks, not original)
@@ -274,23 +276,23 @@ class CatalogueTest(parameterized.TestCase):
             self.assertEqual(suite.find(name).id, id_)
 
     def test_names_are_unique(self):
-        self.assertLen(set(suite.ALL_IDS), len(catalogue.ROWS))
-        self.assertLen(set(suite.ALL_TASKS), len(catalogue.ROWS))
+        self.assertLen(set(suite.ALL_IDS), len(catalogue.SPECS))
+        self.assertLen(set(suite.ALL_TASKS), len(catalogue.SPECS))
         every = [*suite.ALL_IDS, *catalogue.ALIASES]
         self.assertLen(set(every), len(every))
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_row(self, id_):
-        row = suite.find(id_)
-        self.assertEqual(row.id, id_)
+        spec = suite.find(id_)
+        self.assertEqual(spec.id, id_)
         self.assertRegex(id_, r'^\w+(-\w+)?-v\d$')  # what Gymnasium takes for a name
-        self.assertRegex(row.description, r'^[A-Z].*\.$')
-        self.assertNotIn('\n', row.description)
-        self.assertLess(len(row.description), 130)
-        self.assertIn(row.character, characters.CHARACTERS)
-        self.assertIn(row.domain, suite.TASKS_BY_DOMAIN)
-        self.assertRegex(row.task, r'^[a-z0-9_]+$')
-        terrain.load(row.terrain)
+        self.assertRegex(spec.description, r'^[A-Z].*\.$')
+        self.assertNotIn('\n', spec.description)
+        self.assertLess(len(spec.description), 130)
+        self.assertIn(spec.character, characters.CHARACTERS)
+        self.assertIn(spec.domain, suite.TASKS_BY_DOMAIN)
+        self.assertRegex(spec.task, r'^[a-z0-9_]+$')
+        terrain.load(spec.terrain)
 
     def test_descriptions_differ(self):
         descriptions = [suite.find(id_).description for id_ in suite.ALL_IDS]
@@ -298,14 +300,14 @@ class CatalogueTest(parameterized.TestCase):
 
     @parameterized.parameters(*imitation_ids())
     def test_what_an_id_says(self, id_):
-        row, parts = suite.find(id_), id_.removesuffix('-v0').split('_')
+        spec, parts = suite.find(id_), id_.removesuffix('-v0').split('_')
         environment = suite.make(id_, {'random': 0})
         task = environment.task
         self.assertEqual(task.actuation_model, MODELS[parts[0]])
         figure = {'Dog2D': 'dog', 'Raptor2D': 'raptor'}.get(
             parts[1], 'biped2d' if 'LLC' in parts else 'biped2d_full'
         )
-        self.assertEqual(task.character.row.name, figure)
+        self.assertEqual(task.character.spec.name, figure)
         ground = 'Flat' if 'LLC' in parts else '_'.join(p for p in parts[2:] if p != 'Terrain')
         self.assertEqual(task.arena.terrain.name, TERRAINS[ground])
         clips = {'dog': 'dog_bound', 'biped2d_full': 'biped2d_full_walk', 'biped2d': 'biped2d_walk'}
@@ -318,10 +320,10 @@ class CatalogueTest(parameterized.TestCase):
             clip = clips[figure]
         self.assertEqual(task.clip.name, clip)
         self.assertEqual('terrain' in environment.blocks, 'Terrain' in parts)
-        self.assertEqual('target' in environment.blocks, 'LLC' in parts)
+        self.assertEqual('reference' in environment.blocks, 'LLC' in parts)
         self.assertEqual(environment.step_limit, 256)
         self.assertAlmostEqual(environment.control_timestep(), 1 / 30)
-        self.assertEqual(dict(row.options), dict(suite.find(id_).options))
+        self.assertEqual(dict(spec.options), dict(suite.find(id_).options))
 
     def test_tables(self):
         self.assertEqual(
@@ -334,16 +336,16 @@ class CatalogueTest(parameterized.TestCase):
         self.assertCountEqual(flat, suite.ALL_TASKS)
         self.assertEqual(
             set(suite.BENCHMARKING),
-            {(r.domain, r.task) for r in catalogue.ROWS if 'original' in r.tags},
+            {(r.domain, r.task) for r in catalogue.SPECS if 'original' in r.tags},
         )
         self.assertLess(set(suite.BENCHMARKING), set(suite.ALL_TASKS))
 
     def test_rows_cannot_be_changed(self):
-        row = suite.find(GAPS)
+        spec = suite.find(GAPS)
         with self.assertRaises(AttributeError):
-            row.terrain = 'flat'
+            spec.terrain = 'flat'
         with self.assertRaises(TypeError):
-            row.options['terrain_samples'] = 3
+            spec.options['terrain_observation'] = 3
 
 
 class LoadTest(parameterized.TestCase):
@@ -377,7 +379,7 @@ class LoadTest(parameterized.TestCase):
         (lambda: suite.make('PD_Biped2D_Gap_Terrain-v0'), f"unknown environment.*'{GAPS}'"),
         (lambda: suite.make('pd_dog2d_steps_terrain-v0'), "'PD_Dog2D_Steps_Terrain-v0'"),
         (lambda: suite.make('plaid/dog_gap'), "unknown environment.*'plaid/dog_gaps'"),
-        (lambda: suite.make(GAPS, {'terrain_sample': 3}), "unknown option.*'terrain_samples'"),
+        (lambda: suite.make(GAPS, {'terrain_sample': 3}), "unknown option.*'terrain_observation'"),
         (lambda: suite.make(GAPS, {'randm': 3}), "unknown option.*'random'"),
         (lambda: suite.make(GAPS, {'actuation_model': 'torque'}), 'unknown option'),
         (lambda: suite.make(GAPS, None, {'flat': 1}), "unknown option.*'flat_observation'"),
@@ -390,7 +392,7 @@ class LoadTest(parameterized.TestCase):
             "unknown option.*'goal_reached'",
         ),
         (lambda: suite.build('dgo'), "unknown character 'dgo'.*'dog'"),
-        (lambda: suite.build('dog', 'torqe'), "unknown actuation 'torqe'.*'torque'"),
+        (lambda: suite.build('dog', 'torqe'), "unknown actuation .*'torqe'.*'torque'"),
         (lambda: suite.build('dog', terrain='gap'), "unknown terrain 'gap'.*'gaps'"),
         (lambda: suite.build('dog', task='imitate'), "unknown task 'imitate'.*'imitation'"),
         (lambda: suite.build('dog', clip='dog_bond'), "unknown clip 'dog_bond'.*'dog_bound'"),
@@ -414,19 +416,21 @@ class OptionTest(parameterized.TestCase):
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 600)
 
     def test_terrain_samples(self):
-        environment = suite.make(GAPS, {'random': 0, 'terrain_samples': 8})
+        environment = suite.make(GAPS, {'random': 0, 'terrain_observation': 8})
         self.assertEqual(environment.observation_spec()['terrain'].shape, (8,))
-        blind = suite.make(GAPS, {'random': 0, 'terrain_samples': 0})
+        blind = suite.make(GAPS, {'random': 0, 'terrain_observation': 0})
         self.assertNotIn('terrain', blind.observation_spec())
 
     def test_target(self):
-        environment = suite.make(GAPS, {'random': 0, 'target': True})
-        self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity', 'target'])
+        environment = suite.make(GAPS, {'random': 0, 'reference_observation': True})
+        self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity', 'reference'])
 
     def test_position_range(self):
-        environment = suite.make(GAPS, {'centre': 'posture', 'half_range': 0.5})
-        np.testing.assert_array_equal(environment.action_map.centre, 0)  # the biped's posture
-        np.testing.assert_array_equal(environment.action_map.half_range, 0.5)
+        environment = suite.make(GAPS, {'action_offset': 'posture', 'action_scale': 0.5})
+        np.testing.assert_array_equal(
+            environment.action_map.action_offset, 0
+        )  # the biped's posture
+        np.testing.assert_array_equal(environment.action_map.action_scale, 0.5)
 
     def test_limits(self):
         self.assertEqual(suite.make(GAPS, {'step_limit': 9}).step_limit, 9)
@@ -461,9 +465,9 @@ class BuildTest(parameterized.TestCase):
     @parameterized.parameters(
         *(
             (name, model)
-            for name in suite.DEFAULT_CLIPS
+            for name, spec in characters.CHARACTERS.items()
             for model in ('position', 'torque', 'velocity', 'muscle')
-            if model != 'muscle' or not characters.CHARACTERS[name].spatial
+            if spec.clip and (model != 'muscle' or not spec.spatial)
         )
     )
     def test_every_character_with_every_model(self, name, model):
@@ -493,7 +497,7 @@ class BuildTest(parameterized.TestCase):
     def test_every_preset_in_three_dimensions(self, preset, task):
         environment = suite.build(
             'biped3d_mocap', terrain=preset, task=task,
-            task_kwargs={'random': 0, 'terrain_map': True},
+            task_kwargs={'random': 0, 'terrain_observation': 'height'},
         )  # fmt: skip
         self.assertEqual(environment.task.arena.terrain.name, preset)
         self.assertEqual(environment.observation_spec()['terrain'].shape, (1024,))
@@ -548,12 +552,12 @@ class BuildTest(parameterized.TestCase):
         ({'character': 'biped3d_mocap', 'terrain': {'Type': 'var2d_gaps'}, 'task': 'footsteps'},
          "'biped3d_mocap' is three-dimensional and terrain 'var2d_gaps'"),
         ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
-        ({'character': 'dog', 'task': 'hike'}, "'dog' is planar; the task 'hike'"),
+        ({'character': 'dog', 'task': 'goal_navigation'}, "'dog' is planar; the task 'goal_navigation'"),
         ({'character': 'dog', 'task': 'footsteps'}, "'dog' has no right and left foot to place"),
-        ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no right and left foot"),
+        ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no clip of its own"),
         ({'character': 'biped2d_full', 'task': 'footsteps', 'clip': motion.load_steps('biped3d_mocap')},
          "'biped3d_mocap' is a library of steps"),
-        ({'character': 'biped3d', 'task': 'imitation3d'}, "unknown task 'imitation3d'"),
+        ({'character': 'biped3d', 'task': 'spatial_imitation'}, "unknown task 'spatial_imitation'"),
         ({'character': 'biped3d', 'task': 'footsteps'},
          'no library of steps of its own; give clip=, one of .*biped3d_mocap'),
         ({'character': 'biped3d_mocap', 'task': 'footsteps', 'clip': 'biped3d_moca'},
@@ -569,11 +573,11 @@ class BuildTest(parameterized.TestCase):
             suite.build(**arguments)
 
     def test_a_row_on_other_ground(self):
-        row = dataclasses.replace(suite.find('PD_Biped3D_Imitate-v0'), terrain='gaps')
+        spec = dataclasses.replace(suite.find('PD_Biped3D_Imitate-v0'), terrain='gaps')
         with self.assertRaisesRegex(
             ValueError, "'biped3d' is three-dimensional and terrain 'gaps'"
         ):
-            suite.build_task(row)
+            suite.build_task(spec)
 
     def test_terrain_as_mapping_file_and_object(self):
         content = {'Type': 'var2d_steps', 'Params': [{'StepH0Min': 0.3, 'StepH0Max': 0.3}]}
@@ -581,7 +585,9 @@ class BuildTest(parameterized.TestCase):
             path = pathlib.Path(folder) / 'mine.json'
             path.write_text(json.dumps(content))
             blocks = [
-                suite.build('dog', terrain=source, task_kwargs={'random': 2, 'terrain_samples': 50})
+                suite.build(
+                    'dog', terrain=source, task_kwargs={'random': 2, 'terrain_observation': 50}
+                )
                 .reset()
                 .observation['pose']
                 for source in (content, str(path), terrain.load(content))
@@ -602,13 +608,13 @@ class BuildTest(parameterized.TestCase):
             np.testing.assert_array_equal(pose, found[0])
 
     def test_a_row_of_the_users_own(self):
-        row = dataclasses.replace(
-            characters.CHARACTERS['biped2d'], name='mine', fall_links=('root', 'left_knee'),
+        spec = dataclasses.replace(
+            characters.CHARACTERS['biped2d'], name='mine', clip=None, fall_links=('root', 'left_knee'),
             path=str(resources.directory('xml') / 'biped2d.xml'),
         )  # fmt: skip
         with self.assertRaisesRegex(ValueError, 'clip'):
-            suite.build(row)
-        environment = suite.build(row, clip='biped2d_walk', task_kwargs={'random': 0})
+            suite.build(spec)
+        environment = suite.build(spec, clip='biped2d_walk', task_kwargs={'random': 0})
         environment.reset()
         self.assertEqual(environment.step(np.zeros(6)).observation['pose'].shape, (15,))
 

@@ -7,9 +7,11 @@ import tempfile
 import numpy as np
 from absl.testing import absltest, parameterized
 
-from trl_suite import policies, scripted, suite
-from trl_suite.symmetry import Mirror, blocks, exchanged
-from trl_suite.tasks.imitation3d import joint_targets
+from trl_suite import policies, suite
+from trl_suite.policies import files
+from trl_suite.policies.mirror import Mirror, blocks, exchanged
+from trl_suite.tasks.imitation.spatial import joint_targets
+from trl_suite.tasks.navigation import scripted
 from trl_suite.vector import VectorEnvironment
 
 SOCCER = 'PD_Biped3D_HLC_Soccer-v0'
@@ -22,15 +24,15 @@ CASES = (
     ('biped3d_mocap_run', 'position', 'plane', 'imitation', {}),
     ('biped3d_mocap_run', 'position', 'plane', 'footsteps', {}),
     ('biped3d_full_mocap', 'position', 'plane', 'footsteps', {}),
-    ('biped3d_full_mocap', 'position', 'plane', 'imitation', {'centre': 'original'}),
-    ('biped3d', 'position', 'plane', 'imitation', {'centre': 'original', 'terrain_map': True}),
-    ('biped3d', 'position', 'plane', 'imitation', {'centre': 'posture'}),
+    ('biped3d_full_mocap', 'position', 'plane', 'imitation', {'action_offset': 'original'}),
+    ('biped3d', 'position', 'plane', 'imitation', {'action_offset': 'original', 'terrain_observation': 'height'}),
+    ('biped3d', 'position', 'plane', 'imitation', {'action_offset': 'posture'}),
     ('biped3d', 'torque', 'plane', 'imitation', {}),
-    ('biped3d_mocap', 'torque', 'plane', 'footsteps', {'terrain_map': True}),
+    ('biped3d_mocap', 'torque', 'plane', 'footsteps', {'terrain_observation': 'height'}),
     ('biped3d', 'velocity', 'plane', 'imitation', {}),
     ('biped3d_mocap', 'velocity', 'plane', 'footsteps', {}),
-    ('biped3d', 'position', 'stairs3d', 'imitation', {'terrain_map': True}),
-    ('biped3d_mocap', 'position', 'ramp3d', 'footsteps', {'terrain_map': True}),
+    ('biped3d', 'position', 'stairs3d', 'imitation', {'terrain_observation': 'height'}),
+    ('biped3d_mocap', 'position', 'ramp3d', 'footsteps', {'terrain_observation': 'height'}),
 )  # fmt: skip
 
 
@@ -202,7 +204,7 @@ class TaskTest(parameterized.TestCase):
             left = mirror.left(first)
             both += 0 < left.sum() < 6
             action = 0.3 * rng.uniform(-1, 1, (6, 17))
-            a, b = plain.step(mirror.answered(action, left)), mirrored.step(action)
+            a, b = plain.step(mirror.unmirror_action(action, left)), mirrored.step(action)
             np.testing.assert_array_equal(a.reward, b.reward)
             first = a.observation
             canonical, left = mirror.canonical(first)
@@ -258,7 +260,7 @@ class PlanTest(parameterized.TestCase):
         again = mirror.observation(theirs.observation['observations'][None])[0]
         turned = mine.observation['observations'][105] - first[105]  # where the goal is seen
         self.assertGreater(abs(turned), 0.2)
-        shown = np.r_[environment.blocks['pose'], environment.blocks['target'], 107:109]
+        shown = np.r_[environment.blocks['pose'], environment.blocks['goal'], 107:109]
         np.testing.assert_allclose(
             again[shown], mine.observation['observations'][shown], rtol=0, atol=0.06
         )
@@ -282,12 +284,12 @@ class PlanTest(parameterized.TestCase):
                 )
 
     def test_every_footstep_begins_with_a_foot_ahead(self):
-        rows = VectorEnvironment(SOCCER, 16, 1, seed=0)
-        plan, observation = scripted.scripted(rows), rows.reset()
+        specs = VectorEnvironment(SOCCER, 16, 1, seed=0)
+        plan, observation = scripted.scripted(specs), specs.reset()
         for _ in range(6):
-            left = rows.task.mirror.left(observation)
-            np.testing.assert_array_equal(left, rows.task.stance == 1)
-            observation = rows.step(plan(observation)).observation
+            left = specs.task.mirror.left(observation)
+            np.testing.assert_array_equal(left, specs.task.stance == 1)
+            observation = specs.step(plan(observation)).observation
 
     def test_who_acts_joints_too_has_none(self):
         self.assertIsNone(suite.make(SOCCER, {'interface': 'frame'}).task.mirror)
@@ -327,7 +329,9 @@ class MirrorTest(parameterized.TestCase):
         canonical, left = mirror.canonical(observation)
         np.testing.assert_array_equal(canonical, [observation[0], reflected[1]])
         action = np.array([[0.1, 0.2], [0.1, 0.2]])
-        np.testing.assert_array_equal(mirror.answered(action, left), [[0.1, 0.2], [0.2, 0.1]])
+        np.testing.assert_array_equal(
+            mirror.unmirror_action(action, left), [[0.1, 0.2], [0.2, 0.1]]
+        )
         np.testing.assert_array_equal(action, [[0.1, 0.2], [0.1, 0.2]])
 
     def test_by_the_foot_ahead(self):
@@ -388,8 +392,8 @@ class PolicyTest(parameterized.TestCase):
         self.path = pathlib.Path(folder.name) / 'p.npz'
         self.environment, _ = build(STEP)
         self.policy = policy_for(self.environment)
-        rows = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 30, 1, seed=4)
-        self.observation = rows.reset()
+        environments = VectorEnvironment('PD_Biped3D_LLC_General_Step-v0', 30, 1, seed=4)
+        self.observation = environments.reset()
 
     def test_reflected_observations_get_reflected_actions(self):
         mirror = self.environment.task.mirror
@@ -403,7 +407,7 @@ class PolicyTest(parameterized.TestCase):
         plain = dataclasses.replace(self.policy, mirror=None)
         np.testing.assert_array_equal(action[~left], plain(self.observation[~left]))
         self.assertTrue((action[left] != plain(self.observation[left])).any(1).all())
-        # A row does not depend on the others.
+        # A simulation does not depend on the others.
         for i in range(30):
             np.testing.assert_array_equal(self.policy(self.observation[i]), action[i])
 
@@ -413,7 +417,7 @@ class PolicyTest(parameterized.TestCase):
             names = [name for name in data.files if name.startswith('mirror_')]
             self.assertLen(names, 5)
             for name in names:
-                self.assertRegex(policies.__doc__, rf'\n    {name}  ')
+                self.assertRegex(files.__doc__, rf'\n    {name}  ')
                 self.assertIn(data[name].dtype.kind, 'iuf')
                 if data[name].dtype.kind == 'f':
                     self.assertIn(data[name].dtype, (np.float32, np.float16))

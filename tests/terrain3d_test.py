@@ -11,7 +11,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain import noise, spatial, spatial_ground
+from trl_suite.terrain.spatial import generators as spatial
+from trl_suite.terrain.spatial import noise
+from trl_suite.terrain.spatial import windows as spatial_ground
 
 GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
 BOXED = ('blocks3d', 'pillars3d', 'path3d', 'path3d_wide', 'ramp3d', 'stairs3d')
@@ -19,7 +21,7 @@ MOVING = ('conveyor3d', 'conveyor3d_wide', 'dynamic_obstacles3d')
 
 
 def make(source, seed=0, **options):
-    return terrain.Ground(terrain.load(source), seed, **options)
+    return terrain.SpatialGround(terrain.load(source), seed, **options)
 
 
 def around(source, seeds, xy=None):
@@ -27,8 +29,8 @@ def around(source, seeds, xy=None):
     ground = terrain.load(source)
     found = terrain.Surroundings(len(seeds), terrain.capacity(ground))
     xy = np.zeros((len(seeds), 2)) if xy is None else xy
-    for row, seed in enumerate(seeds):
-        found.begin(row, terrain.Ground(ground, seed), xy[row])
+    for env_id, seed in enumerate(seeds):
+        found.begin(env_id, terrain.SpatialGround(ground, seed), xy[env_id])
     return found
 
 
@@ -212,7 +214,7 @@ class ObstaclesTest(parameterized.TestCase):
             touching = ((begin <= 2) & (end >= -2)).all(1)
             self.assertFalse(touching.any())
             x, y = np.random.default_rng(seed).uniform(-30, 30, (2, 4000))
-            covered.append((terrain.Ground(ground, seed).height(x, y) > 0.03).mean())
+            covered.append((terrain.SpatialGround(ground, seed).height(x, y) > 0.03).mean())
         self.assertAlmostEqual(np.mean(covered), cover, delta=0.25 * cover)
 
     def test_ground_does_not_depend_on_requests(self):
@@ -469,7 +471,7 @@ class GroundTest(parameterized.TestCase):
         ground = make(source, np.random.SeedSequence(5).spawn(3)[2])
         x, y = np.random.default_rng(0).uniform(-15, 15, (2, 400))
         for other in (
-            terrain.Ground.from_state(pickle.loads(pickle.dumps(ground.state()))),
+            terrain.SpatialGround.from_state(pickle.loads(pickle.dumps(ground.state()))),
             pickle.loads(pickle.dumps(ground)),
         ):
             np.testing.assert_array_equal(other.height(x, y), ground.height(x, y))
@@ -481,7 +483,7 @@ class GroundTest(parameterized.TestCase):
     def test_same_ground_in_another_process(self):
         code = (
             'from trl_suite import terrain as t; '
-            'print([t.Ground(t.load(n), 7).height([9.1, -9.1], [3.2, 3.2]).tolist() for n in '
+            'print([t.SpatialGround(t.load(n), 7).height([9.1, -9.1], [3.2, 3.2]).tolist() for n in '
             "('trail3d2', 'steps3d', 'stairs3d', 'pillars3d')])"
         )
         root = pathlib.Path(terrain.__file__).parents[2]
@@ -544,7 +546,7 @@ class GroundTest(parameterized.TestCase):
             same = np.abs(trail.heading - heading) < 1e-12
             self.assertLess(np.abs(across[same]).min(), 1e-9)
             nearest = np.linalg.norm(0.5 * (trail.start + trail.end) - (x, y), axis=1).argmin()
-            for rule, most in (('hike', 10), ('step', 1)):
+            for rule, most in (('far', 10), ('near', 1)):
                 goal = ground.goal(rng, (x, y), rule)
                 ahead = [
                     k
@@ -567,10 +569,10 @@ class GroundTest(parameterized.TestCase):
     def test_spawn_at_the_start(self, source):
         ground, rng = make(source), np.random.RandomState(1)
         self.assertEqual(ground.spawn(rng), (0.0, 0.0, 0.0))
-        hikes = np.array([ground.goal(rng, (5.0, 7.0)) for _ in range(200)])
-        self.assertBetween(np.abs(hikes[:, :2] - (5, 7)).max(), 2.9, 3)
-        np.testing.assert_allclose(hikes[:, 2], ground.height(hikes[:, 0], hikes[:, 1]), atol=1e-6)
-        steps = np.array([ground.goal(rng, (5.0, 7.0), 'step', distance=0.5) for _ in range(200)])
+        far = np.array([ground.goal(rng, (5.0, 7.0)) for _ in range(200)])
+        self.assertBetween(np.abs(far[:, :2] - (5, 7)).max(), 2.9, 3)
+        np.testing.assert_allclose(far[:, 2], ground.height(far[:, 0], far[:, 1]), atol=1e-6)
+        steps = np.array([ground.goal(rng, (5.0, 7.0), 'near', distance=0.5) for _ in range(200)])
         np.testing.assert_array_equal(steps[:, 1], 0)
         self.assertBetween(steps[:, 0].min() - 5, 0.5, 0.6)
         self.assertBetween(steps[:, 0].max() - 5, 2.9, 3)
@@ -593,15 +595,15 @@ class GroundTest(parameterized.TestCase):
 
     def test_refuses(self):
         with self.assertRaisesRegex(ValueError, 'hills3d.*three-dimensional'):
-            terrain.Strip(terrain.load('hills3d'), 0)
+            terrain.PlanarGround(terrain.load('hills3d'), 0)
         with self.assertRaisesRegex(ValueError, 'gaps.*planar'):
-            terrain.Ground(terrain.load('gaps'), 0)
+            terrain.SpatialGround(terrain.load('gaps'), 0)
         with self.assertRaisesRegex(TypeError, 'seed'):
             make('hills3d', 1.5)
         with self.assertRaisesRegex(ValueError, 'finite'):
             make('hills3d').height(0.0, math.nan)
-        with self.assertRaisesRegex(ValueError, 'blend'):
-            make('hills3d', blend=math.nan)
+        with self.assertRaisesRegex(ValueError, 'terrain_level'):
+            make('hills3d', terrain_level=math.nan)
 
 
 class FileTest(parameterized.TestCase):
@@ -611,7 +613,7 @@ class FileTest(parameterized.TestCase):
         self.assertTrue(ground.spatial)
         self.assertEqual(ground.name, name)
         self.assertEqual(pickle.loads(pickle.dumps(ground)), ground)
-        self.assertTrue(np.isfinite(terrain.Ground(ground, 0).height(3.0, 1.0)))
+        self.assertTrue(np.isfinite(terrain.SpatialGround(ground, 0).height(3.0, 1.0)))
 
     def test_presets_that_environments_use(self):
         self.assertContainsSubset(
@@ -660,7 +662,8 @@ class FileTest(parameterized.TestCase):
             'Params': [{'ConveyorNumStrips': 1}, {'ConveyorNumStrips': 4}],
         }
         counts = [
-            len(make(mixed, 0, blend=blend).layout.belts.velocity) for blend in (0, 0.5, 0.7, 1)
+            len(make(mixed, 0, terrain_level=terrain_level).layout.belts.velocity)
+            for terrain_level in (0, 0.5, 0.7, 1)
         ]
         self.assertEqual(counts, [1, 2, 3, 4])
         self.assertEqual(terrain.capacity(terrain.load(mixed)).belts, 4)
@@ -690,13 +693,15 @@ class RegisterTest(parameterized.TestCase):
         rng = np.random.default_rng(0)
         x, y = rng.uniform(-8, 8, (2, 4, 2000))
         heights, velocity = found.height(x, y), found.velocity(x, y)
-        for row, ground in enumerate(found.grounds):
-            np.testing.assert_allclose(heights[row], ground.height(x[row], y[row]), atol=1e-12)
-            np.testing.assert_array_equal(velocity[row], ground.velocity(x[row], y[row]))
-            self.assertGreater(np.ptp(heights[row][heights[row] > 0.41]), 0.2)  # the slope
-            area = (heights[row] > 0.45).mean() * 256
+        for env_id, ground in enumerate(found.grounds):
+            np.testing.assert_allclose(
+                heights[env_id], ground.height(x[env_id], y[env_id]), atol=1e-12
+            )
+            np.testing.assert_array_equal(velocity[env_id], ground.velocity(x[env_id], y[env_id]))
+            self.assertGreater(np.ptp(heights[env_id][heights[env_id] > 0.41]), 0.2)  # the slope
+            area = (heights[env_id] > 0.45).mean() * 256
             self.assertBetween(area, 3, 6)
-            self.assertAlmostEqual(velocity[row].any(1).mean() * 256, 12, delta=3)
+            self.assertAlmostEqual(velocity[env_id].any(1).mean() * 256, 12, delta=3)
         self.assertFalse(
             np.array_equal(found.height(x[:1].repeat(4, 0), y[:1].repeat(4, 0))[0], heights[1])
         )
@@ -743,7 +748,7 @@ class RegisterTest(parameterized.TestCase):
         holds = terrain.capacity(ground)
         terrain.register3d('moody3d', replace=True)(lambda parameters, rng: terrain.Layout())
         with self.assertRaisesRegex(ValueError, 'moody3d.*same kinds'):
-            terrain.Surroundings(1, holds).begin(0, terrain.Ground(ground, 0))
+            terrain.Surroundings(1, holds).begin(0, terrain.SpatialGround(ground, 0))
 
 
 class SurroundingsTest(parameterized.TestCase):
@@ -759,22 +764,28 @@ class SurroundingsTest(parameterized.TestCase):
             xy[:, 1:] + rng.uniform(-12, 12, (5, 600)),
         )
         heights, velocity = found.height(x, y), found.velocity(x, y)
-        for row, ground in enumerate(found.grounds):
-            np.testing.assert_allclose(heights[row], ground.height(x[row], y[row]), atol=2e-6)
-            np.testing.assert_array_equal(velocity[row], ground.velocity(x[row], y[row]))
-        rows = np.array([1, 4])
-        np.testing.assert_array_equal(found.height(x[rows], y[rows], rows), heights[rows])
+        for env_id, ground in enumerate(found.grounds):
+            np.testing.assert_allclose(
+                heights[env_id], ground.height(x[env_id], y[env_id]), atol=2e-6
+            )
+            np.testing.assert_array_equal(velocity[env_id], ground.velocity(x[env_id], y[env_id]))
+        env_ids = np.array([1, 4])
+        np.testing.assert_array_equal(
+            found.height(x[env_ids], y[env_ids], env_ids), heights[env_ids]
+        )
         np.testing.assert_array_equal(found.height(x[2:3], y[2:3], slice(2, 3)), heights[2:3])
-        np.testing.assert_array_equal(found.velocity(x[rows], y[rows], rows), velocity[rows])
+        np.testing.assert_array_equal(
+            found.velocity(x[env_ids], y[env_ids], env_ids), velocity[env_ids]
+        )
 
     def samples(self, xy, heading):
         """Points of maps, one by one, in the order of the original."""
         points = np.zeros((len(xy), 1024, 2))
-        for row, (root, psi) in enumerate(zip(xy, heading, strict=True)):
+        for env_id, (root, psi) in enumerate(zip(xy, heading, strict=True)):
             for v in range(32):
                 for u in range(32):
                     forward, right = -1 + 11 * u / 31, -5.5 + 11 * v / 31
-                    points[row, 32 * v + u] = (
+                    points[env_id, 32 * v + u] = (
                         root
                         + forward * np.array([np.cos(psi), np.sin(psi)])
                         + right * np.array([np.sin(psi), -np.cos(psi)])
@@ -796,29 +807,29 @@ class SurroundingsTest(parameterized.TestCase):
         velocities = found.velocity_map(xy, heading)
         self.assertEqual((heights.shape, velocities.shape), ((count, 1024), (count, 2048)))
         differing = 0
-        for row, ground in enumerate(found.grounds):
-            centres = found.centres()[row] if found.capacity.movers else None
-            direction = found.direction[row] if found.capacity.movers else None
-            under = ground.height(*xy[row], centres)
-            expected = ground.height(*points[row].T, centres) - under
+        for env_id, ground in enumerate(found.grounds):
+            centres = found.centres()[env_id] if found.capacity.movers else None
+            direction = found.direction[env_id] if found.capacity.movers else None
+            under = ground.height(*xy[env_id], centres)
+            expected = ground.height(*points[env_id].T, centres) - under
             # Within rounding of an edge of a box either side may be taken.
-            off = np.abs(heights[row] - expected) > 3e-6
+            off = np.abs(heights[env_id] - expected) > 3e-6
             differing += off.sum()
-            flow = ground.velocity(*points[row].T, centres, direction)
-            flow = flow - ground.velocity(*xy[row], centres, direction)
-            cosine, sine = np.cos(heading[row]), np.sin(heading[row])
+            flow = ground.velocity(*points[env_id].T, centres, direction)
+            flow = flow - ground.velocity(*xy[env_id], centres, direction)
+            cosine, sine = np.cos(heading[env_id]), np.sin(heading[env_id])
             forward = flow @ (cosine, sine)
             right = flow @ (sine, -cosine)
-            np.testing.assert_allclose(velocities[row, :1024][~off], forward[~off], atol=1e-12)
-            np.testing.assert_allclose(velocities[row, 1024:][~off], right[~off], atol=1e-12)
+            np.testing.assert_allclose(velocities[env_id, :1024][~off], forward[~off], atol=1e-12)
+            np.testing.assert_allclose(velocities[env_id, 1024:][~off], right[~off], atol=1e-12)
         self.assertLessEqual(differing, 2)
         self.assertEqual(bool(velocities.any()), source in MOVING)
-        rows = np.array([0, 7, 18])
+        env_ids = np.array([0, 7, 18])
         np.testing.assert_array_equal(
-            found.height_map(xy[rows], heading[rows], rows), heights[rows]
+            found.height_map(xy[env_ids], heading[env_ids], env_ids), heights[env_ids]
         )
         np.testing.assert_array_equal(
-            found.velocity_map(xy[rows], heading[rows], rows), velocities[rows]
+            found.velocity_map(xy[env_ids], heading[env_ids], env_ids), velocities[env_ids]
         )
         out = np.zeros((count, 3072))
         found.height_map(xy, heading, out=out[:, :1024])
@@ -867,12 +878,12 @@ class SurroundingsTest(parameterized.TestCase):
                 xy[:, :1] + rng.uniform(-11.4, 11.4, (2, 9)),
                 xy[:, 1:] + rng.uniform(-11.4, 11.4, (2, 9)),
             )
-            for row, ground in enumerate(found.grounds):
+            for env_id, ground in enumerate(found.grounds):
                 np.testing.assert_allclose(
-                    found.height(x, y)[row], ground.height(x[row], y[row]), atol=2e-6
+                    found.height(x, y)[env_id], ground.height(x[env_id], y[env_id]), atol=2e-6
                 )
         self.assertBetween(len(laid), 20, 60)
-        # Only the rows that are given, and a jump.
+        # Only the simulations that are given, and a jump.
         self.assertEqual(found.follow(np.array([(999.0, -3.0)]), np.array([1])), [1])
         self.assertEqual(
             found.height(np.array([[999.0]]), np.array([[-3.0]]), np.array([1])).shape, (1, 1)
@@ -926,8 +937,10 @@ class SurroundingsTest(parameterized.TestCase):
         found = around({'Type': 'crowd3d'}, range(2))
         self.assertEqual(found.arrays.bins[0, 3, 5].tolist(), [0, 90])  # they do not fit into bins
         x, y = np.random.default_rng(0).uniform(-15, 15, (2, 2, 500))
-        for row, ground in enumerate(found.grounds):
-            np.testing.assert_array_equal(found.height(x, y)[row], ground.height(x[row], y[row]))
+        for env_id, ground in enumerate(found.grounds):
+            np.testing.assert_array_equal(
+                found.height(x, y)[env_id], ground.height(x[env_id], y[env_id])
+            )
 
     def test_wrong_shapes_are_refused(self):
         found = around('plane', [0, 1])
@@ -949,8 +962,8 @@ class SurroundingsTest(parameterized.TestCase):
         for part in ('way', 'direction', 'centre'):
             np.testing.assert_array_equal(getattr(other, part)[2], getattr(found, part)[1])
         x, y = xy[1:, :1] + np.linspace(-8, 8, 50), xy[1:, 1:] + np.linspace(-8, 8, 50)
-        rows = np.array([1])
-        np.testing.assert_array_equal(other.height(x, y, rows + 1), found.height(x, y, rows))
+        env_ids = np.array([1])
+        np.testing.assert_array_equal(other.height(x, y, env_ids + 1), found.height(x, y, env_ids))
         empty = terrain.Surroundings(1, found.capacity)
         empty.restore(0, empty.state(0))
         self.assertIsNone(empty.grounds[0])
@@ -961,7 +974,7 @@ class SurroundingsTest(parameterized.TestCase):
         holds = terrain.capacity(ground)
         most = 0
         for seed in range(100, 160):
-            layout = terrain.Ground(ground, seed).layout
+            layout = terrain.SpatialGround(ground, seed).layout
             for centre in ((0, 0), (24, -20), (400, 8)):
                 low = np.array(centre) - 16.0
                 most = max(most, len(layout.boxes_in(low, low + 32).top))
@@ -972,7 +985,7 @@ class SurroundingsTest(parameterized.TestCase):
         ground = terrain.load('pillars3d')
         holds = terrain.capacity(ground)._replace(boxes=40)
         found = terrain.Surroundings(1, holds)
-        found.begin(0, terrain.Ground(ground, 0))
+        found.begin(0, terrain.SpatialGround(ground, 0))
         x, y = np.random.default_rng(0).uniform(-5, 5, (2, 1, 500))
         np.testing.assert_array_equal(found.height(x, y)[0], found.grounds[0].height(x[0], y[0]))
         self.assertLen(found.boxes[0].top, 40)

@@ -13,7 +13,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain import generators
+from trl_suite.terrain.planar import generators
 
 # The example printed in the paper.
 PAPER = """
@@ -336,17 +336,17 @@ class FileTest(parameterized.TestCase):
 
     def test_blend(self):
         ground = terrain.load('gaps_curriculum')
-        for blend, low, high in (
+        for terrain_level, low, high in (
             (0, 0.1, 0.25), (0.5, 0.3, 0.875), (1, 0.5, 1.5), (-3, 0.1, 0.25), (7, 0.5, 1.5),
         ):  # fmt: skip
-            values = ground.parameters(blend)
+            values = ground.parameters(terrain_level)
             self.assertAlmostEqual(values['GapWMin'], low)
             self.assertAlmostEqual(values['GapWMax'], high)
             self.assertEqual(values['GapSpacingMin'], 4)
         self.assertEqual(ground.parameters(), ground.parameters(0))
-        for blend in (math.nan, True, '0'):
-            with self.assertRaisesRegex(ValueError, 'blend must be a number'):
-                ground.parameters(blend)
+        for terrain_level in (math.nan, True, '0'):
+            with self.assertRaisesRegex(ValueError, 'terrain_level must be a number'):
+                ground.parameters(terrain_level)
 
     def test_blend_of_three_sets_and_of_defaults(self):
         sets = [{'GapWMin': 0.1, 'GapWMax': 0.1}, {}, {'GapWMin': 1, 'GapWMax': 1}]
@@ -357,8 +357,10 @@ class FileTest(parameterized.TestCase):
 
     def test_blended_strip(self):
         easy, hard = (
-            terrain.Strip(terrain.load('bumps_blend'), 0, blend=blend).height(np.arange(1, 20, 0.1))
-            for blend in (0, 1)
+            terrain.PlanarGround(
+                terrain.load('bumps_blend'), 0, terrain_level=terrain_level
+            ).height(np.arange(1, 20, 0.1))
+            for terrain_level in (0, 1)
         )
         np.testing.assert_array_equal(easy, 0)
         self.assertGreater(np.abs(hard).max(), 0.06)
@@ -367,7 +369,7 @@ class FileTest(parameterized.TestCase):
     def test_preset(self, name):
         ground = terrain.load(name)
         self.assertEqual(ground.name, name)
-        strip = terrain.Strip(ground, 1, blend=1)
+        strip = terrain.PlanarGround(ground, 1, terrain_level=1)
         heights, _ = strip.window(-2000, 4001)  # 100 m
         self.assertTrue(np.isfinite(heights).all())
         if name != 'flat':
@@ -478,7 +480,7 @@ class RegisterTest(parameterized.TestCase):
             return terrain.Profile(heights, np.diff(heights, prepend=0.0) < 0)
 
         ground = terrain.load({'Type': 'var2d_saw', 'Params': [{'ToothW': 0.5}]})
-        heights = terrain.Strip(ground, 0).height(1 + np.arange(0, 10, 0.5) - 1e-9)
+        heights = terrain.PlanarGround(ground, 0).height(1 + np.arange(0, 10, 0.5) - 1e-9)
         np.testing.assert_array_less(heights[1:], 0.2 + 1e-9)
         np.testing.assert_array_less(0.1 - 1e-6, heights[1:])
         with self.assertRaisesRegex(ValueError, "did you mean 'ToothW'"):
@@ -508,7 +510,7 @@ class RegisterTest(parameterized.TestCase):
     )
     def test_bad_generator(self, make, message):
         terrain.register('mine')(lambda parameters, length, rng: make())
-        strip = terrain.Strip(terrain.load({'Type': 'mine'}), 0)
+        strip = terrain.PlanarGround(terrain.load({'Type': 'mine'}), 0)
         with self.assertRaisesRegex(ValueError, f"'mine'.*{message}"):
             strip.height(5.0)
 
@@ -525,7 +527,7 @@ class StripTest(parameterized.TestCase):
     """The endless ground."""
 
     def make(self, name='slopes_mixed', seed=0, **options):
-        return terrain.Strip(terrain.load(name), seed, **options)
+        return terrain.PlanarGround(terrain.load(name), seed, **options)
 
     @parameterized.parameters('gaps', 'slopes_humanoid', 'bumps', 'cliffs_rugged')
     def test_intended_start(self, name):
@@ -603,8 +605,8 @@ class StripTest(parameterized.TestCase):
 
     def test_streams_of_level_ground(self):
         # They are made when they are asked for; a state has them all the same.
-        state = terrain.Strip(terrain.load('flat'), 3).state()
-        other = terrain.Strip(terrain.load('slopes'), 3).state()
+        state = terrain.PlanarGround(terrain.load('flat'), 3).state()
+        other = terrain.PlanarGround(terrain.load('slopes'), 3).state()
         self.assertEqual(state['right'], other['right'])
         self.assertEqual(state['left'], other['left'])
         self.assertEqual(state['right'], np.random.PCG64(3).state)
@@ -616,7 +618,7 @@ class StripTest(parameterized.TestCase):
     def test_same_ground_in_another_process(self):
         code = (
             'from trl_suite import terrain as t; '
-            "print(t.Strip(t.load('slopes_mixed'), 7).height([9.1, -9.1]).tolist())"
+            "print(t.PlanarGround(t.load('slopes_mixed'), 7).height([9.1, -9.1]).tolist())"
         )
         root = pathlib.Path(terrain.__file__).parents[2]
         output = subprocess.run(
@@ -643,7 +645,7 @@ class StripTest(parameterized.TestCase):
         strip = self.make('slopes_mixed')
         strip.ensure(-30, 50)
         state = pickle.loads(pickle.dumps(strip.state()))
-        ways = [terrain.Strip.from_state(state), pickle.loads(pickle.dumps(strip))]
+        ways = [terrain.PlanarGround.from_state(state), pickle.loads(pickle.dumps(strip))]
         other = self.make('gaps', 9)
         other.ensure(-60, 60)
         other.set_state(state)

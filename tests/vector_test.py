@@ -1,4 +1,4 @@
-"""Many rows behave as single environments do, bit for bit, and never disturb each other."""
+"""Many simulations behave as single environments do, bit for bit, and never disturb each other."""
 
 import multiprocessing
 import os
@@ -11,25 +11,26 @@ import numpy as np
 from absl.testing import parameterized
 from helpers import assert_rows_are_singles
 
-from trl_suite import catalogue, suite
+from trl_suite import suite
+from trl_suite.registry import catalogue
 from trl_suite.vector import AUTORESET, VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
-LIMIT = 12  # control steps: short episodes, so that rows are reset in the middle
+LIMIT = 12  # control steps: short episodes, so that simulations are reset in the middle
 
 
 class IdentityTest(parameterized.TestCase):
-    """A row is the single environment with its seed."""
+    """A simulation is the single environment with its seed."""
 
     @parameterized.parameters(*suite.ALL_IDS)
     def test_every_row_is_a_single_environment(self, id_):
         # A step of a gait is a whole cycle, one above a controller a footstep; gait_test and
         # high_level_test look closer.
         limit, steps, scale = LIMIT, 2 * LIMIT + 6, 1.0
-        if suite.find(id_).rules == 'gait':
+        if suite.find(id_).task_type == 'gait':
             limit, steps, scale = 1, 4, 0.3
-        elif suite.find(id_).rules in ('hike', 'soccer'):
+        elif suite.find(id_).task_type in ('goal_navigation', 'soccer'):
             limit, steps = 3, 8
         _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5)
         self.assertGreaterEqual(ends, 6)
@@ -38,28 +39,28 @@ class IdentityTest(parameterized.TestCase):
     def test_threads_do_not_matter(self, threads):
         found = []
         for number in (1, threads):
-            rows = VectorEnvironment(GAPS, 5, num_threads=number, seed=1)
-            rows.reset()
+            environments = VectorEnvironment(GAPS, 5, num_threads=number, seed=1)
+            environments.reset()
             random = np.random.default_rng(3)
             for _ in range(30):
-                step = rows.step(random.uniform(-1, 1, (5, 11)))
+                step = environments.step(random.uniform(-1, 1, (5, 11)))
             found.append(step.observation)
         np.testing.assert_array_equal(*found)
 
     @parameterized.parameters('MTU_Biped2D_LLC_Imitate_Flat-v0', 'PD_Dog2D_Slopes_Terrain-v0')
     def test_rows_are_reset_as_the_engine_does(self, id_):
-        rows = VectorEnvironment(id_, 4, 1, seed=1)
-        rows.reset()
-        rows.step(np.ones((4, len(rows.action_map))))
-        world, which, found = rows.task.world, np.array([1, 3]), []
-        for row in which:
-            world.set_state(row, np.ones_like(world.get_state(row)))
+        specs = VectorEnvironment(id_, 4, 1, seed=1)
+        specs.reset()
+        specs.step(np.ones((4, len(specs.action_map))))
+        world, which, found = specs.task.world, np.array([1, 3]), []
+        for env_id in which:
+            world.set_state(env_id, np.ones_like(world.get_state(env_id)))
         world.reset(which)
         fresh = mujoco.MjData(world.models[0])
         initial = np.empty(len(world.get_state(0)))
         mujoco.mj_getState(world.models[0], fresh, initial, mujoco.mjtState.mjSTATE_INTEGRATION)
-        for row in range(4):
-            found.append((world.get_state(row) == initial).all())
+        for env_id in range(4):
+            found.append((world.get_state(env_id) == initial).all())
         self.assertEqual(found, [False, True, False, True])
         np.testing.assert_array_equal(world.qpos[which], [fresh.qpos] * 2)
         self.assertFalse(world.diverged()[which].any())
@@ -76,30 +77,33 @@ class IdentityTest(parameterized.TestCase):
             np.testing.assert_array_equal(a.reward, b.reward[:2])
 
     def test_long_runs_go_over_new_ground(self):
-        # 14 m at 4 m/s: the window of boxes is laid anew, at another time in every row.
-        rows = VectorEnvironment('PD_Dog2D_Slopes_Terrain-v0', 3, 2, seed=2, autoreset='disabled')
+        # 14 m at 4 m/s: the window of boxes is laid anew, at another time in every simulation.
+        environments = VectorEnvironment(
+            'PD_Dog2D_Slopes_Terrain-v0', 3, 2, seed=2, autoreset='disabled'
+        )
         alone = [
-            suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': int(seed)}) for seed in rows.seeds
+            suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': int(seed)})
+            for seed in environments.seeds
         ]
-        rows.reset()
-        world, ids = rows._task.world, np.arange(3)
+        environments.reset()
+        world, ids = environments._task.world, np.arange(3)
         for one in alone:
             one.reset()
         for push in range(1, 6):
-            for row, one in enumerate(alone):
-                x = push * (2.0 + row)
-                height = rows._task.arena.strips[row].height(np.array([x]))[0] + 1.0
-                world.qpos[row, :2] = x, height
+            for env_id, one in enumerate(alone):
+                x = push * (2.0 + env_id)
+                height = environments._task.arena.grounds[env_id].height(np.array([x]))[0] + 1.0
+                world.qpos[env_id, :2] = x, height
                 one.physics.data.qpos[:2] = x, height
                 one.task.world.forward(np.zeros(1, int))
             world.forward(np.arange(3))
             action = np.zeros((3, 20))
             for _ in range(3):
-                rows._task.step(action, ids)
+                environments._task.step(action, ids)
                 steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
-                for one, row in zip(steps, rows._task.observation, strict=True):
+                for one, env_id in zip(steps, environments._task.observation, strict=True):
                     np.testing.assert_array_equal(
-                        np.concatenate(list(one.observation.values())), row
+                        np.concatenate(list(one.observation.values())), env_id
                     )
                 if any(one.last() for one in steps):
                     for one in alone:
@@ -108,9 +112,10 @@ class IdentityTest(parameterized.TestCase):
 
     @parameterized.parameters(*AUTORESET)
     def test_terms_sum_to_the_reward(self, autoreset):
-        rows = VectorEnvironment(FLAT, 3, 1, seed=3, autoreset=autoreset, step_limit=LIMIT)
+        environments = VectorEnvironment(FLAT, 3, 1, seed=3, autoreset=autoreset, step_limit=LIMIT)
         alone = [
-            suite.make(FLAT, {'random': int(seed), 'step_limit': LIMIT}) for seed in rows.seeds
+            suite.make(FLAT, {'random': int(seed), 'step_limit': LIMIT})
+            for seed in environments.seeds
         ]
 
         def check(reward, info):
@@ -118,30 +123,30 @@ class IdentityTest(parameterized.TestCase):
             np.testing.assert_allclose(total, reward, rtol=0, atol=1e-12)
             np.testing.assert_array_equal(total[reward == 0], 0)
 
-        rows.reset()
-        check(np.zeros(3), rows.info)
+        environments.reset()
+        check(np.zeros(3), environments.info)
         for one in alone:
             one.reset()
         random, begun, ended = np.random.default_rng(0), np.zeros(3, bool), np.zeros(3, bool)
         reward = np.zeros(3)
         for _ in range(3 * LIMIT):
             if autoreset == 'disabled' and ended.any():
-                rows.reset(ended)
-                check(np.where(ended, 0, reward), rows.info)
-            action = random.uniform(-1, 1, (3, len(rows.action_map)))
-            step = rows.step(action)
+                environments.reset(ended)
+                check(np.where(ended, 0, reward), environments.info)
+            action = random.uniform(-1, 1, (3, len(environments.action_map)))
+            step = environments.step(action)
             reward = step.reward
             check(reward, step.info)
             if autoreset == 'next_step':
                 np.testing.assert_array_equal(step.reward[ended], 0)
-                for row, one in enumerate(alone):
-                    one.step(action[row])
+                for env_id, one in enumerate(alone):
+                    one.step(action[env_id])
                     for name, value in one.info['reward_terms'].items():
-                        self.assertEqual(step.info['reward_terms'][name][row], value)
+                        self.assertEqual(step.info['reward_terms'][name][env_id], value)
             ended = step.terminated | step.truncated
             begun |= ended
             if autoreset == 'same_step':
-                check(np.where(ended, 0, reward), rows.info)
+                check(np.where(ended, 0, reward), environments.info)
         self.assertTrue(begun.all())
 
 
@@ -154,15 +159,15 @@ class LimitTest(parameterized.TestCase):
         ({'time_limit': 0.5, 'step_limit': 7}, 7), ({'time_limit': 0.2, 'step_limit': 7}, None),
     )  # fmt: skip
     def test_same_step_as_a_single_environment(self, options, expected):
-        rows = VectorEnvironment(FLAT, 2, 1, seed=0, task_kwargs=options)
-        one = suite.make(FLAT, {'random': int(rows.seeds[0]), **options})
-        for environment in rows, one:
+        environments = VectorEnvironment(FLAT, 2, 1, seed=0, task_kwargs=options)
+        one = suite.make(FLAT, {'random': int(environments.seeds[0]), **options})
+        for environment in environments, one:
             environment.task.finish_step = _never_failing(environment.task)
-        rows.reset()
+        environments.reset()
         one.reset()
         idle, ends = np.zeros((2, 6)), []
         for count in range(1, 2 * (expected or 30) + 3):
-            step, time_step = rows.step(idle), one.step(idle[0])
+            step, time_step = environments.step(idle), one.step(idle[0])
             self.assertFalse(step.terminated.any())
             np.testing.assert_array_equal(step.truncated, time_step.last())
             if time_step.last():
@@ -173,26 +178,26 @@ class LimitTest(parameterized.TestCase):
 
     def test_rows_are_cut_each_in_its_time(self):
         options = {'time_limit': 0.3}
-        rows = VectorEnvironment(
+        environments = VectorEnvironment(
             FLAT, 3, 1, seed=0, autoreset='disabled', task_kwargs=options, step_limit=None
         )
-        rows.reset()
+        environments.reset()
         idle = np.zeros((3, 6))
         for _ in range(4):
-            rows.step(idle)
-        rows.reset([1])
-        state = rows.get_state()
+            environments.step(idle)
+        environments.reset([1])
+        state = environments.get_state()
         other = VectorEnvironment(
             FLAT, 3, 1, seed=9, autoreset='disabled', task_kwargs=options, step_limit=None
         )
         other.set_state(state)
-        for environments in rows, other:
+        for each in environments, other:
             for _ in range(5):
-                step = environments.step(idle)
+                step = each.step(idle)
             np.testing.assert_array_equal(step.truncated, [True, False, True])
-            environments.reset([0, 2])
+            each.reset([0, 2])
             for _ in range(4):
-                step = environments.step(idle)
+                step = each.step(idle)
             np.testing.assert_array_equal(step.truncated, [False, True, False])
 
     @parameterized.parameters(
@@ -211,46 +216,46 @@ class AutoresetTest(parameterized.TestCase):
     """Gymnasium's three manners of beginning anew."""
 
     def run_to_the_end(self, autoreset):
-        rows = VectorEnvironment(FLAT, 4, 1, seed=0, autoreset=autoreset, step_limit=3)
-        rows.reset()
+        environments = VectorEnvironment(FLAT, 4, 1, seed=0, autoreset=autoreset, step_limit=3)
+        environments.reset()
         for _ in range(3):
-            step = rows.step(np.zeros((4, 6)))
+            step = environments.step(np.zeros((4, 6)))
         self.assertTrue(step.truncated.all())
-        return rows, step
+        return environments, step
 
     def test_next_step_ignores_the_action(self):
-        rows, _ = self.run_to_the_end('next_step')
-        step = rows.step(np.ones((4, 6)))
+        environments, _ = self.run_to_the_end('next_step')
+        step = environments.step(np.ones((4, 6)))
         np.testing.assert_array_equal(step.reward, 0)
         self.assertFalse((step.terminated | step.truncated).any())
         again, _ = self.run_to_the_end('next_step')
         np.testing.assert_array_equal(again.step(-np.ones((4, 6))).observation, step.observation)
 
     def test_same_step_keeps_the_last_observation(self):
-        rows, step = self.run_to_the_end('same_step')
+        environments, step = self.run_to_the_end('same_step')
         other, last = self.run_to_the_end('next_step')
         np.testing.assert_array_equal(step.info['final_observation'], last.observation)
         np.testing.assert_array_equal(step.info['ended'], True)
         np.testing.assert_array_equal(step.observation, other.step(np.zeros((4, 6))).observation)
         np.testing.assert_array_equal(step.reward, last.reward)
-        self.assertFalse(rows.step(np.zeros((4, 6))).truncated.any())
+        self.assertFalse(environments.step(np.zeros((4, 6))).truncated.any())
 
     def test_disabled_asks_for_a_reset(self):
-        rows, step = self.run_to_the_end('disabled')
-        with self.assertRaisesRegex(RuntimeError, 'row 0 has ended'):
-            rows.step(np.zeros((4, 6)))
-        rows.reset(np.array([True] * 4))
-        self.assertFalse(rows.step(np.zeros((4, 6))).truncated.any())
+        environments, step = self.run_to_the_end('disabled')
+        with self.assertRaisesRegex(RuntimeError, 'simulation 0 has ended'):
+            environments.step(np.zeros((4, 6)))
+        environments.reset(np.array([True] * 4))
+        self.assertFalse(environments.step(np.zeros((4, 6))).truncated.any())
         self.assertEqual(step.reward.shape, (4,))
 
-    @parameterized.parameters({'rows': [1, 3]}, {'rows': [False, True, False, True]})
-    def test_a_reset_of_some_rows_leaves_the_others(self, rows):
+    @parameterized.parameters({'env_ids': [1, 3]}, {'env_ids': [False, True, False, True]})
+    def test_a_reset_of_some_rows_leaves_the_others(self, env_ids):
         environments, untouched = (
             VectorEnvironment(FLAT, 4, 1, seed=4, autoreset='disabled') for _ in range(2)
         )
         before = environments.reset()
         np.testing.assert_array_equal(untouched.reset(), before)
-        after = environments.reset(rows)
+        after = environments.reset(env_ids)
         np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
         self.assertTrue((after[[1, 3]] != before[[1, 3]]).any(1).all())
         action = np.random.default_rng(0).uniform(-0.1, 0.1, (4, 6))
@@ -262,132 +267,141 @@ class AutoresetTest(parameterized.TestCase):
         self.assertEqual(AUTORESET, ('next_step', 'same_step', 'disabled'))
 
 
-KINDS = tuple({row.rules: row.id for row in catalogue.ROWS}.values())  # one id of each task
+KINDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())  # one id of each task
 ALONE = np.array([False, True, False])
 
 
 class SomeRowsTest(parameterized.TestCase):
-    """Stepping some rows, and going on where another environment is: what a search needs."""
+    """Stepping some simulations, and going on where another environment is: what a search needs."""
 
     @parameterized.parameters(*KINDS)
     def test_rows_that_rest_stay_as_they_are(self, id_):
-        """Row 1 rests every other step, and is no other for it than the row that never rests."""
-        rows, other = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
+        """Simulation 1 rests every other step, and is no other for it than the simulation that never rests."""
+        specs, other = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
         random = np.random.default_rng(0)
-        actions = random.uniform(-0.1, 0.1, (3, 3, len(rows.action_map)))
-        for each in (rows, other):
+        actions = random.uniform(-0.1, 0.1, (3, 3, len(specs.action_map)))
+        for each in (specs, other):
             each.reset()
         for t, action in enumerate(actions):
             expected = other.step(action)
-            before = rows.task.world.qpos[1].copy(), rows.task.world.qvel[1].copy()
-            waiting = rows.step(np.ones_like(action), [0, 2] if t == 1 else [2])
-            np.testing.assert_array_equal(rows.task.world.qpos[1], before[0])
-            np.testing.assert_array_equal(rows.task.world.qvel[1], before[1])
+            before = specs.task.world.qpos[1].copy(), specs.task.world.qvel[1].copy()
+            waiting = specs.step(np.ones_like(action), [0, 2] if t == 1 else [2])
+            np.testing.assert_array_equal(specs.task.world.qpos[1], before[0])
+            np.testing.assert_array_equal(specs.task.world.qvel[1], before[1])
             self.assertEqual(waiting.reward[1], 0)
             self.assertFalse(waiting.terminated[1] or waiting.truncated[1])
-            step = rows.step(action, ALONE)
+            step = specs.step(action, ALONE)
             np.testing.assert_array_equal(step.observation[1], expected.observation[1])
             self.assertEqual(step.reward[1], expected.reward[1])
             self.assertEqual(step.terminated[1], expected.terminated[1])
 
     def test_a_row_that_has_ended_rests_until_it_is_asked(self):
-        rows = VectorEnvironment(GAPS, 3, 1, 0, step_limit=2)
-        rows.reset()
-        action = np.zeros((3, len(rows.action_map)))
-        rows.step(action, [0, 1])
-        step = rows.step(action, [0])
+        environments = VectorEnvironment(GAPS, 3, 1, 0, step_limit=2)
+        environments.reset()
+        action = np.zeros((3, len(environments.action_map)))
+        environments.step(action, [0, 1])
+        step = environments.step(action, [0])
         np.testing.assert_array_equal(step.truncated, [True, False, False])
         for _ in range(2):
-            step = rows.step(action, [2])
+            step = environments.step(action, [2])
         np.testing.assert_array_equal(step.truncated, [False, False, True])
-        step = rows.step(action)  # the first and the last begin anew, the other ends
+        step = environments.step(action)  # the first and the last begin anew, the other ends
         np.testing.assert_array_equal(step.truncated, [False, True, False])
         np.testing.assert_array_equal(step.reward > 0, [False, True, False])
-        with self.assertRaisesRegex(ValueError, 'rows .3. of an environment of 3 rows'):
-            rows.step(action, [3])
+        with self.assertRaisesRegex(
+            ValueError, 'simulations .3. of an environment of 3 simulations'
+        ):
+            environments.step(action, [3])
 
     @parameterized.parameters(*KINDS)
     def test_copies_go_on_where_the_other_is(self, id_):
-        rows = VectorEnvironment(id_, 2, 1, seed=4)
+        environments = VectorEnvironment(id_, 2, 1, seed=4)
         copies = VectorEnvironment(id_, 3, 1, seed=9)
-        action = np.random.default_rng(0).uniform(-0.1, 0.1, (2, len(rows.action_map)))
-        for each in (rows, copies):
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (2, len(environments.action_map)))
+        for each in (environments, copies):
             each.reset()
-        rows.step(action)
-        copies.copy_from(rows, [1, 0, 1], [0, 1, 2])
-        expected, step = rows.step(action), copies.step(action[[1, 0, 1]])
+        environments.step(action)
+        copies.copy_from(environments, [1, 0, 1], [0, 1, 2])
+        expected, step = environments.step(action), copies.step(action[[1, 0, 1]])
         np.testing.assert_array_equal(step.observation, expected.observation[[1, 0, 1]])
         np.testing.assert_array_equal(step.reward, expected.reward[[1, 0, 1]])
 
     @parameterized.parameters(*KINDS)
     def test_single_rows_go_back(self, id_):
-        rows, twin = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
-        action = np.random.default_rng(0).uniform(-0.1, 0.1, (3, len(rows.action_map)))
-        for each in (rows, twin):
+        env_ids, twin = (VectorEnvironment(id_, 3, 1, seed=4) for _ in range(2))
+        action = np.random.default_rng(0).uniform(-0.1, 0.1, (3, len(env_ids.action_map)))
+        for each in (env_ids, twin):
             each.reset()
             each.step(action)
-        state = rows.get_state([2, 0])
-        rows.step(action)
-        rows.step(-action)
-        rows.set_state(state, [2, 0])
+        state = env_ids.get_state([2, 0])
+        env_ids.step(action)
+        env_ids.step(-action)
+        env_ids.set_state(state, [2, 0])
         twin.step(action, [1])
         twin.step(-action, [1])
         for each in (action, -action):
-            step, expected = rows.step(each), twin.step(each)
+            step, expected = env_ids.step(each), twin.step(each)
             np.testing.assert_array_equal(step.observation, expected.observation)
             np.testing.assert_array_equal(step.reward, expected.reward)
-        np.testing.assert_array_equal(rows.reset(), twin.reset())
+        np.testing.assert_array_equal(env_ids.reset(), twin.reset())
 
     def test_what_rows_cannot_go_back_to(self):
-        rows = VectorEnvironment(GAPS, 3, 1, 0)
-        state = rows.get_state([1])
-        with self.assertRaisesRegex(RuntimeError, 'some rows before the first reset'):
-            rows.set_state(state, [1])
-        rows.reset()
+        environments = VectorEnvironment(GAPS, 3, 1, 0)
+        state = environments.get_state([1])
+        with self.assertRaisesRegex(RuntimeError, 'some simulations before the first reset'):
+            environments.set_state(state, [1])
+        environments.reset()
         for numbers in ([0, 1], None, []):
-            with self.assertRaisesRegex(ValueError, 'the state has 1 rows; expected'):
-                rows.set_state(state, numbers)
-        with self.assertRaisesRegex(ValueError, 'each of 2 rows once'):
-            rows.set_state(rows.get_state([1, 2]), [1, 1])
-        for call in (rows.get_state, lambda numbers: rows.set_state(state, numbers)):
-            with self.assertRaisesRegex(ValueError, 'rows .3. of an environment of 3 rows'):
+            with self.assertRaisesRegex(ValueError, 'the state has 1 simulations; expected'):
+                environments.set_state(state, numbers)
+        with self.assertRaisesRegex(ValueError, 'each of 2 simulations once'):
+            environments.set_state(environments.get_state([1, 2]), [1, 1])
+        for call in (
+            environments.get_state,
+            lambda numbers: environments.set_state(state, numbers),
+        ):
+            with self.assertRaisesRegex(
+                ValueError, 'simulations .3. of an environment of 3 simulations'
+            ):
                 call([3])
 
     def test_what_cannot_be_copied(self):
-        rows, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
+        environments, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
-            rows.copy_from(rows, [0], [1])
-        rows.reset()
+            environments.copy_from(environments, [0], [1])
+        environments.reset()
         other.reset()
-        with self.assertRaisesRegex(ValueError, f'rows of {FLAT} cannot go on in {GAPS}'):
-            rows.copy_from(other, [0], [1])
-        with self.assertRaisesRegex(ValueError, '2 rows to put into rows .1.'):
-            rows.copy_from(rows, [0, 1], [1])
-        with self.assertRaisesRegex(ValueError, 'rows .2. of an environment of 2 rows'):
-            rows.copy_from(rows, [2], [1])
+        with self.assertRaisesRegex(ValueError, f'simulations of {FLAT} cannot go on in {GAPS}'):
+            environments.copy_from(other, [0], [1])
+        with self.assertRaisesRegex(ValueError, '2 simulations to put into simulations .1.'):
+            environments.copy_from(environments, [0, 1], [1])
+        with self.assertRaisesRegex(
+            ValueError, 'simulations .2. of an environment of 2 simulations'
+        ):
+            environments.copy_from(environments, [2], [1])
 
 
 class RobustnessTest(parameterized.TestCase):
-    """What goes wrong says so, and stays in its row."""
+    """What goes wrong says so, and stays in its simulation."""
 
     def setUp(self):
         super().setUp()
-        self.rows = VectorEnvironment(FLAT, 3, 1, seed=0)
-        self.rows.reset()
+        self.environments = VectorEnvironment(FLAT, 3, 1, seed=0)
+        self.environments.reset()
 
     def test_divergence_stays_in_its_row(self):
         other = VectorEnvironment(FLAT, 3, 1, seed=0)
         other.reset()
-        self.rows._task.world.qvel[1, 5] = 1e12
+        self.environments._task.world.qvel[1, 5] = 1e12
         action = np.zeros((3, 6))
-        step, calm = self.rows.step(action), other.step(action)
+        step, calm = self.environments.step(action), other.step(action)
         np.testing.assert_array_equal(step.info['diverged'], [False, True, False])
         np.testing.assert_array_equal(step.terminated, [False, True, False])
         self.assertEqual(step.reward[1], 0.0)
         self.assertTrue(np.isfinite(step.observation).all())
         np.testing.assert_array_equal(step.observation[[0, 2]], calm.observation[[0, 2]])
         for _ in range(5):
-            step, calm = self.rows.step(action), other.step(action)
+            step, calm = self.environments.step(action), other.step(action)
             np.testing.assert_array_equal(step.observation[[0, 2]], calm.observation[[0, 2]])
             self.assertTrue(np.isfinite(step.observation).all())
 
@@ -398,24 +412,26 @@ class RobustnessTest(parameterized.TestCase):
     )
     def test_wrong_actions(self, action, message):
         with self.assertRaisesRegex(ValueError, message):
-            self.rows.step(action)
+            self.environments.step(action)
 
     @parameterized.parameters(np.nan, np.inf, -np.inf)
     def test_non_finite_actions_name_the_row(self, value):
         action = np.zeros((3, 6))
         action[2, 4] = value
-        with self.assertRaisesRegex(ValueError, r'row 2, number 4 \(left_knee\)'):
-            self.rows.step(action)
+        with self.assertRaisesRegex(ValueError, r'simulation 2, number 4 \(left_knee\)'):
+            self.environments.step(action)
 
     def test_huge_finite_actions_are_clipped(self):
-        self.assertTrue(np.isfinite(self.rows.step(np.full((3, 6), 1e200)).observation).all())
+        self.assertTrue(
+            np.isfinite(self.environments.step(np.full((3, 6), 1e200)).observation).all()
+        )
 
     @parameterized.parameters(
         ({'num_envs': 0}, 'num_envs'),
         ({'num_threads': -1}, 'num_threads'),
         ({'autoreset': 'next'}, "did you mean 'next_step'"),
         ({'dtype': np.int32}, 'float64 or float32'),
-        ({'seed': [1, 2]}, '2 seeds for 3 rows'),
+        ({'seed': [1, 2]}, '2 seeds for 3 simulations'),
         ({'environment': 'PD_Biped2D_Gap_Terrain-v0'}, 'PD_Biped2D_Gaps_Terrain-v0'),
         ({'task_kwargs': {'sub_steps': 3}}, "did you mean 'substeps'"),
     )
@@ -424,10 +440,10 @@ class RobustnessTest(parameterized.TestCase):
             VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
 
     def test_closed(self):
-        self.rows.close()
-        self.rows.close()
+        self.environments.close()
+        self.environments.close()
         with self.assertRaisesRegex(RuntimeError, 'closed'):
-            self.rows.step(np.zeros((3, 6)))
+            self.environments.step(np.zeros((3, 6)))
 
     def test_step_before_reset(self):
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
@@ -435,39 +451,41 @@ class RobustnessTest(parameterized.TestCase):
 
     def test_a_live_batch_is_not_pickled(self):
         with self.assertRaisesRegex(TypeError, 'get_state'):
-            pickle.dumps(self.rows)
+            pickle.dumps(self.environments)
 
     def test_saved_and_restored_elsewhere(self):
         random = np.random.default_rng(0)
         actions = random.uniform(-1, 1, (40, 3, 6))
         for action in actions[:15]:
-            self.rows.step(action)
-        state = pickle.loads(pickle.dumps(self.rows.get_state()))
-        expected = [self.rows.step(action).observation for action in actions[15:]]
+            self.environments.step(action)
+        state = pickle.loads(pickle.dumps(self.environments.get_state()))
+        expected = [self.environments.step(action).observation for action in actions[15:]]
         other = VectorEnvironment(FLAT, 3, 2, seed=99)
         other.set_state(state)
         found = [other.step(action).observation for action in actions[15:]]
         np.testing.assert_array_equal(found, expected)
 
     def test_float32_and_blocks(self):
-        rows = VectorEnvironment(GAPS, 2, 1, seed=0, dtype=np.float32, flat_observation=False)
-        observation = rows.reset()
+        environments = VectorEnvironment(
+            GAPS, 2, 1, seed=0, dtype=np.float32, flat_observation=False
+        )
+        observation = environments.reset()
         self.assertEqual(list(observation), ['terrain', 'pose', 'velocity', 'phase'])
         self.assertEqual({value.dtype for value in observation.values()}, {np.dtype(np.float32)})
         self.assertEqual(observation['terrain'].shape, (2, 50))
-        self.assertEqual(rows.step(np.zeros((2, 11))).reward.dtype, np.float32)
+        self.assertEqual(environments.step(np.zeros((2, 11))).reward.dtype, np.float32)
 
     def test_a_forked_child_is_refused_not_hung(self):
-        rows = VectorEnvironment(FLAT, 2, 2, seed=0)
-        rows.reset()
+        environments = VectorEnvironment(FLAT, 2, 2, seed=0)
+        environments.reset()
         context = multiprocessing.get_context('fork')
         answers = context.Queue()
-        child = context.Process(target=_step_in_child, args=(rows, answers))
+        child = context.Process(target=_step_in_child, args=(environments, answers))
         child.start()
         self.assertIn('fork', answers.get(timeout=30))
         child.join(timeout=30)
         self.assertEqual(child.exitcode, 0)
-        rows.step(np.zeros((2, 6)))
+        environments.step(np.zeros((2, 6)))
 
     def test_spawned_workers_go_on_where_the_parent_is(self):
         context = multiprocessing.get_context('spawn')
@@ -475,13 +493,13 @@ class RobustnessTest(parameterized.TestCase):
         random = np.random.default_rng(0)
         actions = random.uniform(-1, 1, (25, 3, 6))  # falls and resets are among the steps
         for action in actions[:10]:
-            self.rows.step(action)
-        arguments = pickle.dumps((spec, self.rows.get_state(), actions[10:]))
+            self.environments.step(action)
+        arguments = pickle.dumps((spec, self.environments.get_state(), actions[10:]))
         answers, workers = context.Queue(), []
         for _ in range(2):
             workers.append(context.Process(target=_go_on, args=(arguments, answers)))
             workers[-1].start()
-        steps = [self.rows.step(action) for action in actions[10:]]
+        steps = [self.environments.step(action) for action in actions[10:]]
         self.assertTrue(any(step.terminated.any() for step in steps))
         expected = [np.column_stack([*step[:4]]) for step in steps]
         first = VectorEnvironment(**spec).reset()
@@ -512,29 +530,29 @@ import numpy as np
 from trl_suite.vector import VectorEnvironment
 
 make = lambda: VectorEnvironment({FLAT!r}, 2, 2, seed=0)
-roll = lambda rows: [rows.reset(), rows.step(np.ones((2, 6))).observation]
-rows, other = make(), make()
-expected = roll(rows)
+roll = lambda simulations: [simulations.reset(), simulations.step(np.ones((2, 6))).observation]
+simulations, other = make(), make()
+expected = roll(simulations)
 child = os.fork()
 if child == 0:
     signal.alarm(30)
     try:
-        rows.step(np.ones((2, 6)))
+        simulations.step(np.ones((2, 6)))
     except RuntimeError as error:
         print(error)
     other.close()
-    rows = make()  # lets the inherited one go, which must not wait for its threads
-    print(np.array_equal(roll(rows), expected), flush=True)
+    simulations = make()  # lets the inherited one go, which must not wait for its threads
+    print(np.array_equal(roll(simulations), expected), flush=True)
     LEAVE
 status = os.waitpid(child, 0)[1]
-rows.step(np.ones((2, 6)))  # unharmed
+simulations.step(np.ones((2, 6)))  # unharmed
 print('child', status)
 """
 
 
-def _step_in_child(rows, answers):
+def _step_in_child(environments, answers):
     try:
-        rows.step(np.zeros((2, 6)))
+        environments.step(np.zeros((2, 6)))
     except RuntimeError as error:
         answers.put(str(error))
 
@@ -551,7 +569,7 @@ def _never_failing(task):
 
 def _go_on(arguments, answers):
     spec, state, actions = pickle.loads(arguments)
-    rows = VectorEnvironment(**spec)
-    first = rows.reset()
-    rows.set_state(state)
-    answers.put((first, [np.column_stack([*rows.step(action)[:4]]) for action in actions]))
+    environments = VectorEnvironment(**spec)
+    first = environments.reset()
+    environments.set_state(state)
+    answers.put((first, [np.column_stack([*environments.step(action)[:4]]) for action in actions]))

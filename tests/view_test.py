@@ -10,8 +10,8 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import suite
-from trl_suite.commands import view
-from trl_suite.environment import Environment
+from trl_suite.cli import view
+from trl_suite.environments.environment import Environment
 
 GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
@@ -20,7 +20,7 @@ FRAME = 1 / 30  # s
 
 with warnings.catch_warnings():  # GLFW's, where there is no screen
     warnings.simplefilter('ignore')
-    window = importlib.import_module('trl_suite.commands.window')
+    window = importlib.import_module('trl_suite.viewing.window')
 
 
 class CommandTest(cli_test.CommandTest):
@@ -185,7 +185,7 @@ class WindowTest(parameterized.TestCase):
         self.assertGreater(screen.pictures[-1].std(), 10)
         body = shown._viewer.camera.settings.trackbodyid
         name = environment.physics.model.id2name(body, 'body')
-        self.assertEqual(name, f'{environment.task.character.row.name}/')
+        self.assertEqual(name, f'{environment.task.character.spec.name}/')
 
     def test_ground_that_changes_is_drawn_as_it_is(self):
         environment = suite.make(HILLS, {'random': 1})

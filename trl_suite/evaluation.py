@@ -4,7 +4,7 @@ from trl_suite import evaluation, policies
 
 id_ = 'PD_Biped2D_Gaps_Terrain-v0'
 result = evaluation.evaluate(id_, policies.reference(id_), episodes=50, seed=0)
-print(result['return'], result['return_interval'], result['fraction'])
+print(result['return'], result['return_interval'], result['normalized_return'])
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.catalogue import Row
+from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
-from trl_suite.scripted import scripted
-from trl_suite.vector import VectorEnvironment
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.tasks.navigation.scripted import scripted
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 CHUNK = 256  # episodes that run side by side
@@ -29,7 +29,7 @@ _NORMAL_95 = 1.96  # standard errors on either side of a mean
 
 
 def evaluate(
-    environment: str | Row,
+    environment: str | EnvSpec,
     policy: Callable[[Any], Any],
     episodes: int = 50,
     seed: int | Sequence[int] = 0,
@@ -43,11 +43,11 @@ def evaluate(
 
     Episode i has the i-th number of `numpy.random.SeedSequence(seed)` as its seed: it is the first
     episode of `suite.make(id, {'random': result['seeds'][i]})`, whatever the number of episodes and
-    threads, if the policy treats each row by itself (a `Policy` does).
+    threads, if the policy treats each simulation by itself (a `Policy` does).
 
     Args:
       environment: id, alias, or row of the catalogue.
-      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and of rows whose
+      policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n changes, and of simulations whose
         episode has ended the action does not count.
       episodes: how many.
       seed: of them all; or a sequence of as many seeds as episodes.
@@ -61,7 +61,7 @@ def evaluate(
       What JSON can hold. Settings: 'id', 'episodes', 'seed' (None for a sequence),
       'step_limit'. Summary: 'return' (mean),
       'return_interval' (half width of its 95 % confidence interval in the normal approximation, 1.96
-      standard errors; None for a single episode), 'fraction' (mean return over the step limit; no
+      standard errors; None for a single episode), 'normalized_return' (mean return over the step limit; no
       step has a reward above 1), 'full' (share of episodes that last until the step limit),
       'length' (mean, steps), 'distance' (mean, m), 'distance_interval' (its 95 % confidence interval
       by `BOOTSTRAP` resamplings of the episodes, [m, m]; None for a single episode: how far a policy
@@ -90,10 +90,10 @@ def evaluate(
             environment, len(chunk), num_threads, chunk, autoreset='disabled',
             task_kwargs=task_kwargs,
         )  # fmt: skip
-        row, step_limit = environments.row, environments.step_limit
+        spec, step_limit = environments.spec, environments.step_limit
         try:
             if step_limit is None:
-                raise ValueError(f'{row.id} has no step limit, so its episodes may never end')
+                raise ValueError(f'{spec.id} has no step limit, so its episodes may never end')
             if isinstance(policy, Policy):
                 policy.check(environments)
             with tqdm.tqdm(
@@ -110,14 +110,14 @@ def evaluate(
     if len(seeds) > 1:
         interval = _NORMAL_95 * float(of['returns'].std(ddof=1)) / math.sqrt(len(seeds))
     return {
-        'id': row.id,
+        'id': spec.id,
         'episodes': len(seeds),
         'seed': None if isinstance(seed, Sequence) else int(seed),
         'step_limit': step_limit,
         'return': mean,
         'return_interval': interval,
-        'fraction': mean / step_limit,
-        'full': float(of['full'].mean()),
+        'normalized_return': mean / step_limit,
+        'completion_rate': float(of['completion_rate'].mean()),
         'length': float(of['lengths'].mean()),
         'distance': float(of['distances'].mean()),
         'distance_interval': _bootstrap(of['distances']) if len(seeds) > 1 else None,
@@ -131,11 +131,11 @@ def evaluate(
 
 
 def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict[str, np.ndarray]:
-    """Runs one episode in every row."""
+    """Runs one episode in every simulation."""
     n = environments.num_envs
     returns, lengths, distances, durations = np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n)
     fell, diverged, full = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
-    runs = np.ones(n, bool)  # rows in their first episode
+    runs = np.ones(n, bool)  # simulations in their first episode
     observation = environments.reset()
     while runs.any():
         observation, reward, terminated, truncated, info = environments.step(
@@ -152,7 +152,7 @@ def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict
         runs &= ~ends
     return {
         'returns': returns, 'lengths': lengths, 'distances': distances, 'durations': durations,
-        'fell': fell, 'diverged': diverged, 'full': full,
+        'fell': fell, 'diverged': diverged, 'completion_rate': full,
     }  # fmt: skip
 
 
@@ -184,9 +184,9 @@ def clip(environments: VectorEnvironment) -> BatchPolicy:
     """
     task: Any = environments.task
     if not hasattr(task, 'clip_action'):
-        raise ValueError(f'{environments.row.id} has no clip to follow')
-    rows = range(environments.num_envs)
-    return lambda observation: np.clip([task.clip_action(row) for row in rows], -1, 1)
+        raise ValueError(f'{environments.spec.id} has no clip to follow')
+    env_ids = range(environments.num_envs)
+    return lambda observation: np.clip([task.clip_action(env_id) for env_id in env_ids], -1, 1)
 
 
 BASELINES: dict[str, Callable[[VectorEnvironment], BatchPolicy]] = {

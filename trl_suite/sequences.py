@@ -34,11 +34,13 @@ import tqdm
 from numpy.typing import ArrayLike
 
 import trl_suite
-from trl_suite import catalogue, errors, evaluation, files
+from trl_suite import evaluation
+from trl_suite.registry import catalogue
+from trl_suite.util import errors, files
 
 FIRST_TEST_SEED = 2**31  # of 2**32; smaller ones are for training
 EPISODES = 32  # of every test
-SCORE = 'fraction'  # what counts of an evaluation: the mean return over the step limit
+SCORE = 'normalized_return'  # what counts of an evaluation: the mean return over the step limit
 _SETTINGS = ('sequence', 'ids', 'budget', 'episodes', 'seed')  # that a result must agree on
 
 

@@ -1,179 +1,33 @@
-"""The front door: a row of the catalogue, a paper's id, or a free combination -> an environment."""
+"""The front door: an id, a family and task, or a free combination -> an environment."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
 from trl_suite import actuation as actuation_models
-from trl_suite import catalogue, characters, errors, motion, policies
-from trl_suite import terrain as terrains
-from trl_suite.arenas import PlanarTerrain, SpatialTerrain
-from trl_suite.catalogue import Row, find
-from trl_suite.environment import Environment
-from trl_suite.tasks import composed
-from trl_suite.tasks.ball import Ball
-from trl_suite.tasks.footsteps import Footsteps
-from trl_suite.tasks.footsteps2d import PlanarFootsteps, check_feet
-from trl_suite.tasks.gait import GaitTask
-from trl_suite.tasks.high_level import HighLevel
-from trl_suite.tasks.imitation import Imitation
-from trl_suite.tasks.imitation3d import SpatialImitation
-from trl_suite.tasks.journey import Journey, journey
+from trl_suite import characters, motion, policies
+from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
+from trl_suite.registry.build import DIMENSIONS, build_task
+from trl_suite.registry.catalogue import find
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.registry.task_types import TASK_TYPES, TITLES
 from trl_suite.tasks.task import Task
-from trl_suite.tasks.walk import WALK, Walk
+from trl_suite.tasks.task_type import TaskType
+from trl_suite.util import errors
 
 ALL_IDS: tuple[str, ...] = tuple(catalogue.BY_ID)
 ALL_TASKS: tuple[tuple[str, str], ...] = tuple(catalogue.BY_TASK)
 BENCHMARKING: tuple[tuple[str, str], ...] = tuple(
-    key for key, row in catalogue.BY_TASK.items() if 'original' in row.tags
+    key for key, spec in catalogue.BY_TASK.items() if 'original' in spec.tags
 )
 TASKS_BY_DOMAIN: dict[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
     for domain in dict.fromkeys(d for d, _ in ALL_TASKS)
 }
-DEFAULT_CLIPS = {
-    'biped2d': 'biped2d_walk', 'biped2d_full': 'biped2d_full_walk', 'dog': 'dog_bound',
-    'goat': 'dog_bound', 'raptor': 'raptor_run_050', 'biped3d': 'biped3d_walk',
-    'biped3d_mocap': 'biped3d_mocap_walk', 'biped3d_mocap_run': 'biped3d_mocap_run',
-    'biped3d_full_mocap': 'biped3d_full_walk',
-}  # fmt: skip
 _ENVIRONMENT_OPTIONS = ('random', 'time_limit', 'step_limit')  # also taken from task_kwargs
-
-
-def _clip(row: Row) -> motion.Clip:
-    clip: Any = row.clip
-    if isinstance(clip, motion.Steps):
-        raise ValueError(f'{clip.name!r} is a library of steps; to be imitated, give a clip')
-    return clip if isinstance(clip, motion.Clip) else motion.load(clip or '')
-
-
-def _imitation(row: Row, options: dict[str, Any]) -> Task:
-    return Imitation(
-        characters.make(row.character),
-        PlanarTerrain(terrains.load(row.terrain)),
-        _clip(row),
-        actuation_model=row.actuation,
-        **options,
-    )
-
-
-def _gait(row: Row, options: dict[str, Any]) -> Task:
-    arena = PlanarTerrain(terrains.load(row.terrain))
-    return GaitTask(characters.make(row.character), arena, **options)
-
-
-def _spatial(row: Row) -> SpatialTerrain:
-    return SpatialTerrain(terrains.load(row.terrain))
-
-
-def _imitation3d(row: Row, options: dict[str, Any]) -> Task:
-    return SpatialImitation(
-        characters.make(row.character), _spatial(row), _clip(row), actuation_model=row.actuation,
-        **options,
-    )  # fmt: skip
-
-
-def _footsteps(row: Row, options: dict[str, Any]) -> Task:
-    steps: Any = row.clip
-    if isinstance(steps, motion.Clip):
-        raise ValueError(f'{steps.name!r} is a clip; for footsteps, give a library of steps')
-    if not isinstance(steps, motion.Steps):
-        steps = motion.load_steps(steps or '')
-    return Footsteps(
-        characters.make(row.character), _spatial(row), steps, actuation_model=row.actuation,
-        **options,
-    )  # fmt: skip
-
-
-def _footsteps2d(row: Row, options: dict[str, Any]) -> Task:
-    return PlanarFootsteps(
-        characters.make(row.character), PlanarTerrain(terrains.load(row.terrain)), _clip(row),
-        actuation_model=row.actuation, **options,
-    )  # fmt: skip
-
-
-def _hike(row: Row, options: dict[str, Any], with_ball: bool = False) -> Task:
-    if row.actuation != 'position':
-        raise ValueError(
-            f'{row.task}: a footstep controller drives joints by position, not by {row.actuation}'
-        )
-    controller = options.get('controller')
-    if isinstance(controller, str) and not controller.endswith('.npz'):
-        options['controller'] = find(controller).id  # of an alias, too
-    steps = row.clip if isinstance(row.clip, motion.Steps) else motion.load_steps(row.clip or '')
-    arena = _spatial(row)
-    ball = Ball(arena) if with_ball else None
-    return HighLevel(characters.make(row.character), arena, steps, ball, **options)
-
-
-def _soccer(row: Row, options: dict[str, Any]) -> Task:
-    return _hike(row, options, with_ball=True)
-
-
-def _journey(row: Row, options: dict[str, Any]) -> Task:
-    original = options.get('reward') == 'original'
-    return journey(
-        characters.make(row.character), _spatial(row), _clip(row),
-        motion.load_steps(_character(row.character).name) if original else None,
-        actuation_model=row.actuation, **options,
-    )  # fmt: skip
-
-
-def _ball_journey(row: Row, options: dict[str, Any]) -> Task:
-    arena = _spatial(row)
-    return Journey(
-        characters.make(row.character), arena, _clip(row), Ball(arena),
-        actuation_model=row.actuation, **options,
-    )  # fmt: skip
-
-
-def _arena(row: Row) -> PlanarTerrain | SpatialTerrain:
-    if _character(row.character).spatial:
-        return _spatial(row)
-    return PlanarTerrain(terrains.load(row.terrain))
-
-
-def _walk(row: Row, options: dict[str, Any]) -> Task:
-    return Walk(
-        characters.make(row.character), _arena(row), actuation_model=row.actuation, **options
-    )
-
-
-def _of_the_user(row: Row, options: dict[str, Any]) -> Task:
-    make: Any = row.rules
-    tracked = {} if row.clip is None else {'clip': _clip(row)}
-    return make(
-        characters.make(row.character), _arena(row), actuation_model=row.actuation, **tracked,
-        **options,
-    )  # fmt: skip
-
-
-# How a row's rules make a task, and what has the task's options as keyword arguments.
-_RULES: dict[str, tuple[Callable[[Row, dict[str, Any]], Task], Callable[..., Task]]] = {
-    'imitation': (_imitation, Imitation),
-    'gait': (_gait, GaitTask),
-    'imitation3d': (_imitation3d, SpatialImitation),
-    'footsteps': (_footsteps, Footsteps),
-    'footsteps2d': (_footsteps2d, PlanarFootsteps),
-    'hike': (_hike, HighLevel),
-    'soccer': (_soccer, HighLevel),
-    'journey': (_journey, journey),
-    'ball_journey': (_ball_journey, Journey),
-    'walk': (_walk, Walk),
-}
-# As `build` names rules.
-TASKS = ('imitation', 'footsteps', 'hike', 'soccer', 'journey', 'gait', 'walk')
-_SPATIAL = {  # what is for one kind of character only
-    'hike': True, 'soccer': True, 'journey': True, 'gait': False,
-}  # fmt: skip
-_BY_DIMENSIONS = {  # rules of a task that planar and spatial characters have
-    ('imitation', True): 'imitation3d', ('footsteps', False): 'footsteps2d',
-}  # fmt: skip
-_OF_STEPS = ('footsteps', 'hike', 'soccer')  # in space the motion is a library of steps
-_DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
 
 
 def load(
@@ -201,8 +55,8 @@ def load(
                 f'task of domain {domain_name!r}', task_name, TASKS_BY_DOMAIN[domain_name]
             )
         )
-    row = catalogue.BY_TASK[domain_name, task_name]
-    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    spec = catalogue.BY_TASK[domain_name, task_name]
+    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def make(
@@ -214,7 +68,7 @@ def make(
 
     Arguments and errors are those of `load`.
     """
-    return build_row(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def reference_policy(id: str) -> policies.Policy:
@@ -228,10 +82,10 @@ def reference_policy(id: str) -> policies.Policy:
 
 
 def build(
-    character: str | characters.CharacterRow,
+    character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
-    task: str | Callable[..., Task] = 'imitation',
+    task: str | TaskType | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
@@ -240,36 +94,37 @@ def build(
 
     Args:
       character, actuation, terrain, task, clip: as for `combine`.
-      task_kwargs: as for `load`; the task's options, e.g. `terrain_samples=50`.
+      task_kwargs: as for `load`; the task's options, e.g. `terrain_observation=50`.
       environment_kwargs: as for `load`.
 
     Raises:
       ValueError: unknown names, options, or parts that do not fit each other.
     """
-    row = combine(character, actuation, terrain, task, clip)
-    return build_row(row, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    spec = combine(character, actuation, terrain, task, clip)
+    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
 
 
 def combine(
-    character: str | characters.CharacterRow,
+    character: str | characters.CharacterSpec,
     actuation: str | None = None,
     terrain: Any = None,
-    task: str | Callable[..., Task] = 'imitation',
+    task: str | TaskType | Callable[..., Task] = 'imitation',
     clip: str | motion.Clip | motion.Steps | None = None,
-) -> Row:
-    """Returns the row of a combination: what `VectorEnvironment` and Gymnasium take.
+) -> EnvSpec:
+    """Returns the data of a combination: what `VectorEnvironment` and Gymnasium take.
 
     Args:
-      character: name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+      character: name in `trl_suite.characters.CHARACTERS`, or a `CharacterSpec` of the user's own.
       actuation: one of `trl_suite.actuation.ACTUATIONS`, by default 'position'; a gait drives
         joints by itself and takes none.
       terrain: what `trl_suite.terrain.load` takes: a preset, a file, or a mapping; as many
         dimensions as the character has. By default level ground.
-      task: the rules: 'imitation'; 'footsteps', for who has a right and a left foot; in three
-        dimensions 'hike' or 'soccer' (above a footstep controller) or 'journey' (from goal to goal
-        without one); 'gait' (in the plane), or 'walk', which needs neither clip nor controller. Or
-        a class or function of the user's, called as task(character, arena, actuation_model=...),
-        with clip=... if one is given, and with the task's options by keyword; it returns a `Task`.
+      task: title of a task type: 'imitation'; 'footsteps', for characters with a right and a left
+        foot; in three dimensions 'goal_navigation' or 'soccer' (above a footstep controller), or
+        'direct_navigation' or 'direct_soccer' (without one); 'gait' (in the plane), or 'walk', which
+        needs neither clip nor controller. Or a `TaskType` of the user's; or a class or function, called
+        as task(character, arena, actuation_model=...), with clip=... if one is given, and with the
+        task's options by keyword; it returns a `Task`.
       clip: what is tracked. To be imitated: name of a clip, path of an .npz, or a `Clip`; for
         footsteps in three dimensions the same of a library of steps, `Steps`. By default the
         character's own. A gait or a walk takes none.
@@ -277,65 +132,96 @@ def combine(
     Raises:
       ValueError: unknown names, or parts that do not fit each other.
     """
-    own = not isinstance(task, str)
-    title = task if isinstance(task, str) else str(getattr(task, '__name__', 'task'))
-    if own and not callable(task):
-        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
-    if not own and title not in TASKS:
-        raise ValueError(errors.unknown('task', title, TASKS))
-    name = character if isinstance(character, str) else character.name
-    if isinstance(character, str) and character not in characters.CHARACTERS:
+    own: dict[str, Any] = {}
+    if not isinstance(character, str):
+        own['character'], character = character, character.name
+    elif character not in characters.CHARACTERS:
         raise ValueError(errors.unknown('character', character, characters.CHARACTERS))
-    spatial = _character(character).spatial
-    if not own and spatial is not _SPATIAL.get(title, spatial):
-        raise ValueError(
-            f'character {name!r} is {_DIMENSIONS[spatial]}; the task {title!r} is for '
-            f'{_DIMENSIONS[not spatial]} characters'
-        )
-    if task == 'footsteps' and not spatial:
-        check_feet(_character(character))
-    if task == 'gait':
-        if actuation not in (None, 'gait') or clip is not None:
-            raise ValueError(
-                'a gait drives the joints by itself: it takes no actuation and no clip'
-            )
-        actuation = 'gait'
+    figure = own.get('character') or characters.CHARACTERS[character]
+    if isinstance(task, str):
+        title, type_ = task, _type(task, figure)
+        actuation = _actuation(type_, actuation)
+        if type_.motion is None and clip is not None:
+            raise ValueError(f'the task {title!r} tracks nothing: it takes no clip')
+        if clip is None and type_.motion is not None:
+            clip = _own_motion(figure, type_.motion)
+    elif isinstance(task, TaskType):
+        title, type_, own['task_type'] = task.title, task, task
+        _check_dimensions(task, figure)
+        actuation = _actuation(type_, actuation)
+        if clip is None and type_.motion is not None:
+            clip = _own_motion(figure, type_.motion)
+    elif callable(task):
+        title, type_ = str(getattr(task, '__name__', 'task')), None
+        own['task_type'], actuation = task, _actuation(None, actuation)
     else:
-        actuation = 'position' if actuation is None else actuation
-        if actuation not in actuation_models.ACTUATIONS:
-            raise ValueError(errors.unknown('actuation', actuation, actuation_models.ACTUATIONS))
-        if task == 'walk' and clip is not None:
-            raise ValueError('a walk tracks nothing: it takes no clip')
-        if clip is None and not own and task != 'walk':
-            clip = _own_motion(name, title in _OF_STEPS and spatial)
+        raise TypeError(f'a task is a name, or a class or function that makes one, not {task!r}')
     if terrain is None:
-        terrain = 'plane' if spatial else 'flat'
-    return Row(
-        id=f'{name}/{actuation}/{terrain if isinstance(terrain, str) else "terrain"}/{title}',
+        terrain = 'plane' if figure.spatial else 'flat'
+    if clip is not None and not isinstance(clip, str):
+        own['clip'], clip = clip, clip.name
+    ground = terrain if isinstance(terrain, str) else 'terrain'
+    spec = EnvSpec(
+        id=f'{character}/{actuation}/{ground}/{title}',
         domain='custom',
         task=title,
-        character=character,  # type: ignore[arg-type]
+        character=character,
         actuation=actuation,
-        terrain=terrain,
-        rules=task if own else _BY_DIMENSIONS.get((title, spatial), title),  # type: ignore[arg-type]
-        clip=clip,  # type: ignore[arg-type]
-        options=MappingProxyType({'rewards': WALK} if task == 'walk' else {}),
+        terrain=ground,
+        task_type=title if type_ is None else type_.name,
+        clip=clip,
+        options=MappingProxyType({} if type_ is None else dict(type_.options)),
         description='A combination of the user.',
+        own=MappingProxyType(own),
     )
+    return spec.with_terrain(terrain)
 
 
-def _character(character: str | characters.CharacterRow) -> characters.CharacterRow:
-    return characters.CHARACTERS[character] if isinstance(character, str) else character
+def _type(title: str, character: characters.CharacterSpec) -> TaskType:
+    """Returns the task type of a title for a character."""
+    if title not in TITLES:
+        raise ValueError(errors.unknown('task', title, TITLES))
+    types = {type_.spatial: type_ for type_ in TASK_TYPES.values() if type_.title == title}
+    type_ = types.get(character.spatial) or next(iter(types.values()))
+    _check_dimensions(type_, character)
+    return type_
 
 
-def _own_motion(name: str, steps: bool) -> str:
+def _check_dimensions(type_: TaskType, character: characters.CharacterSpec) -> None:
+    """Checks that a task type is for characters of these dimensions.
+
+    Raises:
+      ValueError: it is not.
+    """
+    if character.spatial != type_.spatial:
+        raise ValueError(
+            f'character {character.name!r} is {DIMENSIONS[character.spatial]}; the task '
+            f'{type_.title!r} is for {DIMENSIONS[type_.spatial]} characters'
+        )
+
+
+def _actuation(type_: TaskType | None, actuation: str | None) -> str:
+    """Returns the actuation model of a task type, by default position control if it may be."""
+    known = actuation_models.ACTUATIONS
+    if type_ is not None and type_.actuations is not None:
+        known = type_.actuations
+    if actuation is None:
+        return 'position' if 'position' in known else known[0]
+    if actuation not in known:
+        owner = 'actuation' if type_ is None else f'actuation of the task {type_.title!r}'
+        raise ValueError(errors.unknown(owner, actuation, known))
+    return actuation
+
+
+def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
     """Returns the name of a character's own clip, or of its library of steps."""
-    if not steps:
-        if name not in DEFAULT_CLIPS:
+    name = character.name
+    if kind is motion.Clip:
+        if character.clip is None:
             raise ValueError(
                 f"character {name!r} has no clip of its own; give clip=, or task='walk', which needs none"
             )
-        return DEFAULT_CLIPS[name]
+        return character.clip
     known = motion.steps_names()
     if name not in known:
         raise ValueError(
@@ -345,77 +231,21 @@ def _own_motion(name: str, steps: bool) -> str:
     return name
 
 
-def _check_dimensions(row: Row) -> None:
-    """Checks that character and terrain have the same number of dimensions.
-
-    Raises:
-      ValueError: they have not; the message names presets that fit.
-    """
-    character, ground = _character(row.character), terrains.load(row.terrain)
-    if ground.spatial == character.spatial:
-        return
-    presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
-    raise ValueError(
-        f'character {character.name!r} is {_DIMENSIONS[character.spatial]} and terrain {ground.name!r} '
-        f'({ground.type}) {_DIMENSIONS[ground.spatial]}; presets that fit: {", ".join(sorted(presets))}'
-    )
-
-
-def build_task(row: Row, options: Mapping[str, Any] | None = None) -> Task:
-    """Builds the task of a row, for a plain `composer.Environment` or a batch.
-
-    Args:
-      row: a row of the catalogue.
-      options: keyword arguments of the task class that override those of the row; besides those
-        every task takes `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
-
-    Raises:
-      ValueError: an unknown option; the message has the closest matches. Or a terrain with other
-        dimensions than the character.
-    """
-    make_task = _of_the_user if callable(row.rules) else _RULES[row.rules][0]
-    merged = {**row.options, **(options or {})}
-    known = task_options(row)
-    parts = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
-    for name in merged:
-        if name not in known:
-            choices = [*known, *composed.OPTIONS, 'random']
-            raise ValueError(errors.unknown(f'option of {row.id}', name, choices))
-    if not callable(row.rules):  # the user's own check theirs
-        errors.check_kinds(_takes(row), merged)
-    _check_dimensions(row)
-    return composed.compose(make_task(row, merged), parts)
-
-
-def task_options(row: Row) -> dict[str, Any]:
-    """Returns the options of a row's task, besides those of every task, with their defaults."""
-    return {
-        name: row.options.get(name, parameter.default)
-        for name, parameter in inspect.signature(_takes(row)).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
-    }
-
-
-def _takes(row: Row) -> Callable[..., Any]:
-    """Returns what has the options of a row's task as keyword arguments."""
-    return row.rules if callable(row.rules) else _RULES[row.rules][1]
-
-
-def build_row(
-    row: Row, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
+def build_environment(
+    spec: EnvSpec, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
 ) -> Environment:
-    """Builds the environment of a row; see `load` for the arguments."""
+    """Builds an environment from its data; see `load` for the arguments."""
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
     for name in environment_kwargs:
         if name not in known:
             raise ValueError(errors.unknown('option of an environment', name, known))
-    options = {'step_limit': row.step_limit, **environment_kwargs}
+    options = {'step_limit': spec.step_limit, **environment_kwargs}
     for name in _ENVIRONMENT_OPTIONS:
         if name in task_kwargs:
             options[name] = task_kwargs[name]
     task = build_task(
-        row, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
+        spec, {name: v for name, v in task_kwargs.items() if name not in _ENVIRONMENT_OPTIONS}
     )
     environment = Environment(task, **options)
-    environment._recipe = (build_row, (row, task_kwargs, environment_kwargs))
+    environment.recipe = (build_environment, (spec, task_kwargs, environment_kwargs))
     return environment

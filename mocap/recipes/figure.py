@@ -11,7 +11,7 @@ import functools
 import mujoco
 import numpy as np
 
-from trl_suite import resources
+from trl_suite.util import resources
 
 
 def model(name: str, ground: bool = False) -> mujoco.MjModel:

@@ -14,8 +14,9 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from trl_suite import motion, resources
+from trl_suite import motion
 from trl_suite.motion import quaternion
+from trl_suite.util import resources
 
 LEGS = {
     'torso': 4,

@@ -1,6 +1,6 @@
 """Arenas: terrain as collision geometry, without recompiling."""
 
-from trl_suite.arenas.planar import PlanarTerrain
-from trl_suite.arenas.spatial import SpatialTerrain
+from trl_suite.arenas.planar import PlanarArena
+from trl_suite.arenas.spatial import SpatialArena
 
-__all__ = ('PlanarTerrain', 'SpatialTerrain')
+__all__ = ('PlanarArena', 'SpatialArena')

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import boxes, stage
+from trl_suite.arenas import boxes
+from trl_suite.arenas import scene as stage
 from trl_suite.arenas.boxes import Boxes
-from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
-from trl_suite.terrain import GENERATORS, SPACING, Strip, Terrain, planar_ground
-from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain import GENERATORS, SPACING, PlanarGround, Terrain
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes about where it was laid
@@ -36,7 +38,7 @@ class Pool(NamedTuple):
     geoms: bounds.Geoms
 
 
-class PlanarTerrain(composer.Arena):
+class PlanarArena(composer.Arena):
     """Planar terrain realised by a pool of static boxes that are posed anew, never recompiled.
 
     After compiling, `bind` ties the arena to a world of n simulations. Each has its own strip;
@@ -80,24 +82,24 @@ class PlanarTerrain(composer.Arena):
             )
             for model in world.models
         ]
-        self.strips: list[Strip | None] = [None] * world.n
+        self.grounds: list[PlanarGround | None] = [None] * world.n
         self.ground = planar_ground.empty(world.n, _WINDOW, _REACH)
         self._ground = packed(self.ground)
         self._numbers = np.arange(world.n)
 
-    def begin_episode(self, row: int, strip: Strip) -> None:
+    def begin_episode(self, env_id: int, strip: PlanarGround) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards."""
-        self.strips[row] = strip
-        self._lay(row, 0)
+        self.grounds[env_id] = strip
+        self._lay(env_id, 0)
 
-    def follow(self, x: np.ndarray, rows: np.ndarray | None = None) -> None:
+    def follow(self, x: np.ndarray, env_ids: np.ndarray | None = None) -> None:
         """Keeps ground under and ahead of characters.
 
         Args:
-          x: where their roots are, m, (n, 1), or of the given rows only, (m, 1).
-          rows: sorted numbers of simulations; None for all.
+          x: where their roots are, m, (n, 1), or of the given simulations only, (m, 1).
+          env_ids: sorted numbers of simulations; None for all.
         """
-        env_ids = self._numbers if rows is None else rows
+        env_ids = self._numbers if env_ids is None else env_ids
         far = np.abs(x[:, 0] - self.ground.centre[env_ids]) > self.ground.reach
         if far.any():
             self.follow_all(env_ids[far], x[far, 0])
@@ -110,18 +112,18 @@ class PlanarTerrain(composer.Arena):
         # Contacts of the open step name boxes that now lie elsewhere.
         self._world.forward(env_ids)
 
-    def height(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """Heights of the ground in m at x (rows, k) m, exact between the strip's vertices.
+    def height(self, x: np.ndarray, env_ids: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Heights of the ground in m at x (simulations, k) m, exact between the strip's vertices.
 
         `follow` keeps characters inside their windows; of what lies beyond see `look_far`.
         """
-        return self._ask(_heights, x, rows)
+        return self._ask(_heights, x, env_ids)
 
     def look_far(self, x: np.ndarray, heights: np.ndarray) -> None:
-        """Puts right what `height` gave where rows ask beyond their boxes.
+        """Puts right what `height` gave where simulations ask beyond their boxes.
 
         Args:
-          x: as given to `height` for all rows, m, (n, k).
+          x: as given to `height` for all simulations, m, (n, k).
           heights: what it returned, (n, k). True up to the length of a window beyond the boxes;
             further away is only who has broken down.
         """
@@ -136,48 +138,48 @@ class PlanarTerrain(composer.Arena):
 
     def widen(self, env_id: int) -> None:
         """Draws ground up to the length of a window beyond the window of one simulation."""
-        strip, ground = self.strips[env_id], self.ground
+        strip, ground = self.grounds[env_id], self.ground
         if strip is None or ground.is_wide[env_id]:
             return
         start = int(ground.start[env_id]) - _WINDOW
         ground.wide[env_id] = strip.window(start, 3 * _WINDOW + 1)[0]
         ground.is_wide[env_id] = True
 
-    def slope(self, x: np.ndarray, rows: slice | np.ndarray = slice(None)) -> np.ndarray:
-        """Slopes dh/dx of the ground at x (rows, k) m."""
-        return self._ask(_slopes, x, rows)
+    def slope(self, x: np.ndarray, env_ids: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Slopes dh/dx of the ground at x (simulations, k) m."""
+        return self._ask(_slopes, x, env_ids)
 
     def _ask(
-        self, query: Callable[..., None], x: np.ndarray, rows: slice | np.ndarray
+        self, query: Callable[..., None], x: np.ndarray, env_ids: slice | np.ndarray
     ) -> np.ndarray:
-        """Asks a compiled loop about points (rows, k)."""
-        env_ids, x = self._numbers[rows], np.ascontiguousarray(x, float)
+        """Asks a compiled loop about points (simulations, k)."""
+        env_ids, x = self._numbers[env_ids], np.ascontiguousarray(x, float)
         if x.ndim != 2 or len(x) != len(env_ids):
             raise ValueError(f'x has shape {x.shape}; expected ({len(env_ids)}, k)')
         found = np.empty(x.shape)
         query(env_ids, x, self.ground, found)
         return found
 
-    def state(self, row: int) -> dict[str, Any]:
+    def state(self, env_id: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
-        strip = self.strips[row]
+        strip = self.grounds[env_id]
         if strip is None:
             return {'strip': None}
-        return {'strip': strip.state(), 'centre': int(self.ground.start[row]) + _BEHIND}
+        return {'strip': strip.state(), 'centre': int(self.ground.start[env_id]) + _BEHIND}
 
-    def restore(self, row: int, state: dict[str, Any]) -> None:
+    def restore(self, env_id: int, state: dict[str, Any]) -> None:
         """Restores the ground of one simulation; the caller forwards the world afterwards."""
         if state['strip'] is not None:
-            self.strips[row] = Strip.from_state(state['strip'])
-            self._lay(row, state['centre'])
+            self.grounds[env_id] = PlanarGround.from_state(state['strip'])
+            self._lay(env_id, state['centre'])
 
-    def _lay(self, row: int, centre: int) -> None:
+    def _lay(self, env_id: int, centre: int) -> None:
         """Realises the strip around a vertex as boxes."""
-        strip = self.strips[row]
+        strip = self.grounds[env_id]
         assert strip is not None
         start = centre - _BEHIND
         heights, vertical = strip.window(start, _WINDOW)
-        if is_laid(row, centre, heights, vertical, self._ground):
+        if is_laid(env_id, centre, heights, vertical, self._ground):
             return  # as on flat ground: the boxes lie already
         tolerance = boxes.TOLERANCE
         pieces = boxes.cut(start, heights, vertical, tolerance)
@@ -191,14 +193,14 @@ class PlanarTerrain(composer.Arena):
                 )
             pieces = boxes.cut(start, heights, vertical, tolerance)
         lay(
-            row, centre, heights, vertical, pieces.number, pieces.level, pieces.ends, pieces.edges,
-            boxes.angles(pieces), self._ground, self._pools[row],
+            env_id, centre, heights, vertical, pieces.number, pieces.level, pieces.ends, pieces.edges,
+            boxes.angles(pieces), self._ground, self._pools[env_id],
         )  # fmt: skip
 
 
 @compiled_loop
 def is_laid(
-    i: int, centre: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarGround
+    i: int, centre: int, heights: np.ndarray, vertical: np.ndarray, ground: PlanarWindows
 ) -> bool:
     """Moves the window of a simulation; returns whether it holds these vertices already."""
     ground.centre[i] = centre * SPACING
@@ -222,7 +224,7 @@ def lay(
     ends: np.ndarray,
     edges: np.ndarray,
     angle: np.ndarray,
-    ground: PlanarGround,
+    ground: PlanarWindows,
     pool: Pool,
 ) -> None:
     """Puts vertices into the window of a simulation, and poses the boxes of their pieces."""
@@ -240,21 +242,23 @@ def lay(
 
 
 @compiled
-def _heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+def _heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarWindows, out: np.ndarray) -> None:
     for k in range(len(env_ids)):
         for p in range(x.shape[1]):
             out[k, p] = planar_ground.height(env_ids[k], x[k, p], ground)
 
 
 @compiled
-def _far_heights(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+def _far_heights(
+    env_ids: np.ndarray, x: np.ndarray, ground: PlanarWindows, out: np.ndarray
+) -> None:
     for k in range(len(env_ids)):
         for p in range(x.shape[1]):
             out[k, p] = planar_ground.far_height(env_ids[k], x[k, p], ground)
 
 
 @compiled
-def _slopes(env_ids: np.ndarray, x: np.ndarray, ground: PlanarGround, out: np.ndarray) -> None:
+def _slopes(env_ids: np.ndarray, x: np.ndarray, ground: PlanarWindows, out: np.ndarray) -> None:
     for k in range(len(env_ids)):
         for p in range(x.shape[1]):
             out[k, p] = planar_ground.slope(env_ids[k], x[k, p], ground)
@@ -266,9 +270,11 @@ def _pool_size(terrain: Terrain) -> int:
     if generator is not None and generator.line is not None:
         windows = range(-LINE_PROBES, LINE_PROBES)  # it is always the same, and nowhere alike
     most = 0
-    for blend in range(max(1, len(terrain.parameter_sets))):
+    for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for k in windows:
-            window = Strip(terrain, abs(k), blend=blend).window(k * _WINDOW, _WINDOW)
+            window = PlanarGround(terrain, abs(k), terrain_level=terrain_level).window(
+                k * _WINDOW, _WINDOW
+            )
             most = max(most, boxes.cut(k * _WINDOW, *window).number)
     return round(SPARE * most) + PROBES
 

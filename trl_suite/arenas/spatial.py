@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from dm_control import composer, mjcf
 
-from trl_suite.arenas import stage
-from trl_suite.arenas.stage import FRICTION, PARKED, SOLIMP, SOLREF
+from trl_suite.arenas import scene as stage
+from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
-from trl_suite.terrain import Boxes, Ground, Surroundings, Terrain, capacity
-from trl_suite.terrain.ground import Random
-from trl_suite.terrain.spatial_ground import HALF, VERTICES, SpatialGround, keep_moving
-from trl_suite.terrain.surroundings import ALL, Rows
+from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
+from trl_suite.terrain.spatial.ground import Random
+from trl_suite.terrain.spatial.surroundings import ALL, Rows
+from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
 ELEVATION = 40.0  # m; the most that heights of a grid may differ within a window
@@ -31,7 +31,7 @@ SHADES = np.array(
 )  # of boxes, by turns of 0.5 m along x
 
 
-class SpatialTerrain(composer.Arena):
+class SpatialArena(composer.Arena):
     """Three-dimensional terrain realised by geoms that are posed anew, never recompiled.
 
     A plane, a height field of 32 m x 32 m, pools of static boxes and of belts, and boxes that slide
@@ -144,36 +144,38 @@ class SpatialTerrain(composer.Arena):
         self._geoms = [packed(bounds.geoms(model)) for model in world.models]
 
     @property
-    def grounds(self) -> list[Ground | None]:
+    def grounds(self) -> list[SpatialGround | None]:
         """The ground of each simulation."""
         return self.surroundings.grounds
 
-    def begin_episode(self, row: int, ground: Ground, xy: npt.ArrayLike = (0.0, 0.0)) -> None:
+    def begin_episode(
+        self, env_id: int, ground: SpatialGround, xy: npt.ArrayLike = (0.0, 0.0)
+    ) -> None:
         """Replaces the ground of one simulation; the caller forwards the world afterwards.
 
         Args:
-          row: which simulation; it may be reset before or after.
+          env_id: which simulation; it may be reset before or after.
           ground: the new ground.
           xy: where its character is put, m.
         """
-        self.surroundings.begin(row, ground, xy)
-        self._begin[row] = self.surroundings.way[row]
-        self._world.qpos[row, self._qpos] = 0.0
-        self._place(row)
-        self._realise(row)
+        self.surroundings.begin(env_id, ground, xy)
+        self._begin[env_id] = self.surroundings.way[env_id]
+        self._world.qpos[env_id, self._qpos] = 0.0
+        self._place(env_id)
+        self._realise(env_id)
 
-    def follow(self, xy: np.ndarray, rows: np.ndarray | None = None) -> None:
+    def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> None:
         """Keeps ground around characters and boxes moving; called before every control step.
 
         Args:
-          xy: where their roots are, m, (n, 2), or of the given rows only, (m, 2).
-          rows: sorted numbers of simulations; None for all.
+          xy: where their roots are, m, (n, 2), or of the given simulations only, (m, 2).
+          env_ids: sorted numbers of simulations; None for all.
         """
-        changed = self.surroundings.follow(xy, rows)
-        for row in changed:
-            self._realise(row)
+        changed = self.surroundings.follow(xy, env_ids)
+        for env_id in changed:
+            self._realise(env_id)
         if len(self._dof):
-            env_ids = self._world.all_ids if rows is None else rows
+            env_ids = self._world.all_ids if env_ids is None else env_ids
             sped = np.zeros(len(env_ids), bool)
             _keep_moving(
                 env_ids, np.ascontiguousarray(xy, float), self._world.qpos, self._world.qvel,
@@ -183,81 +185,81 @@ class SpatialTerrain(composer.Arena):
         if changed:  # contacts of the open step name boxes that now lie elsewhere
             self._world.forward(np.array(changed))
 
-    def height(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
-        """Heights of the surface in m at points (rows, k) m, within 12 m of the characters."""
-        self._look(rows)
-        return self.surroundings.height(x, y, rows)
+    def height(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+        """Heights of the surface in m at points (simulations, k) m, within 12 m of the characters."""
+        self._look(env_ids)
+        return self.surroundings.height(x, y, env_ids)
 
-    def surface_velocity(self, x: np.ndarray, y: np.ndarray, rows: Rows = ALL) -> np.ndarray:
-        """Horizontal velocities of the surface in m/s at points (rows, k) m, (rows, k, 2)."""
-        self._look(rows)
-        return self.surroundings.velocity(x, y, rows)
+    def surface_velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+        """Horizontal velocities of the surface in m/s at points (simulations, k) m, (simulations, k, 2)."""
+        self._look(env_ids)
+        return self.surroundings.velocity(x, y, env_ids)
 
     def height_map(
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        rows: Rows = ALL,
+        env_ids: Rows = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Heights around characters, (rows, 1024) m; see `Surroundings.height_map`."""
-        self._look(rows)
-        return self.surroundings.height_map(xy, heading, rows, out)
+        """Heights around characters, (simulations, 1024) m; see `Surroundings.height_map`."""
+        self._look(env_ids)
+        return self.surroundings.height_map(xy, heading, env_ids, out)
 
     def velocity_map(
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        rows: Rows = ALL,
+        env_ids: Rows = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Velocities of the surface, (rows, 2048) m/s; see `Surroundings.velocity_map`."""
-        self._look(rows)
-        return self.surroundings.velocity_map(xy, heading, rows, out)
+        """Velocities of the surface, (simulations, 2048) m/s; see `Surroundings.velocity_map`."""
+        self._look(env_ids)
+        return self.surroundings.velocity_map(xy, heading, env_ids, out)
 
     def goal(
         self,
-        row: int,
+        env_id: int,
         random: Random,
         root: npt.ArrayLike,
-        rule: str = 'hike',
+        rule: str = 'far',
         distance: float = 1.0,
     ) -> np.ndarray:
-        """Draws a goal for one simulation, clear of boxes as they now stand; see `Ground.goal`."""
-        self._look(row)
-        ground = self.grounds[row]
+        """Draws a goal for one simulation, clear of boxes as they now stand; see `SpatialGround.goal`."""
+        self._look(env_id)
+        ground = self.grounds[env_id]
         assert ground is not None
         movers = None
         if ground.layout.movers is not None:
-            movers = self.surroundings.centres(np.array([row]))[
+            movers = self.surroundings.centres(np.array([env_id]))[
                 0, : len(ground.layout.movers.speed)
             ]
         return ground.goal(random, root, rule, distance=distance, movers=movers)
 
-    def state(self, row: int) -> dict[str, Any]:
+    def state(self, env_id: int) -> dict[str, Any]:
         """What is needed to restore the ground of one simulation exactly."""
-        self._look(row)
-        return {**self.surroundings.state(row), 'begin': self._begin[row].copy()}
+        self._look(env_id)
+        return {**self.surroundings.state(env_id), 'begin': self._begin[env_id].copy()}
 
-    def restore(self, row: int, state: Mapping[str, Any]) -> None:
+    def restore(self, env_id: int, state: Mapping[str, Any]) -> None:
         """Restores the ground of one simulation; the caller restores the world afterwards."""
         if state['ground'] is not None:
-            self.surroundings.restore(row, state)
-            self._begin[row] = state['begin']
-            self._world.qpos[row, self._qpos] = state['way'] - state['begin']
-            self._place(row)
-            self._realise(row)
+            self.surroundings.restore(env_id, state)
+            self._begin[env_id] = state['begin']
+            self._world.qpos[env_id, self._qpos] = state['way'] - state['begin']
+            self._place(env_id)
+            self._realise(env_id)
 
-    def _look(self, rows: Rows | int) -> None:
+    def _look(self, env_ids: Rows | int) -> None:
         """Sees where the physics has taken moving boxes of some simulations."""
         if len(self._qpos):
-            moved = self._world.qpos[rows][..., self._qpos]
-            self.surroundings.way[rows] = self._begin[rows] + moved
+            moved = self._world.qpos[env_ids][..., self._qpos]
+            self.surroundings.way[env_ids] = self._begin[env_ids] + moved
 
-    def _realise(self, row: int) -> None:
+    def _realise(self, env_id: int) -> None:
         """Poses geoms as the window says."""
-        model, around = self._world.models[row], self.surroundings
-        ground, (x, y) = around.grounds[row], around.centre[row]
+        model, around = self._world.models[env_id], self.surroundings
+        ground, (x, y) = around.grounds[env_id], around.centre[env_id]
         assert ground is not None
         level, floor = ground.layout.level, 0.0
         if self._plane >= 0:
@@ -269,7 +271,7 @@ class SpatialTerrain(composer.Arena):
                 return  # nothing but a plane, which lies there already
             model.geom_pos[self._plane] = place
         if self._field >= 0:
-            heights = around.grid(row)
+            heights = around.grid(env_id)
             lowest, highest = float(heights.min()), float(heights.max())
             if not highest - lowest <= ELEVATION:
                 raise ValueError(
@@ -281,7 +283,7 @@ class SpatialTerrain(composer.Arena):
             data = model.hfield_data.reshape(VERTICES, VERTICES)
             np.subtract(heights[::-1], np.float32(lowest), out=data)
             data *= np.float32(1 / ELEVATION)
-        boxes, belts = around.boxes[row], ground.layout.belts
+        boxes, belts = around.boxes[env_id], ground.layout.belts
         if len(boxes.top):
             floor = min(floor, float(boxes.top.min()))
         for pool, used in ((self._pool, boxes), (self._belts, belts and belts.boxes)):
@@ -297,28 +299,28 @@ class SpatialTerrain(composer.Arena):
             cosine, sine = np.cos(belts.boxes.yaw), np.sin(belts.boxes.yaw)
             east, north = belts.velocity.T
             run[:, 0], run[:, 1] = cosine * east + sine * north, cosine * north - sine * east
-        bounds.refresh_all(self._placed, self._geoms[row])
+        bounds.refresh_all(self._placed, self._geoms[env_id])
         if self._field >= 0:
             self._show(model)
 
-    def _place(self, row: int) -> None:
+    def _place(self, env_id: int) -> None:
         """Puts moving boxes where their ways begin for the physics."""
         if not len(self._bodies):
             return
-        model, around, ground = self._world.models[row], self.surroundings, self.grounds[row]
+        model, around, ground = self._world.models[env_id], self.surroundings, self.grounds[env_id]
         assert ground is not None and ground.layout.level is not None
         movers, level = ground.layout.movers, ground.layout.level
         count = 0 if movers is None else len(movers.speed)
         position = np.full((len(self._bodies), 3), PARKED)
         size = np.full((len(self._bodies), 3), SIZE)
         if movers is not None:
-            way = self._begin[row, :count, None]
-            position[:count, :2] = around.start[row, :count] + way * around.axis[row, :count]
+            way = self._begin[env_id, :count, None]
+            position[:count, :2] = around.start[env_id, :count] + way * around.axis[env_id, :count]
             position[:count, 2] = level + 0.5 * movers.height
             size[:count, :2], size[:count, 2] = movers.half_size, 0.5 * movers.height
-            model.jnt_axis[self._joints[:count], :2] = around.axis[row, :count]
+            model.jnt_axis[self._joints[:count], :2] = around.axis[env_id, :count]
         model.body_pos[self._bodies], model.geom_size[self._mover_geoms] = position, size
-        self._world.qvel[row, self._dof] = around.direction[row] * around.speed[row]
+        self._world.qvel[env_id, self._dof] = around.direction[env_id] * around.speed[env_id]
 
     def _set_inertia(self, model: mujoco.MjModel) -> None:
         if len(self._dof) and len(self._own):
@@ -339,7 +341,7 @@ class SpatialTerrain(composer.Arena):
 @compiled_loop
 def _keep_moving(
     env_ids: np.ndarray, xy: np.ndarray, qpos: np.ndarray, qvel: np.ndarray,
-    ground: SpatialGround, sped: np.ndarray,
+    ground: SpatialWindows, sped: np.ndarray,
 ) -> None:  # fmt: skip
     for k in range(len(env_ids)):
         sped[k] = keep_moving(env_ids[k], xy[k, 0], xy[k, 1], qpos, qvel, ground)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from trl_suite import errors
 from trl_suite.characters.character import (
     Character,
-    CharacterRow,
+    CharacterSpec,
     Joint,
     body_figures,
     fingerprint,
 )
-from trl_suite.characters.own import from_file
-from trl_suite.characters.rows import CHARACTERS
+from trl_suite.characters.from_file import from_file
+from trl_suite.characters.specs import CHARACTERS
+from trl_suite.util import errors
 
 __all__ = (
     'CHARACTERS',
     'Character',
-    'CharacterRow',
+    'CharacterSpec',
     'Joint',
     'body_figures',
     'fingerprint',
@@ -25,7 +25,7 @@ __all__ = (
 )
 
 
-def make(character: str | CharacterRow) -> Character:
+def make(character: str | CharacterSpec) -> Character:
     """Builds a character entity.
 
     Args:

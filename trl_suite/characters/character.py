@@ -12,7 +12,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
-from trl_suite import resources
+from trl_suite.util import resources
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 is what is drawn
 DIGITS = 6  # to which a fingerprint looks
@@ -56,7 +56,7 @@ class Joint:
 
 
 @dataclasses.dataclass(frozen=True)
-class CharacterRow:
+class CharacterSpec:
     """One character as a row of data.
 
     Attributes:
@@ -71,9 +71,11 @@ class CharacterRow:
       spatial: whether its root is free in three dimensions, instead of moving in the x-z plane.
       xml, assets: MJCF text instead of a file, and its meshes and pictures by name.
       bodies: names of the links, root first, where they are not 'root' and those of the joints.
-      solids: names of the geoms that can touch the ground; by default one for each link, of its
+      collision_geoms: names of the geoms that can touch the ground; by default one for each link, of its
         name, unless its default class is group0.
       notes: what was assumed about the character, for people.
+      clip: the clip that it tracks where none is given, of those in mocap/.
+      differences: sentences on what differs from the original, by actuation model or 'gait'.
     """
 
     name: str
@@ -88,8 +90,10 @@ class CharacterRow:
     xml: str | None = dataclasses.field(default=None, repr=False)
     assets: Mapping[str, bytes] = dataclasses.field(default_factory=dict, repr=False)
     bodies: tuple[str, ...] | None = None
-    solids: tuple[str, ...] | None = None
+    collision_geoms: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
+    clip: str | None = None
+    differences: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict, repr=False)
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -114,7 +118,8 @@ class CharacterRow:
         return raw / raw.sum()
 
     @functools.cached_property
-    def _fingerprint(self) -> str:
+    def digest(self) -> str:
+        """See `fingerprint`."""
         return _digest(self)  # it compiles the character
 
 
@@ -125,12 +130,12 @@ class Character(composer.Entity):
     only when an actuation model is added (see `trl_suite.actuation`).
     """
 
-    def _build(self, row: CharacterRow, name: str | None = None) -> None:  # type: ignore[override]
-        self.row = row
-        if row.xml is not None:
-            self._mjcf_root = mjcf.from_xml_string(row.xml, assets=dict(row.assets))
+    def _build(self, spec: CharacterSpec, name: str | None = None) -> None:  # type: ignore[override]
+        self.spec = spec
+        if spec.xml is not None:
+            self._mjcf_root = mjcf.from_xml_string(spec.xml, assets=dict(spec.assets))
         else:
-            path = row.path or str(resources.directory('xml') / f'{row.name}.xml')
+            path = spec.path or str(resources.directory('xml') / f'{spec.name}.xml')
             self._mjcf_root = mjcf.from_path(path)
         if name is not None:
             self._mjcf_root.model = name
@@ -152,7 +157,7 @@ class Character(composer.Entity):
           The joints root_x (m), root_z (m) and root_pitch (rad, positive lifts the front); of a
           spatial character one free joint, root.
         """
-        if self.row.spatial:
+        if self.spec.spatial:
             return (frame.add('freejoint', name='root'),)
         root = {'limited': False, 'damping': 0, 'armature': 0}
         return (
@@ -163,28 +168,28 @@ class Character(composer.Entity):
 
     @property
     def root_body(self) -> mjcf.Element:
-        return self._find('body', self.row.links[0])
+        return self._find('body', self.spec.links[0])
 
     @property
     def bodies(self) -> list[mjcf.Element]:
         """Bodies in link order, the root body first."""
-        return [self._find('body', name) for name in self.row.links]
+        return [self._find('body', name) for name in self.spec.links]
 
     @property
     def joints(self) -> list[mjcf.Element]:
         """Actuated joints in link order."""
-        return [self._find('joint', name) for name in self.row.joints]
+        return [self._find('joint', name) for name in self.spec.joints]
 
     @property
     def end_effectors(self) -> list[mjcf.Element]:
-        return [self._find('body', name) for name in self.row.end_effectors]
+        return [self._find('body', name) for name in self.spec.end_effectors]
 
     @property
     def collision_geoms(self) -> list[mjcf.Element]:
         """The geoms that can touch the ground; of the suite's own, one per link that has any."""
-        if self.row.solids is not None:
-            return [self._find('geom', name) for name in self.row.solids]
-        geoms = [self._find('geom', name) for name in self.row.links]
+        if self.spec.collision_geoms is not None:
+            return [self._find('geom', name) for name in self.spec.collision_geoms]
+        geoms = [self._find('geom', name) for name in self.spec.links]
         return [geom for geom in geoms if geom.dclass.dclass != 'group0']
 
     @property
@@ -223,7 +228,7 @@ class Character(composer.Entity):
         element = self._mjcf_root.find(namespace, name)
         if element is None:
             raise ValueError(
-                f'character {self.row.name!r}: xml/{self.row.name}.xml has no {namespace} named '
+                f'character {self.spec.name!r}: xml/{self.spec.name}.xml has no {namespace} named '
                 f'{name!r}'
             )
         return element
@@ -279,27 +284,27 @@ class CharacterObservables(composer.Observables):
         return observable.Generic(relative)
 
 
-def fingerprint(row: CharacterRow) -> str:
+def fingerprint(spec: CharacterSpec) -> str:
     """Returns name and digest of all that makes a body move as it does, gains included.
 
     Looks do not count, nor does how the MJCF is written. Found once for every row.
     """
-    return row._fingerprint
+    return spec.digest
 
 
-def _digest(row: CharacterRow) -> str:
-    model = mjcf.Physics.from_mjcf_model(Character(row).mjcf_model).model
-    solid = _solid(row, model)
+def _digest(spec: CharacterSpec) -> str:
+    model = mjcf.Physics.from_mjcf_model(Character(spec).mjcf_model).model
+    solid = _solid(spec, model)
     figures = [
         model.body_mass, model.body_inertia, model.body_ipos, model.body_pos, model.body_quat,
         model.jnt_type, model.jnt_pos, model.jnt_axis, model.jnt_range, model.jnt_actfrcrange,
         model.geom_size[solid], model.geom_pos[solid], model.geom_quat[solid],
-        model.geom_friction[solid], [(j.kp, j.kd, j.armature) for j in row.joints.values()],
+        model.geom_friction[solid], [(j.kp, j.kd, j.armature) for j in spec.joints.values()],
     ]  # fmt: skip
     digest = hashlib.sha256()
     for array in figures:
         digest.update((np.asarray(array, float).round(DIGITS) + 0.0).tobytes())
-    return f'{row.name} {digest.hexdigest()[:16]}'
+    return f'{spec.name} {digest.hexdigest()[:16]}'
 
 
 def body_figures(character: Character) -> dict[str, Any]:
@@ -322,7 +327,7 @@ def body_figures(character: Character) -> dict[str, Any]:
         inertia += m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     lowest = min(
         lowest_point(data.geom_xpos[i], data.geom_xmat[i], model.geom_aabb[i, 3:])
-        for i in np.flatnonzero(_solid(character.row, model))
+        for i in np.flatnonzero(_solid(character.spec, model))
     )
     return {
         'mass': float(mass.sum()),
@@ -332,11 +337,11 @@ def body_figures(character: Character) -> dict[str, Any]:
     }
 
 
-def _solid(row: CharacterRow, model: Any) -> np.ndarray:
+def _solid(spec: CharacterSpec, model: Any) -> np.ndarray:
     """Which geoms of a character compiled alone make its body, (geoms,) bool."""
-    if row.solids is None:
+    if spec.collision_geoms is None:
         return model.geom_group == GROUP_COLLISION
-    return np.isin([model.id2name(i, 'geom') for i in range(model.ngeom)], row.solids)
+    return np.isin([model.id2name(i, 'geom') for i in range(model.ngeom)], spec.collision_geoms)
 
 
 def lowest_point(position: np.ndarray, matrix: np.ndarray, half_size: np.ndarray) -> float:

@@ -65,12 +65,12 @@ def skeleton(character: Character, world: World) -> Skeleton:
     qpos, dof = world.joint_addresses(names)
     links = world.body_ids([body.full_identifier for body in character.bodies])
     model = world.models[0]
-    # MuJoCo stores a triangle by rows; its order is by depth, so any of a pair may be the later.
+    # MuJoCo stores a triangle by simulations; its order is by depth, so any of a pair may be the later.
     places = np.full((model.nv, model.nv), -1)
-    for row in range(model.nv):
-        start = model.M_rowadr[row]
-        for k in range(start, start + model.M_rownnz[row]):
-            places[row, model.M_colind[k]] = places[model.M_colind[k], row] = k
+    for env_id in range(model.nv):
+        start = model.M_rowadr[env_id]
+        for k in range(start, start + model.M_rownnz[env_id]):
+            places[env_id, model.M_colind[k]] = places[model.M_colind[k], env_id] = k
     joint, body = model.dof_jntid[dof].astype(int), model.dof_bodyid[dof].astype(int)
     hinge = np.arange(len(names)) >= 2  # all but root_x and root_z
     moves = np.zeros((model.nbody, len(names)), bool)
@@ -109,12 +109,12 @@ def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndar
     rest = -2 * np.arctan2(model.body_quat[:, 2], model.body_quat[:, 0])
     coefficients = np.zeros((len(joints), len(skeleton.dof)))
     constants = np.zeros(len(joints))
-    for row, joint in enumerate(joints):
+    for env_id, joint in enumerate(joints):
         body = skeleton.body[3 + joint]
-        coefficients[row] = skeleton.moves[body]
-        coefficients[row, 3 + joint] = 0.0
+        coefficients[env_id] = skeleton.moves[body]
+        coefficients[env_id, 3 + joint] = 0.0
         while body:
-            constants[row] += rest[body]
+            constants[env_id] += rest[body]
             body = model.body_parentid[body]
     return coefficients, constants
 
@@ -126,10 +126,10 @@ def frame(joints: np.ndarray, skeleton: Skeleton, world: World) -> tuple[np.ndar
 def write_inertia(i: int, skeleton: Skeleton, M: np.ndarray, out: np.ndarray) -> None:
     """Writes the joint-space inertia into out[i], (D, D)."""
     count = len(skeleton.dof)
-    for row in range(count):
+    for env_id in range(count):
         for column in range(count):
-            entry = skeleton.entry[row, column]
-            out[i, row, column] = M[i, entry] if entry >= 0 else 0.0
+            entry = skeleton.entry[env_id, column]
+            out[i, env_id, column] = M[i, entry] if entry >= 0 else 0.0
 
 
 @compiled
@@ -158,18 +158,18 @@ def weight(
 
 @compiled
 def write_jacobian(
-    i: int, body: int, x: float, z: float, row: int, skeleton: Skeleton, xanchor: np.ndarray,
+    i: int, body: int, x: float, z: float, env_id: int, skeleton: Skeleton, xanchor: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Writes d(x, z) / d(degrees of freedom) of a point of a body into two rows of out[i], (., D).
+    """Writes d(x, z) / d(degrees of freedom) of a point of a body into two simulations of out[i], (., D).
 
     Of slides other than those of the root it is 0.
     """
     for k in range(len(skeleton.dof)):
         joint, moves = skeleton.joint[k], skeleton.moves[body, k]
-        out[i, row, k] = -(z - xanchor[i, joint, 2]) if moves else 0.0
-        out[i, row + 1, k] = x - xanchor[i, joint, 0] if moves else 0.0
-    out[i, row, 0] = out[i, row + 1, 1] = 1.0
+        out[i, env_id, k] = -(z - xanchor[i, joint, 2]) if moves else 0.0
+        out[i, env_id + 1, k] = x - xanchor[i, joint, 0] if moves else 0.0
+    out[i, env_id, 0] = out[i, env_id + 1, 1] = 1.0
 
 
 @compiled
@@ -180,9 +180,9 @@ def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
     """
     for k in range(n):
         pivot = k
-        for row in range(k + 1, n):
-            if abs(matrix[i, row, k]) > abs(matrix[i, pivot, k]):
-                pivot = row
+        for env_id in range(k + 1, n):
+            if abs(matrix[i, env_id, k]) > abs(matrix[i, pivot, k]):
+                pivot = env_id
         if pivot != k:
             for column in range(k, n):
                 kept = matrix[i, k, column]
@@ -192,13 +192,13 @@ def solve(i: int, n: int, matrix: np.ndarray, vector: np.ndarray) -> None:
             vector[i, k] = vector[i, pivot]
             vector[i, pivot] = kept
         inverse = 1.0 / matrix[i, k, k]
-        for row in range(k + 1, n):
-            factor = matrix[i, row, k] * inverse
+        for env_id in range(k + 1, n):
+            factor = matrix[i, env_id, k] * inverse
             if factor == 0.0:
                 continue
             for column in range(k + 1, n):
-                matrix[i, row, column] -= factor * matrix[i, k, column]
-            vector[i, row] -= factor * vector[i, k]
+                matrix[i, env_id, column] -= factor * matrix[i, k, column]
+            vector[i, env_id] -= factor * vector[i, k]
     for k in range(n - 1, -1, -1):
         x = vector[i, k]
         for column in range(k + 1, n):

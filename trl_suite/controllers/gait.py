@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
 from trl_suite.characters import Character
 from trl_suite.controllers import dynamics, gaits, parameters
 from trl_suite.controllers.dynamics import Mechanics
@@ -27,6 +26,7 @@ from trl_suite.controllers.machine import STATES, GaitRules, GaitState, Machine,
 from trl_suite.controllers.parameters import KINDS, Parameters
 from trl_suite.engine import World
 from trl_suite.kinematics.planar import PlanarState
+from trl_suite.util import errors
 from trl_suite.util.compiled import packed
 
 _LEG_ON_GROUND = 0.5  # kg; mass of the hopper's leg that its lift carries, beside the root
@@ -62,9 +62,9 @@ class Gait:
           ValueError: no gait drives this character, or it lacks a joint or a foot of the gait.
         """
         self.character = character
-        self.parameters = gait = gait or parameters.load(character.row.name)
-        self.number = {name: i for i, name in enumerate(character.row.joints)}
-        self.link = {name: i for i, name in enumerate(character.row.links)}
+        self.parameters = gait = gait or parameters.load(character.spec.name)
+        self.number = {name: i for i, name in enumerate(character.spec.joints)}
+        self.link = {name: i for i, name in enumerate(character.spec.links)}
         for joints in (*gait.legs, *gait.targets.values()):
             for name in joints:
                 if name not in self.number:
@@ -73,9 +73,9 @@ class Gait:
             if name not in self.link:
                 raise ValueError(errors.unknown('link', name, self.link))
         scope = character.mjcf_model.model
-        self._sensors = [f'{scope}_{link}_ground' for link in character.row.links]
+        self._sensors = [f'{scope}_{link}_ground' for link in character.spec.links]
         bodies = {body.name: body for body in character.bodies}
-        for name, link in zip(self._sensors, character.row.links, strict=True):
+        for name, link in zip(self._sensors, character.spec.links, strict=True):
             root.sensor.add(
                 'contact', name=name, body1=bodies[link], body2=ground_body, num=1, data='found'
             )
@@ -90,9 +90,9 @@ class Gait:
     def bind(self, world: World) -> None:
         """Resolves names in a compiled world, which has bound `dynamics.FIELDS`; makes room."""
         self.world, gait = world, self.parameters
-        row, scope = self.character.row, f'{self.character.mjcf_model.model}/'
+        spec, scope = self.character.spec, f'{self.character.mjcf_model.model}/'
         skeleton = dynamics.skeleton(self.character, world)
-        joints = row.joints.values()
+        joints = spec.joints.values()
         legs = np.array([[self.number[name] for name in leg] for leg in gait.legs])
         turn, constant = dynamics.frame(legs[:, 0], skeleton, world)
         contacts = world.sensor_addresses(self._sensors)  # neighbours, in link order
@@ -118,7 +118,7 @@ class Gait:
         )
         n, size, count = world.n, len(skeleton.dof), len(self.number)
         self.state = GaitState(
-            np.tile(gait.centre, (n, 1)), np.zeros(n, int), np.zeros(n), np.zeros((n, count)),
+            np.tile(gait.action_offset, (n, 1)), np.zeros(n, int), np.zeros(n), np.zeros((n, count)),
             np.zeros(n, int), np.zeros(n, bool), np.zeros(n, bool),
         )  # fmt: skip
         scratch = Scratch(
@@ -168,7 +168,7 @@ class Gait:
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Puts machines at the start of their first cycle, with the default gait."""
-        gaits.begin_all(env_ids, self.parameters.centre, self._pack)
+        gaits.begin_all(env_ids, self.parameters.action_offset, self._pack)
 
     def apply(self, env_ids: np.ndarray, vectors: np.ndarray) -> None:
         """Begins cycles with parameters (m, P)."""

@@ -89,21 +89,21 @@ def add_weight(i: int, gait: GaitRules) -> None:
     skeleton, scratch = gait.skeleton, gait.scratch
     com, anchors = gait.physics.subtree_com, gait.mechanics.xanchor
     support, grip, force = scratch.support, scratch.matrix, scratch.vector
-    for row in range(4):  # forces that carry the root, the first three degrees of freedom
+    for env_id in range(4):  # forces that carry the root, the first three degrees of freedom
         for column in range(4):
-            grip[i, row, column] = 0.0
+            grip[i, env_id, column] = 0.0
             for k in range(3):
-                grip[i, row, column] += support[i, row, k] * support[i, column, k]
-        grip[i, row, row] += REGULARISATION
-        force[i, row] = 0.0
+                grip[i, env_id, column] += support[i, env_id, k] * support[i, column, k]
+        grip[i, env_id, env_id] += REGULARISATION
+        force[i, env_id] = 0.0
         for k in range(3):
-            force[i, row] -= support[i, row, k] * weight(i, k, skeleton, com, anchors)
+            force[i, env_id] -= support[i, env_id, k] * weight(i, k, skeleton, com, anchors)
     solve(i, 4, grip, force)
     for joint in range(len(gait.machine.kp)):
         k = 3 + joint
         carried = 0.0
-        for row in range(4):
-            carried += force[i, row] * support[i, row, k]
+        for env_id in range(4):
+            carried += force[i, env_id] * support[i, env_id, k]
         scratch.torque[i, joint] += -weight(i, k, skeleton, com, anchors) - carried
 
 
@@ -263,10 +263,10 @@ def begin_all(env_ids: np.ndarray, vector: np.ndarray, gait: GaitRules) -> None:
 @compiled_loop
 def apply_all(env_ids: np.ndarray, vectors: np.ndarray, gait: GaitRules) -> None:
     """Begins cycles with parameters (m, P)."""
-    for row in range(len(env_ids)):
+    for env_id in range(len(env_ids)):
         for k in range(vectors.shape[1]):
-            gait.state.vector[env_ids[row], k] = vectors[row, k]
-        apply(env_ids[row], gait)
+            gait.state.vector[env_ids[env_id], k] = vectors[env_id, k]
+        apply(env_ids[env_id], gait)
 
 
 @compiled_loop
@@ -279,5 +279,5 @@ def act_all(env_ids: np.ndarray, gait: GaitRules) -> None:
 @compiled_loop
 def advance_all(env_ids: np.ndarray, gait: GaitRules, ended: np.ndarray) -> None:
     """Moves machines on; writes whose cycle has ended, (m,)."""
-    for row in range(len(env_ids)):
-        ended[row] = advance(env_ids[row], gait)
+    for env_id in range(len(env_ids)):
+        ended[env_id] = advance(env_ids[env_id], gait)

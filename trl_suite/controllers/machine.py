@@ -37,7 +37,7 @@ class Machine(NamedTuple):
       per_state: how many parameters each state has.
       absolute: places of the parameters whose sign does not count.
       place: which parameter of a state is the target of a joint while the right or the left leg
-        stands, -1 for those that no state moves, (2, J). Other gaits use the first row.
+        stands, -1 for those that no state moves, (2, J). Other gaits use the first simulation.
       legs: joints of each leg, the hip first, (F, K). The targets of hips are world angles.
       feet: links that step, one for each leg, (F,).
       soles: sites under them, (F,); of a bound only.

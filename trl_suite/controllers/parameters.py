@@ -16,7 +16,7 @@ One JSON file per character:
     target_speed             m/s, of the reward
     sets                     name -> vector
     base_actions             [set, set, blend]: gaits to choose from; they bound the actions
-    centre                   action 0: a set by name, or a base action by number
+    action_offset            action 0: a set by name, or a base action by number
     search_scale             by name, without state: standard deviations for a search
     start                    the pose of the first instant: height of the root m, pitch rad, velocity
                              of the root (m/s, m/s, rad/s), and angle and rate of each joint
@@ -33,7 +33,7 @@ and, where a character is an exception:
     observe_pitch            true: pitch and its rate take the place of the last link's z and its rate
 
 Source of the figures: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
-Panne (2016). The sets of which 'tuning' tells are our own.
+Panne (2016). The sets of which 'tuning' tells are our own, and the biped's 'tuned'.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import errors
+from trl_suite.util import errors
 
 KINDS = ('bound', 'stride', 'hop')
 BASE_ACTIONS = ('default', 'original')
@@ -72,8 +72,8 @@ class Parameters:
       sets: name -> (P,).
       base_actions: (8 or so, P).
       blends: of each base action: a set, another, and the other's share.
-      centre: what action 0 means, (P,).
-      half_range: largest deviation of a base action from the centre, (P,); what action 1 adds. So
+      action_offset: what action 0 means, (P,).
+      action_scale: largest deviation of a base action from the action_offset, (P,); what action 1 adds. So
         every base action lies in [-1, 1].
       search_scale: standard deviation for a search, (P,).
       start: the pose of the first instant, see the module.
@@ -98,8 +98,8 @@ class Parameters:
     sets: dict[str, np.ndarray]
     base_actions: np.ndarray
     blends: tuple[tuple[str, str, float], ...]
-    centre: np.ndarray
-    half_range: np.ndarray
+    action_offset: np.ndarray
+    action_scale: np.ndarray
     search_scale: np.ndarray
     start: dict[str, Any]
     gravity_compensation: bool
@@ -109,14 +109,14 @@ class Parameters:
     observe_pitch: bool
 
     def vector(self, action: np.ndarray) -> np.ndarray:
-        """Returns the parameters (n, P) that actions (n, a) mean: centre + half_range * action."""
-        vectors = np.tile(self.centre, (len(action), 1))
-        vectors[:, self.actions] += self.half_range[self.actions] * action
+        """Returns the parameters (n, P) that actions (n, a) mean: action_offset + action_scale * action."""
+        vectors = np.tile(self.action_offset, (len(action), 1))
+        vectors[:, self.actions] += self.action_scale[self.actions] * action
         return vectors
 
     def action(self, vector: np.ndarray) -> np.ndarray:
         """Returns the actions (..., a) that mean parameters (..., P), as far as actions can."""
-        return (vector - self.centre)[..., self.actions] / self.half_range[self.actions]
+        return (vector - self.action_offset)[..., self.actions] / self.action_scale[self.actions]
 
     def place(self, name: str) -> int:
         """Returns where a parameter lies."""
@@ -176,8 +176,8 @@ def read(data: dict[str, Any]) -> Parameters:
     base = np.array(
         [(1 - blend) * sets[a] + blend * sets[b] for a, b, blend in data['base_actions']]
     )
-    centre = data['centre']
-    centre = sets[centre] if isinstance(centre, str) else base[centre]
+    action_offset = data['action_offset']
+    action_offset = sets[action_offset] if isinstance(action_offset, str) else base[action_offset]
     return Parameters(
         character=data['character'],
         kind=data['kind'],
@@ -193,8 +193,8 @@ def read(data: dict[str, Any]) -> Parameters:
         sets=sets,
         base_actions=base,
         blends=tuple((a, b, float(blend)) for a, b, blend in data['base_actions']),
-        centre=centre,
-        half_range=np.abs(base - centre).max(0),
+        action_offset=action_offset,
+        action_scale=np.abs(base - action_offset).max(0),
         search_scale=np.array([data['search_scale'][name.split('.')[-1]] for name in names]),
         start=data['start'],
         gravity_compensation=data.get('gravity_compensation', True),

@@ -1,28 +1,31 @@
-"""An environment in words and tables, made from its row and from what it was built into.
+"""An environment in words and tables, made from its data and from what it was built into.
 
 from trl_suite import describe, suite
 
-row = suite.find('PD_Dog2D_Gaps_Terrain-v0')
-for title, text in describe.sections(row, suite.make(row.id)):  # as `trl-suite info` prints it
+spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
+for title, text in describe.sections(spec, suite.make(spec.id)):  # as `trl-suite info` prints it
     print(title, text)
 
-What is said of all environments is in `common`, of a family in `planar`, `gait`, `spatial` and
-`high_level`; `differences` says where the original is otherwise, and `layout` writes text and
-Markdown.
+Sections of every environment are in `common`, those of a task type in `trl_suite.tasks`;
+`differences` says where the original is otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from trl_suite import catalogue
-from trl_suite.describe import layout
+from trl_suite.describe import common, options
 from trl_suite.describe.differences import differences_of
-from trl_suite.describe.layout import Section, Table, escape, markdown, markdown_table, table
+from trl_suite.registry.build import task_type
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.tasks.components import description
+from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
+from trl_suite.util import tables
+from trl_suite.util.tables import Section, Table, escape, markdown, markdown_table, table
 
 if TYPE_CHECKING:
-    from trl_suite.environment import Environment
+    from trl_suite.environments.environment import Environment
 
 __all__ = [
     'Section', 'Table', 'differences_of', 'escape', 'markdown', 'markdown_table', 'parts', 'sections',
@@ -30,48 +33,37 @@ __all__ = [
 ]  # fmt: skip
 
 
-def sections(row: catalogue.Row, environment: Environment) -> Iterator[tuple[str, str]]:
+def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str]]:
     """Yields titles and texts: character, observation, action, rules, time, differences."""
-    for title, parts_ in parts(row, environment):
-        yield title, layout.text(parts_)
+    for title, parts_ in parts(spec, environment):
+        yield title, tables.text(parts_)
     yield (
         'Differs from the original (reasons in docs/differences.md)',
-        '\n'.join(f'  - {text}' for text in differences_of(row)),
+        '\n'.join(f'  - {text}' for text in differences_of(spec)),
     )
 
 
-def parts(row: catalogue.Row, environment: Environment) -> Iterator[Section]:
+def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
     """Yields sections of paragraphs and tables: all of `sections` but the differences.
 
     Args:
-      row: of the environment.
-      environment: built from it, or from a row that differs by its terrain only.
+      spec: of the environment.
+      environment: built from it, or from one that differs by its terrain only.
     """
-    # They import the engine, which the tables of the command line do without.
-    from trl_suite import suite
-    from trl_suite.describe import common, gait, high_level, options, planar, spatial
-    from trl_suite.tasks.gait import GaitTask
-    from trl_suite.tasks.high_level import HighLevel
-    from trl_suite.tasks.imitation import Imitation
-    from trl_suite.tasks.spatial_task import SpatialTask
-
-    families = (
-        (GaitTask, gait), (HighLevel, high_level), (SpatialTask, spatial), (Imitation, planar),
-    )  # fmt: skip
-    task: Any = environment.task
-    family: Any = next((family for kind, family in families if isinstance(task, kind)), None)
-    if family is None:  # one of the user's
-        yield common.observation(environment, planar.blocks(task))
-        yield common.action(environment)
-        yield common.time(row, task)
-        yield options.options(row, suite.task_options(row))
+    type_, task = task_type(spec), environment.task
+    if type_ is None:  # one of the user's
+        yield common.observation(environment, PLANAR_BLOCKS)
+        yield description.action(environment)
+        yield description.time(spec, task)
+        yield options.options(spec)
         return
-    yield from common.character(environment)
-    yield from family.before(task)
-    yield common.observation(environment, family.blocks(task))
-    yield from family.after(task)
-    yield family.action(environment)
-    yield common.ground(row)
-    yield from family.rules(row, task)
-    yield family.time(row, task)
-    yield options.options(row, suite.task_options(row))
+    about = type_.description
+    yield from common.character(environment, about.joints(task))
+    yield from about.before(task)
+    yield common.observation(environment, about.blocks(task))
+    yield from about.after(task)
+    yield about.action(environment)
+    yield common.ground(spec)
+    yield from about.rules(spec, task)
+    yield about.time(spec, task)
+    yield options.options(spec)

@@ -1,4 +1,4 @@
-"""What is said of every environment: character, observation, action, terrain, time."""
+"""Sections that every environment has: character, observation, terrain."""
 
 from __future__ import annotations
 
@@ -8,49 +8,29 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite import catalogue, characters, terrain
-from trl_suite.describe.layout import Section, Table, section
-from trl_suite.environment import Environment
-from trl_suite.tasks import rewards
-from trl_suite.tasks.spatial_task import SpatialTask
-
-Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks
-REWARD_WEIGHT = 'reward weight'  # title of a column of links
-# What terms of a reward compare with the clip, or the step.
-_ERRORS = {
-    'pose': 'angles of joints and root, mean weighted as in Links; rad^2',
-    'velocity': 'their rates, mean weighted alike; rad^2/s^2',
-    'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
-    'root': 'height of the root above the ground; m^2',
-    'heading': '-',
-}
-_ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
+from trl_suite import characters, terrain
+from trl_suite.environments.environment import Environment
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.tasks.components.description import REWARD_WEIGHT, Meanings, floats
+from trl_suite.util.tables import Section, Table, section
 
 
-def character(environment: Environment) -> Iterator[Section]:
-    """Yields the character of a task, and its links."""
-    task: Any = environment.task
-    figure, row = task.character, task.character.row
-    # The last column: a weight in a reward that has none of a gait, or what a gait tracks.
-    gait, above = getattr(task, 'gait', None), hasattr(task, 'controller')
-    title, last = REWARD_WEIGHT, [joint.weight for joint in row.joints.values()]
-    if gait is not None:
-        title = 'target is to'
-        last = ['the world' if j in gait.hips else 'its parent' for j in row.joints]
-    elif above:
-        title, last = '', [''] * len(last)
-    yield section(f'Character: {row.name}', row.description, figures(figure))
-    yield section('Links', links(figure, environment.physics, (title, last)))
+def character(environment: Environment, joints: tuple[str, Iterable[object]]) -> Iterator[Section]:
+    """Yields the character of a task, and its links with one more column for its joints."""
+    figure: Any = environment.task.character  # type: ignore[attr-defined]
+    spec = figure.spec
+    yield section(f'Character: {spec.name}', spec.description, figures(figure))
+    yield section('Links', links(figure, environment.physics, joints))
 
 
 def figures(figure: characters.Character) -> str:
     """Returns the whole-body figures of a character in one line."""
-    row = figure.row
-    own = characters.CHARACTERS.get(row.name) is not row
-    found = characters.body_figures(characters.make(row)) if own else _figures(row.name)
+    spec = figure.spec
+    own = characters.CHARACTERS.get(spec.name) is not spec
+    found = characters.body_figures(characters.make(spec)) if own else _figures(spec.name)
     return (
         f'{found["mass"]:.4g} kg, stands {found["standing_height"]:.3g} m high at the root, '
-        f'{len(row.links)} links, {len(row.joints)} joints'
+        f'{len(spec.links)} links, {len(spec.joints)} joints'
     )
 
 
@@ -68,10 +48,10 @@ def links(figure: characters.Character, physics: Any, last: tuple[str, Iterable[
       last: title of one more column, and what is in it for each joint.
     """
     masses = floats(physics.bind(figure.bodies).mass)
-    own = figure.row.root_weight if last[0] == REWARD_WEIGHT else ''
+    own = figure.spec.root_weight if last[0] == REWARD_WEIGHT else ''
     cells: list[tuple[object, ...]] = [('root', masses[0], '', '', '', '', own)]
     for (name, joint), mass, (low, high), limit, slides, ball, more in zip(
-        figure.row.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
+        figure.spec.joints.items(), masses[1:], figure.joint_ranges, figure.torque_limits,
         figure.prismatic, figure.spherical, last[1], strict=True,
     ):  # fmt: skip
         reach = 'free' if np.isinf(low) else f'{low:.3g} to {high:.3g}'
@@ -94,7 +74,8 @@ def observation(environment: Environment, meanings: Meanings) -> Section:
     """Returns the blocks of the observation."""
     blocks = environment.blocks
     size = max(part.stop for part in blocks.values())
-    spatial = isinstance(environment.task, SpatialTask)
+    task: Any = environment.task
+    spatial = task.character.spec.spatial
     axes = "; axes: x along the root's heading, y to the left, z up" if spatial else ''
     return section(
         f'Observation: {size} numbers, in this order{axes}',
@@ -108,90 +89,15 @@ def observation(environment: Environment, meanings: Meanings) -> Section:
     )
 
 
-def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
-    """Returns the terms of a reward for tracking.
-
-    Args:
-      task: it has them.
-      steps: whether footsteps are tracked, not a clip.
-      more: meanings of terms that only this task has; terms without a meaning are left out.
-    """
-    average = 'sum' if steps else 'mean'
-    errors = {
-        **_ERRORS,
-        'end_effector': f'joints of the end effectors, their way from {_ABOUT[task.ABOUT]} and their '
-        f'height above the ground, {average} over them; m^2',
-        **more,
-    }
-    return Table(
-        ('term', 'weight', 'scale', 'error: squared difference of'),
-        [
-            (name, weight, '' if name == 'heading' else scale, errors[name])
-            for name, (weight, scale) in task.TERMS.items()
-            if name in errors
-        ],
-    )
-
-
-def action(environment: Environment) -> Section:
-    """Returns what the actions drive."""
-    action_map = environment.action_map
-    title, limits = _limits(environment)
-    unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
-    columns = (np.round(action_map.centre, 9) + 0.0, action_map.half_range, limits)
-    return section(
-        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = centre + '
-        'half range * action',
-        Table(
-            ('drives', 'centre', 'half range', title),
-            list(zip(action_map.names, *map(floats, columns), strict=True)),
-            numbered=True,
-        ),
-    )
-
-
-def _limits(environment: Environment) -> tuple[str, Any]:
-    """Returns what limits each action's effect, and how much."""
-    task: Any = environment.task
-    actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
-    if environment.action_map.quantity == 'excitation':
-        return 'peak force (N)', np.asarray(actuators.gainprm)[:, 2]
-    ball, limits = task.character.spherical, task.character.torque_limits
-    names = environment.action_map.names
-    if not ball.any():
-        return 'torque limit (N m)', limits
-    if task.actuation_model == 'velocity':
-        limits = np.where(ball, limits / np.sqrt(3), limits)
-    # Every ball joint takes as many numbers.
-    each = (len(names) - np.count_nonzero(~ball)) // np.count_nonzero(ball)
-    norm = '' if task.actuation_model == 'velocity' else ', norm'
-    return f'torque limit (N m{norm})', np.repeat(limits, np.where(ball, each, 1))
-
-
-def ground(row: catalogue.Row) -> Section:
+def ground(spec: EnvSpec) -> Section:
     """Returns the terrain and its parameters."""
-    found = terrain.load(row.terrain)
+    found = terrain.load(spec.part('terrain'))
     idle = terrain.IDLE.get(found.type, ())
     parameters = ', '.join(
         f'{name} {value:g}' for name, value in found.parameters().items() if name not in idle
     )
     sets = len(found.parameter_sets)
-    more = f' (set 0 of {sets}; see the option blend)' if sets > 1 else ''
+    more = f' (set 0 of {sets}; see the option terrain_level)' if sets > 1 else ''
     return section(
         f'Terrain: {found.name} ({found.type})', f'{parameters or "no parameters"}{more}'
     )
-
-
-def time(row: catalogue.Row, task: Any) -> Section:
-    """Returns rates, and how long an episode is."""
-    control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
-    return section(
-        'Time',
-        f'control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
-        f'{row.step_limit} steps, {row.step_limit * task.control_timestep:.3g} s',
-    )
-
-
-def floats(values: Any) -> list[float]:
-    """Returns plain numbers."""
-    return [float(value) for value in values]

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import PlanarTerrain
+from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.terrain import planar_ground
-from trl_suite.terrain.planar_ground import PlanarGround
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.compiled import compiled
 
 CLEARANCE = 0.001  # m; left under every link at the start
@@ -91,7 +91,7 @@ def facing_of(i: int, body: PlanarBody, state: PlanarState) -> float:
 
 @compiled
 def looks_outside(
-    i: int, facing: float, body: PlanarBody, state: PlanarState, ground: PlanarGround
+    i: int, facing: float, body: PlanarBody, state: PlanarState, ground: PlanarWindows
 ) -> bool:
     """Whether a character that looks backwards sees ground beyond its window."""
     x = state.qpos[i, body.qpos[0]]
@@ -105,8 +105,8 @@ def looks_outside(
 
 
 @compiled
-def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarGround) -> bool:
-    """Whether `PlanarTerrain.widen` has to be called before a character can be measured."""
+def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows) -> bool:
+    """Whether `PlanarArena.widen` has to be called before a character can be measured."""
     if ground.is_wide[i]:
         return False
     facing = facing_of(i, body, state)
@@ -115,7 +115,7 @@ def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarGround
 
 @compiled
 def measure(
-    i: int, body: PlanarBody, state: PlanarState, ground: PlanarGround, observation: np.ndarray,
+    i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
     found: PlanarMeasurement,
 ) -> None:  # fmt: skip
     """Writes the blocks terrain, pose and velocity, and what else tasks compare.
@@ -178,7 +178,7 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 
 @compiled
 def leaves(
-    i: int, body: PlanarBody, state: PlanarState, ground: PlanarGround, found: PlanarMeasurement
+    i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, found: PlanarMeasurement
 ) -> bool:
     """Whether a window of ground must be laid anew; notes it."""
     found.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
@@ -202,7 +202,7 @@ class PlanarFigure:
     def __init__(
         self,
         character: Character,
-        arena: PlanarTerrain,
+        arena: PlanarArena,
         behind: float,
         ahead: float,
         samples: int,
@@ -221,10 +221,10 @@ class PlanarFigure:
         self.character, self.arena = character, arena
         character.create_root_joints(arena.attach(character))
         self._samples = np.linspace(-behind, ahead, samples)
-        self._fall_sensors = [self._add_sensor(n, 'fall') for n in character.row.fall_links]
-        ends = character.row.end_effectors if contact else ()
+        self._fall_sensors = [self._add_sensor(n, 'fall') for n in character.spec.fall_links]
+        ends = character.spec.end_effectors if contact else ()
         self._contact_sensors = [self._add_sensor(name, 'contact') for name in ends]
-        links = len(character.row.links)
+        links = len(character.spec.links)
         self.blocks = {'terrain': samples, 'pose': 2 * links + 1, 'velocity': 2 * links}
 
     def _add_sensor(self, link: str, kind: str) -> str:
@@ -268,7 +268,7 @@ class PlanarFigure:
         self.state = PlanarState(*(getattr(world, name) for name in PlanarState._fields))
 
     @property
-    def ground(self) -> PlanarGround:
+    def ground(self) -> PlanarWindows:
         """The ground under all simulations, for compiled functions."""
         return self.arena.ground
 
@@ -319,21 +319,21 @@ class PlanarFigure:
 @compiled
 def put_down(
     env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, extents: np.ndarray,
-    body: PlanarBody, ground: PlanarGround, qpos: np.ndarray, qvel: np.ndarray,
+    body: PlanarBody, ground: PlanarWindows, qpos: np.ndarray, qvel: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes the poses and velocities of characters that stand at x = 0; see `PlanarFigure.place`."""
-    for row in range(len(env_ids)):
-        i = env_ids[row]
-        height = poses[row, 1] + planar_ground.height(i, 0.0, ground)
+    for env_id in range(len(env_ids)):
+        i = env_ids[env_id]
+        height = poses[env_id, 1] + planar_ground.height(i, 0.0, ground)
         lift = 0.0
         for k in range(extents.shape[2]):
-            centre, half = extents[row, 0, k], extents[row, 1, k]
+            centre, half = extents[env_id, 0, k], extents[env_id, 1, k]
             level = planar_ground.height(i, centre - half, ground)
             level = max(level, planar_ground.height(i, centre, ground))
             level = max(level, planar_ground.height(i, centre + half, ground))
-            depth = level - (height + extents[row, 2, k])
+            depth = level - (height + extents[env_id, 2, k])
             lift = max(lift, depth + CLEARANCE)
-        poses[row, 0], poses[row, 1] = 0.0, height + lift
+        poses[env_id, 0], poses[env_id, 1] = 0.0, height + lift
         for k in range(len(body.qpos)):
-            qpos[i, body.qpos[k]] = poses[row, k]
-            qvel[i, body.dof[k]] = rates[row, k]
+            qpos[i, body.qpos[k]] = poses[env_id, k]
+            qvel[i, body.dof[k]] = rates[env_id, k]

@@ -167,10 +167,10 @@ def tabulated(
       pose_dof: addresses in qvel of those of a velocity.
       poses: (n, columns).
       rates: (n, columns).
-      parts: which rows of which fields of MjData are wanted.
+      parts: which simulations of which fields of MjData are wanted.
 
     Returns:
-      By name the fields (n, rows, ...).
+      By name the fields (n, simulations, ...).
     """
     data = mujoco.MjData(model)
     views = [getattr(data, name) for name in parts]  # they stay current

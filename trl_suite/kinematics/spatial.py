@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.arenas import SpatialTerrain
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World, native
 from trl_suite.engine.native import Engine
 from trl_suite.motion import quaternion
-from trl_suite.terrain import spatial_ground
-from trl_suite.terrain.spatial_ground import SAMPLES, SpatialGround, see_movers
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SAMPLES, SpatialWindows, see_movers
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
 CLEARANCE = 0.001  # m; left under every link at the start
@@ -69,7 +69,7 @@ class SpatialState(NamedTuple):
 
 
 class SpatialMeasurement(NamedTuple):
-    """What `measure` finds, rows of n simulations.
+    """What `measure` finds, simulations of n simulations.
 
     Attributes:
       root, com: of the root and of the centre of mass, (n, 3) m.
@@ -137,7 +137,7 @@ def feature_columns(body: SpatialBody) -> dict[str, slice]:
 
 @compiled
 def measure(
-    i: int, body: SpatialBody, state: SpatialState, ground: SpatialGround,
+    i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows,
     found: SpatialMeasurement,
 ) -> None:  # fmt: skip
     """Measures the character of simulation i."""
@@ -272,7 +272,7 @@ def write_body(
 
 @compiled
 def write_terrain(
-    i: int, column: int, ground: SpatialGround, found: SpatialMeasurement, observation: np.ndarray
+    i: int, column: int, ground: SpatialWindows, found: SpatialMeasurement, observation: np.ndarray
 ) -> None:
     """Writes the map of heights around a character; nothing if the column is negative."""
     if column >= 0:
@@ -286,7 +286,7 @@ class Measured(NamedTuple):
 
     body: SpatialBody
     state: SpatialState
-    ground: SpatialGround
+    ground: SpatialWindows
     found: SpatialMeasurement
 
 
@@ -311,31 +311,31 @@ class Corners(NamedTuple):
 
 @compiled
 def put_down(
-    i: int, row: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
+    i: int, env_id: int, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray, corners: Corners,
     measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
-    """Puts the character of simulation i on the ground; see `SpatialFigure.place`, whose row it is."""
+    """Puts the character of simulation i on the ground; see `SpatialFigure.place`, whose simulation it is."""
     body, physics, ground = measured.body, measured.state, measured.ground
     for k in range(len(body.qpos)):
-        physics.qpos[i, body.qpos[k]] = poses[row, k]
+        physics.qpos[i, body.qpos[k]] = poses[env_id, k]
     for k in range(len(body.dof)):
-        physics.qvel[i, body.dof[k]] = rates[row, k]
-    angle = spawns[row, 2]
+        physics.qvel[i, body.dof[k]] = rates[env_id, k]
+    angle = spawns[env_id, 2]
     cosine, sine = math.cos(angle), math.sin(angle)
-    x, y = poses[row, 0], poses[row, 1]
-    x, y = spawns[row, 0] + (cosine * x - sine * y), spawns[row, 1] + (sine * x + cosine * y)
+    x, y = poses[env_id, 0], poses[env_id, 1]
+    x, y = spawns[env_id, 0] + (cosine * x - sine * y), spawns[env_id, 1] + (sine * x + cosine * y)
     see_movers(i, physics.qpos, ground)
-    z = poses[row, 2] + spatial_ground.height(i, x, y, ground)
+    z = poses[env_id, 2] + spatial_ground.height(i, x, y, ground)
     columns = body.qpos
     physics.qpos[i, columns[0]], physics.qpos[i, columns[1]] = x, y
     physics.qpos[i, columns[2]] = z
     half_cosine, half_sine = math.cos(angle / 2), math.sin(angle / 2)
-    q_w, q_x, q_y, q_z = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
+    q_w, q_x, q_y, q_z = poses[env_id, 3], poses[env_id, 4], poses[env_id, 5], poses[env_id, 6]
     physics.qpos[i, columns[3]] = half_cosine * q_w - half_sine * q_z
     physics.qpos[i, columns[4]] = half_cosine * q_x - half_sine * q_y
     physics.qpos[i, columns[5]] = half_cosine * q_y + half_sine * q_x
     physics.qpos[i, columns[6]] = half_cosine * q_z + q_w * half_sine
-    v_x, v_y = rates[row, 0], rates[row, 1]
+    v_x, v_y = rates[env_id, 0], rates[env_id, 1]
     physics.qvel[i, body.dof[0]] = cosine * v_x - sine * v_y
     physics.qvel[i, body.dof[1]] = sine * v_x + cosine * v_y
     native.forward(i, engine)
@@ -362,8 +362,8 @@ def put_down_all(
     corners: Corners, measured: Measured, engine: Engine,
 ) -> None:  # fmt: skip
     """Puts characters on the ground; takes packs."""
-    for row in range(len(env_ids)):
-        put_down(env_ids[row], row, poses, rates, spawns, corners, measured, engine)
+    for env_id in range(len(env_ids)):
+        put_down(env_ids[env_id], env_id, poses, rates, spawns, corners, measured, engine)
 
 
 class SpatialFigure:
@@ -383,26 +383,28 @@ class SpatialFigure:
     found: SpatialMeasurement
     fields: tuple[str, ...] = ('xquat',)  # of MjData, beside those that every world binds
 
-    def __init__(self, character: Character, arena: SpatialTerrain, terrain_map: bool) -> None:
+    def __init__(
+        self, character: Character, arena: SpatialArena, terrain_observation: bool
+    ) -> None:
         """Attaches the character; adds contact sensors for its fall links and end effectors.
 
         Args:
           character: a spatial character; it is attached to the arena and given a free joint.
           arena: where it moves.
-          terrain_map: whether it sees the heights around it, 32 x 32 samples.
+          terrain_observation: whether it sees the heights around it, 32 x 32 samples.
         """
-        self.character, self.arena, self.terrain_map = character, arena, terrain_map
+        self.character, self.arena, self.terrain_observation = character, arena, terrain_observation
         (self._root,) = character.create_root_joints(arena.attach(character))
         self._sensors = {
             kind: [self._add_sensors(name, kind) for name in names]
             for kind, names in (
-                ('fall', character.row.fall_links),
-                ('contact', character.row.end_effectors),
+                ('fall', character.spec.fall_links),
+                ('contact', character.spec.end_effectors),
             )
         }
-        links = len(character.row.links)
+        links = len(character.spec.links)
         self.blocks = {
-            'terrain': SAMPLES**2 if terrain_map else 0,
+            'terrain': SAMPLES**2 if terrain_observation else 0,
             'pose': LINK_POSE * links + 1,
             'velocity': LINK_VELOCITY * links,
         }
@@ -461,7 +463,7 @@ class SpatialFigure:
         self._corners = packed(Corners(bodies, corners.reshape(-1, 3)))
 
     @property
-    def ground(self) -> SpatialGround:
+    def ground(self) -> SpatialWindows:
         """The ground under all simulations, for compiled functions."""
         return self.arena.surroundings.arrays
 

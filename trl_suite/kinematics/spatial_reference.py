@@ -22,7 +22,7 @@ from trl_suite.kinematics.spatial import (
     measurement,
 )
 from trl_suite.motion import Clip, Steps, quaternion
-from trl_suite.terrain import spatial_ground
+from trl_suite.terrain.spatial import windows as spatial_ground
 from trl_suite.util.compiled import compiled_inline, packed
 
 CYCLE_SAMPLES = 256  # of a looping clip
@@ -48,16 +48,16 @@ class TrackTable(NamedTuple):
 
 @compiled_inline
 def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
-    """Returns where a share in [0, 1] of a track lies: a row of the table, and what is beyond it."""
+    """Returns where a share in [0, 1] of a track lies: a simulation of the table, and what is beyond it."""
     u = share * tracks.samples
     sample = min(max(math.floor(u), 0.0), tracks.samples - 1.0)
     return int(sample) + track * (tracks.samples + 1), u - sample
 
 
 @compiled_inline
-def feature(row: int, rest: float, column: int, tracks: TrackTable) -> float:
+def feature(env_id: int, rest: float, column: int, tracks: TrackTable) -> float:
     """Returns a feature at a moment."""
-    return tracks.steps[row, column] * rest + tracks.table[row, column]
+    return tracks.steps[env_id, column] * rest + tracks.table[env_id, column]
 
 
 class SpatialReference:
@@ -130,8 +130,8 @@ class SpatialReference:
         tracks = self.tracks
         u = share * tracks.samples
         sample = np.minimum(np.floor(u), tracks.samples - 1)
-        row = sample.astype(np.int64) + track * (tracks.samples + 1)
-        return tracks.steps[row] * (u - sample)[:, None] + tracks.table[row]
+        env_id = sample.astype(np.int64) + track * (tracks.samples + 1)
+        return tracks.steps[env_id] * (u - sample)[:, None] + tracks.table[env_id]
 
 
 def _stacked(
@@ -148,7 +148,7 @@ def _stacked(
 
 
 def _continuous(features: np.ndarray, rotations: slice) -> np.ndarray:
-    """Returns features (tracks, samples + 1, F) as rows, no quaternion jumping to its negative."""
+    """Returns features (tracks, samples + 1, F) as simulations, no quaternion jumping to its negative."""
     part = features[..., rotations]
     q = part.reshape(*part.shape[:2], -1, 4)
     flips = np.cumprod(np.where((q[:, 1:] * q[:, :-1]).sum(3) < 0, -1, 1), axis=1)

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.files import existing
 from trl_suite.motion import quaternion
+from trl_suite.util.files import existing
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; inches, times what the file says

@@ -17,9 +17,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trl_suite import errors, resources
-from trl_suite.motion import archive, quaternion
+from trl_suite.motion import quaternion
 from trl_suite.motion.layout import Layout, Mirror
+from trl_suite.util import archive, errors, resources
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a velocity
 STEPS_SUFFIX = '_steps'  # of the names of files that hold a step library instead of a clip

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from trl_suite import errors
 from trl_suite.motion import quaternion
+from trl_suite.util import errors
 
 ROOT_SIZES = {'planar': 3, 'free': 7}  # columns of a pose: x, z, pitch; x, y, z, quaternion
 JOINT_SIZES = (1, 4)  # hinge angle; ball-joint quaternion

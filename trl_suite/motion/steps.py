@@ -21,10 +21,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trl_suite import resources
-from trl_suite.motion import archive, quaternion
+from trl_suite.motion import quaternion
 from trl_suite.motion.clip import STEPS_SUFFIX, VELOCITY_STEP, Clip, shipped
 from trl_suite.motion.layout import Layout
+from trl_suite.util import archive, resources
 
 FEATURES = (
     *('right foot ahead of the root', 'right foot left of the root'),

@@ -1,6 +1,1 @@
-"""Tasks: rules of the families, written over a batch axis of simulations."""
-
-from trl_suite.tasks.imitation import Imitation
-from trl_suite.tasks.task import Task
-
-__all__ = ('Imitation', 'Task')
+"""Tasks: observation, reward, termination and reset, as rules of one simulation."""

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite import errors
 from trl_suite.engine import World
 from trl_suite.tasks.task import Task, consecutive, outcome
+from trl_suite.util import errors
 
 Function = Callable[[Any], np.ndarray]
 OPTIONS = ('rewards', 'observations', 'failures')
@@ -30,9 +30,9 @@ OPTIONS = ('rewards', 'observations', 'failures')
 class Composed(Task):
     """Rules of another task, and some more.
 
-    A function is given this task and returns an array with a row per simulation. What it may read:
+    A function is given this task and returns an array with a simulation per simulation. What it may read:
     `task.world` (see `World`), `task.action` (n, k), clipped to [-1, 1], all attributes of the other
-    task, and `trl_suite.tasks.parts`. It must treat rows alike and by themselves, and draw nothing.
+    task, and `trl_suite.tasks.parts`. It must treat simulations alike and by themselves, and draw nothing.
 
     Attributes:
       task: the other one.

@@ -66,4 +66,4 @@ def root(task: Any) -> np.ndarray:
 
 
 def _spatial(task: Any) -> bool:
-    return task.character.row.spatial
+    return task.character.spec.spatial

@@ -3,244 +3,88 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite import actuation, errors
-from trl_suite.action_map import Drive, drive
-from trl_suite.arenas import SpatialTerrain
+from trl_suite import actuation
+from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
-from trl_suite.engine import World, native
+from trl_suite.engine import World
 from trl_suite.kinematics.spatial import (
-    SpatialBody,
     SpatialFigure,
-    SpatialMeasurement,
-    SpatialState,
-    write_body,
-    write_terrain,
 )
-from trl_suite.kinematics.spatial import measure as measure_body
 from trl_suite.kinematics.spatial_reference import mean_targets
 from trl_suite.motion import Clip, Steps
-from trl_suite.symmetry import Mirror
-from trl_suite.tasks import reflection3d
+from trl_suite.policies.mirror import Mirror
+from trl_suite.tasks.components import reflection as reflection3d
+from trl_suite.tasks.components.spatial_rules import (
+    _DIGITS,
+    ACTION_OFFSETS,
+    ACTION_SCALE,
+    CONTROL_TIMESTEP,
+    MIRRORED_BINS,
+    PHASE_BINS,
+    SUBSTEPS,
+    TERRAIN_MAPS,
+    Clock,
+    SpatialRules,
+    Travel,
+    View,
+)
 from trl_suite.tasks.task import (
-    MAX_JOINT_SPEED,
-    Outcome,
+    START_PHASE,
+    TERRAIN_LEVEL,
     Task,
+    check_position_options,
     consecutive,
     drawn_seed,
     outcome,
     start_phases,
-    too_fast,
 )
-from trl_suite.terrain import Ground, spatial_ground
-from trl_suite.terrain.spatial_ground import SpatialGround
-from trl_suite.util.compiled import compiled, compiled_loop
-
-CONTROL_TIMESTEP = 1 / 30  # s
-SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
-HALF_RANGE = 1.0  # rad per unit action about the mean pose of the motion
-PHASE_BINS = 4
-MIRRORED_BINS = 2  # of the phase of a single step
-CENTRES = ('clip', 'posture', 'original')  # of position control
-_DIGITS = 1e9  # per cycle, to which the clock is rounded
+from trl_suite.terrain import SpatialGround
+from trl_suite.util.options import Config, option
 
 
-class Clock(NamedTuple):
-    """Where each simulation is in the cycle of its motion, (n,).
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialConfig(Config):
+    """Options of tasks of a walker in three dimensions that drive its joints."""
 
-    Attributes:
-      start: phase at the start of the episode.
-      steps: control steps since.
-      cycles: time on the motion in periods: the phase, not wrapped.
-      phase: in [0, 1).
-    """
+    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6)
+    action_offset: str = option(
+        'clip',
+        "pose at action 0: the mean of the motion ('clip'), left and right made alike, the working "
+        "'posture', or the 'original' map: an angle and an axis for every ball joint",
+        choices=ACTION_OFFSETS, actuation='position',
+    )  # fmt: skip
+    action_scale: float | None = option(
+        None, 'joint angle per unit action; by default 1 about the clip, 1.5 about the posture',
+        unit='rad', above=0, actuation='position',
+    )  # fmt: skip
+    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
 
-    start: np.ndarray
-    steps: np.ndarray
-    cycles: np.ndarray
-    phase: np.ndarray
-
-
-class Travel(NamedTuple):
-    """Where the walkers come from.
-
-    Attributes:
-      origin: x, y (m) and heading (rad) of the start, (n, 3).
-      distance: of the root from there, (n,) m; in imitation along +x.
-    """
-
-    origin: np.ndarray
-    distance: np.ndarray
-
-
-class View(NamedTuple):
-    """What of the full observation is given to the agent, perhaps in a mirror, and how it acts.
-
-    Attributes:
-      mirrored: whether left stance is seen as right stance.
-      source, sign: a reflected full observation is `full[source] * sign`, (size,).
-      phase: column of the phase in the full observation.
-      kept: columns of the full observation that are given, (k,); all of them if it is empty.
-      given_phase: column of the phase among them.
-      action_index, action_sign: a reflected action is `action[index] * sign`.
-    """
-
-    mirrored: bool
-    source: np.ndarray
-    sign: np.ndarray
-    phase: int
-    kept: np.ndarray
-    given_phase: int
-    action_index: np.ndarray
-    action_sign: np.ndarray
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+        start_phases(self.start_phase)
+        if self.action_offset == 'original' and self.action_scale is not None:
+            raise ValueError("action_offset 'original' has ranges of its own: give no action_scale")
 
 
-class SpatialRules(NamedTuple):
-    """What the rules of all these tasks work on.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MirroredConfig(SpatialConfig):
+    """Options of tasks whose walkers may see and act as in a mirror while the left foot stands."""
 
-    Attributes:
-      ctrl: controls of the physics, (n, ...).
-      period: of the motion's cycle, s.
-      terrain, pose, velocity, phase: where these blocks begin in the full observation; -1: nowhere.
-      full: the full observation, (n, size).
-      action: what joints are driven by, (n, k); scratch.
-      leaving: whether the window of ground has to be laid anew, (n,).
-    """
-
-    engine: native.Engine
-    body: SpatialBody
-    physics: SpatialState
-    ground: SpatialGround
-    drive: Drive
-    ctrl: np.ndarray
-    period: float
-    terrain: int
-    pose: int
-    velocity: int
-    phase: int
-    given: View
-    clock: Clock
-    travel: Travel
-    found: SpatialMeasurement
-    full: np.ndarray
-    action: np.ndarray
-    leaving: np.ndarray
-    outcome: Outcome
+    mirrored: bool = option(False, 'observe and act as if the right foot always stood first')
 
 
-# Parts of a step of simulation i.
-
-
-@compiled
-def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
-    """Drives the joints and keeps boxes moving; returns whether a window of ground must be laid.
-
-    Ground is laid before the physics, so that what is rendered afterwards is up to date.
-    """
-    given = rules.given
-    left = given.mirrored and rules.full[i, given.phase] >= 0.5
-    for k in range(rules.action.shape[1]):
-        if left:
-            rules.action[i, k] = action[i, given.action_index[k]] * given.action_sign[k]
-        else:
-            rules.action[i, k] = action[i, k]
-    drive(i, rules.action, rules.drive, rules.ctrl)
-    return prepare_ground(i, rules)
-
-
-@compiled
-def prepare_ground(i: int, rules: SpatialRules) -> bool:
-    """Keeps boxes moving before a control step.
-
-    Returns:
-      Whether the window of ground must be laid anew; who lays it keeps boxes moving as well.
-    """
-    root = rules.body.links[0]
-    x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
-    rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
-    if not rules.leaving[i] and spatial_ground.keep_moving(
-        i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
-    ):
-        native.forward(i, rules.engine)
-    return rules.leaving[i]
-
-
-@compiled
-def tick(i: int, rules: SpatialRules) -> None:
-    """Moves the clock on by a control step."""
-    rules.clock.steps[i] += 1
-    read_clock(i, rules)
-
-
-@compiled
-def read_clock(i: int, rules: SpatialRules) -> None:
-    """Works out the phase."""
-    clock = rules.clock
-    cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / rules.period)
-    # Half a cycle is half a cycle, however it was counted.
-    clock.cycles[i] = np.rint(cycles * _DIGITS) / _DIGITS
-    clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
-
-
-@compiled
-def breaks_down(i: int, rules: SpatialRules) -> bool:
-    """Whether the physics has diverged; the last finite observation then stands."""
-    diverged = native.diverged(i, rules.engine) or too_fast(
-        i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
-    )
-    rules.outcome.diverged[i] = diverged
-    return diverged
-
-
-@compiled
-def measure(i: int, rules: SpatialRules) -> None:
-    """Measures the body, on the ground as it now is."""
-    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
-    measure_body(i, rules.body, rules.physics, rules.ground, rules.found)
-    x = rules.found.root[i, 0] - rules.travel.origin[i, 0]
-    y = rules.found.root[i, 1] - rules.travel.origin[i, 1]
-    rules.travel.distance[i] = np.sqrt(x * x + y * y)
-
-
-@compiled
-def observe_body(i: int, rules: SpatialRules) -> None:
-    """Writes the blocks terrain, pose, velocity and phase of the full observation."""
-    write_terrain(i, rules.terrain, rules.ground, rules.found, rules.full)
-    write_body(i, rules.pose, rules.velocity, rules.found, rules.full)
-    if rules.phase >= 0:
-        phase = rules.clock.phase[i]
-        rules.full[i, rules.phase] = phase
-        for k in range(PHASE_BINS):
-            rules.full[i, rules.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
-
-
-@compiled
-def publish(i: int, rules: SpatialRules) -> None:
-    """Gives the agent what it is to see of the full observation."""
-    given, full, observation = rules.given, rules.full, rules.outcome.observation
-    left = given.mirrored and full[i, given.phase] >= 0.5
-    for k in range(len(given.kept)):
-        column = given.kept[k]
-        if left:
-            observation[i, k] = full[i, given.source[column]] * given.sign[column]
-        else:
-            observation[i, k] = full[i, column]
-    if given.mirrored:  # the phase of the single step
-        phase = full[i, given.phase]
-        observation[i, given.given_phase] = 2 * (phase - 0.5 if left else phase)
-
-
-@compiled_loop
-def act_all(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
-    """Takes actions; returns how many windows of ground must be laid. Takes a pack."""
-    leaving = 0
-    for i in env_ids:
-        leaving += act(i, action, rules)
-    return leaving
+def maps(names: str | Collection[str]) -> tuple[str, ...]:
+    """Returns names of maps as a tuple, of one name or several."""
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class SpatialTask(Task):
@@ -259,56 +103,63 @@ class SpatialTask(Task):
     TERMS: Mapping[str, tuple[float, float]]  # reward terms: weight, and scale of the error
     ABOUT = 'com'  # from where end effectors are measured, or 'root'
     fields: tuple[str, ...] = SpatialFigure.fields
+    config: Any  # of the subclass
     period: float
 
     def __init__(
         self,
         character: Character,
-        arena: SpatialTerrain,
+        arena: SpatialArena,
         motion: Clip | Steps,
+        config: SpatialConfig,
         *,
         actuation_model: str = 'position',
-        substeps: int = SUBSTEPS,
-        centre: str = 'clip',
-        half_range: float | None = None,
-        start_phase: float | Sequence[Sequence[float]] | None = None,
-        terrain_map: bool = False,
-        mirrored: bool = False,
-        blend: float = 0.0,
         phase: bool = True,
         extras: Mapping[str, int],
     ) -> None:
         """Composes the task; see the subclasses.
 
+        Args:
+          character: a spatial character without actuators; it is attached to the arena.
+          arena: where it moves.
+          motion: what poses and clock are taken from.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+          phase: whether the phase is observed.
+          extras: sizes of the blocks of a subclass, by name.
+
         Raises:
-          ValueError: options out of range, or a motion that does not fit the character.
+          ValueError: options that do not fit each other, or a motion that does not fit the character.
         """
-        row = character.row
+        mirrored = getattr(config, 'mirrored', False)
+        spec = character.spec
         check_motion(character, motion)
-        check_drive(actuation_model, centre, half_range, substeps)
-        if mirrored and not row.mirror:
+        check_position_options(actuation_model, config.action_offset, config.action_scale)
+        if mirrored and not spec.mirror:
             raise ValueError(
-                f'character {row.name!r} has no pairs of right and left links; mirrored observations '
+                f'character {spec.name!r} has no pairs of right and left links; mirrored observations '
                 'need them'
             )
         if mirrored and not phase:
             raise ValueError('mirrored observations need the phase, which tells left from right')
         self.character, self.arena, self.motion = character, arena, motion
-        self.actuation_model, self.terrain_map = actuation_model, terrain_map
+        self.actuation_model, self.config = actuation_model, config
         self.mirrored = mirrored
-        self._start_phase, self._blend = start_phases(start_phase), blend
-        self.figure = SpatialFigure(character, arena, terrain_map)
-        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / substeps)
+        self._start_phase = start_phases(config.start_phase)
+        self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
         options: dict[str, Any] = {}
         if actuation_model == 'position':
-            options = position_range(self._typical_poses(), motion, centre, half_range)
+            options = position_range(
+                self._typical_poses(), motion, config.action_offset, config.action_scale
+            )
         self.action_map = actuation.add(
             character, actuation_model, self.physics_timestep, **options
         )
         self.joint_map = self.action_map  # from actions to the actuators
         full = {**self.figure.blocks, 'phase': 1 + PHASE_BINS if phase else 0, **extras}
         self._full = self.blocks = consecutive(full)
-        self._reflection = self._reflected() if phase and row.mirror else None
+        self._reflection = self._reflected() if phase and spec.mirror else None
         self.mirror: Mirror | None = self._reflection
         self._kept: np.ndarray = np.zeros(0, int)  # all
         if mirrored:
@@ -352,12 +203,12 @@ class SpatialTask(Task):
     # Binding.
 
     @property
-    def root_entity(self) -> SpatialTerrain:
+    def root_entity(self) -> SpatialArena:
         return self.arena
 
     @property
     def signature(self) -> str:
-        parts = self.character.row.name, self.arena.terrain.name, self.motion.name
+        parts = self.character.spec.name, self.arena.terrain.name, self.motion.name
         return f'{super().signature} of {" / ".join(parts)}'
 
     def _bind_rules(self, world: World) -> SpatialRules:
@@ -437,7 +288,11 @@ class SpatialTask(Task):
         for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
             drawn = random_state.random_sample()
             self.clock.start[i] = self._start_phase(drawn)
-            ground = Ground(self.arena.terrain, drawn_seed(random_state), blend=self._blend)
+            ground = SpatialGround(
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
+            )
             self._random[i] = np.random.default_rng(drawn_seed(random_state))
             spawns[k] = ground.spawn(self._random[i])
             self.arena.begin_episode(i, ground, spawns[k, :2])
@@ -503,45 +358,23 @@ def check_motion(character: Character, motion: Clip | Steps) -> None:
     Raises:
       ValueError: it is not; the message has the joints of both.
     """
-    row = character.row
-    if not row.spatial or tuple(motion.joints) != tuple(row.joints):
+    spec = character.spec
+    if not spec.spatial or tuple(motion.joints) != tuple(spec.joints):
         raise ValueError(
             f'motion {motion.name!r} (joints {", ".join(motion.joints)}) does not fit character '
-            f'{row.name!r}: expected a spatial character with these joints, not '
-            f'{"one" if row.spatial else "a planar one"} with {", ".join(row.joints)}'
-        )
-
-
-def check_drive(actuation_model: str, centre: str, half_range: float | None, substeps: int) -> None:
-    """Checks the options of actuation and time.
-
-    Raises:
-      ValueError: they are out of range, or do not fit each other.
-    """
-    if centre not in CENTRES:
-        raise ValueError(errors.unknown('centre of position control', centre, CENTRES))
-    if actuation_model != 'position' and (centre != 'clip' or half_range is not None):
-        raise ValueError(
-            f'centre and half_range shape position control, not {actuation_model} control'
-        )
-    if centre == 'original' and half_range is not None:
-        raise ValueError("centre 'original' has ranges of its own: give no half_range")
-    if half_range is not None and not 0 < half_range < np.inf:
-        raise ValueError(f'half_range is {half_range}; expected a positive number of radians')
-    if int(substeps) != substeps or substeps < 6:
-        raise ValueError(
-            f'substeps is {substeps}; expected an integer of at least 6 (physics at 180 Hz)'
+            f'{spec.name!r}: expected a spatial character with these joints, not '
+            f'{"one" if spec.spatial else "a planar one"} with {", ".join(spec.joints)}'
         )
 
 
 def position_range(
-    typical_poses: np.ndarray, motion: Clip | Steps, centre: str, half_range: float | None
+    typical_poses: np.ndarray, motion: Clip | Steps, action_offset: str, action_scale: float | None
 ) -> dict[str, Any]:
-    """Returns the options of position control for a centre and a half range."""
-    if centre == 'original':
+    """Returns the options of position control for a action_offset and a half range."""
+    if action_offset == 'original':
         return {'rotations': 'angle_axis'}
-    options: dict[str, Any] = {} if half_range is None else {'half_range': half_range}
-    if centre == 'clip':
-        options.setdefault('half_range', HALF_RANGE)
-        options['centre'] = mean_targets(typical_poses, motion)
+    options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}
+    if action_offset == 'clip':
+        options.setdefault('action_scale', ACTION_SCALE)
+        options['action_offset'] = mean_targets(typical_poses, motion)
     return options

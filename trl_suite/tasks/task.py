@@ -14,10 +14,16 @@ from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from trl_suite.action_map import ActionMap
+from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
 from trl_suite.util.compiled import compiled
 
+# Meanings of options that several tasks have.
+START_PHASE = 'phase of every start, in [0, 1), or pairs to draw it between; by default any'
+TERRAIN_LEVEL = (
+    "which of the terrain's parameter sets to draw from: 0 is the first, 0.5 half-way to the second"
+)
+SPAWNS = ('intended', 'upstream')
 MAX_JOINT_SPEED = 200.0  # rad/s; beyond it a simulation counts as diverged
 
 
@@ -41,7 +47,7 @@ class Marker(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step of each simulation came to; rows of simulations.
+    """What a step of each simulation came to; simulations of simulations.
 
     Attributes:
       observation: all observation blocks side by side, (n, observation size).
@@ -121,8 +127,8 @@ class Task(composer.Task):
       action_map: what an action means.
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
-      saved: tuples of arrays with n rows that make up the state of the task, `outcome` among them.
-      info_arrays: what `info` tells, arrays of n rows by name, or dicts of such; kept up to date.
+      saved: tuples of arrays with n simulations that make up the state of the task, `outcome` among them.
+      info_arrays: what `info` tells, arrays of n simulations by name, or dicts of such; kept up to date.
     """
 
     world: World
@@ -131,6 +137,7 @@ class Task(composer.Task):
     outcome: Outcome
     saved: tuple[NamedTuple, ...]
     info_arrays: dict[str, Any]
+    CONFIG: Any = None  # its options: a subclass of `Config`, or {spatial: one} where they differ
     fields: tuple[str, ...] = ()  # of MjData, read beside those that every world binds
     in_parts = True  # whether threads may each be given a part of the simulations
     _begun = False  # whether no step was taken since composer's reset
@@ -139,7 +146,7 @@ class Task(composer.Task):
 
     @abc.abstractmethod
     def bind(self, world: World) -> None:
-        """Resolves ids in a compiled world and allocates arrays of `world.n` rows."""
+        """Resolves ids in a compiled world and allocates arrays of `world.n` simulations."""
 
     @abc.abstractmethod
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
@@ -175,7 +182,7 @@ class Task(composer.Task):
         self.world.step(self._substeps, env_ids)
 
     def info(self) -> dict[str, Any]:
-        """Returns what happened beyond observation and reward: arrays of n rows, or dicts of such."""
+        """Returns what happened beyond observation and reward: arrays of n simulations, or dicts of such."""
         return _each(self.info_arrays, np.copy)
 
     def info_of(self, env_id: int) -> dict[str, Any]:
@@ -289,7 +296,7 @@ def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dic
 
 
 def check_simulated(lasted: np.ndarray) -> None:
-    """Checks that rows have run the physics of a step of a task that does so by itself.
+    """Checks that simulations have run the physics of a step of a task that does so by itself.
 
     Args:
       lasted: how long each has, 0 where it has not.
@@ -300,7 +307,7 @@ def check_simulated(lasted: np.ndarray) -> None:
     if not lasted.all():
         raise RuntimeError(
             'a task whose steps are long runs their physics by itself: step it by '
-            'trl_suite.environment.Environment, not by a plain composer.Environment'
+            'trl_suite.environments.environment.Environment, not by a plain composer.Environment'
         )
 
 
@@ -349,6 +356,18 @@ def start_phases(
         return float(pairs[i, 1] - (ends[i] - way))
 
     return phase_of
+
+
+def check_position_options(model: str, action_offset: str, action_scale: float | None) -> None:
+    """Checks that options of position control are not given to another actuation model.
+
+    Raises:
+      ValueError: they are.
+    """
+    if model != 'position' and (action_offset != 'clip' or action_scale is not None):
+        raise ValueError(
+            f'action_offset and action_scale shape position control, not {model} control'
+        )
 
 
 def drawn_seed(random_state: np.random.RandomState) -> np.random.SeedSequence:

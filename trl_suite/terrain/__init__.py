@@ -2,7 +2,7 @@
 
 from trl_suite import terrain
 
-ground = terrain.Strip(terrain.load('slopes_mixed'), seed=1)  # a preset, a file or a mapping
+ground = terrain.PlanarGround(terrain.load('slopes_mixed'), seed=1)  # a preset, a file or a mapping
 ground.height([-0.5, 12.3])  # m; the ground is drawn as far as it is asked for
 heights, vertical = ground.window(-40, 800)  # vertices SPACING apart, from x = -1 m on
 
@@ -10,7 +10,7 @@ mine = terrain.load({'Type': 'var2d_gaps', 'Params': [{'GapWMin': 0.2, 'GapWMax'
 mine.parameters()  # with the defaults of all that was not given
 sorted(terrain.PRESETS), sorted(terrain.GENERATORS)  # what there is; `register` adds a type
 
-forest = terrain.Ground(terrain.load('pillars3d'), seed=1)  # three-dimensional
+forest = terrain.SpatialGround(terrain.load('pillars3d'), seed=1)  # three-dimensional
 x, y, heading = forest.spawn(np.random.default_rng(1))
 forest.height(x, y), forest.goal(np.random.default_rng(2), root=(x, y))
 sorted(terrain.PRESETS3D), sorted(terrain.GENERATORS3D)  # `register3d` adds a type
@@ -23,15 +23,15 @@ terrain.from_mesh('canyon.glb')  # also from_image, from_heights, from_function
 terrain.save_mesh(forest, 'forest.obj', low=-20, high=20)
 """
 
-from trl_suite.terrain.generators import GENERATORS, SPACING, Profile, register
-from trl_suite.terrain.ground import Ground
-from trl_suite.terrain.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
 from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
-from trl_suite.terrain.spatial import GENERATORS3D, IDLE, register3d
-from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.planar.generators import GENERATORS, SPACING, Profile, register
+from trl_suite.terrain.planar.ground import PlanarGround
+from trl_suite.terrain.spatial.generators import GENERATORS3D, IDLE, register3d
+from trl_suite.terrain.spatial.ground import SpatialGround
+from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
+from trl_suite.terrain.spatial.surroundings import Surroundings, capacity
 from trl_suite.terrain.surface import from_function, from_heights, from_image, from_mesh
-from trl_suite.terrain.surroundings import Surroundings, capacity
 
 __all__ = [
     'GENERATORS',
@@ -45,11 +45,11 @@ __all__ = [
     'Belts',
     'Boxes',
     'Grid',
-    'Ground',
     'Layout',
     'Movers',
+    'PlanarGround',
     'Profile',
-    'Strip',
+    'SpatialGround',
     'Surroundings',
     'Terrain',
     'boxes',

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.files import check_path, replacing
-from trl_suite.terrain.generators import SPACING
-from trl_suite.terrain.ground import Ground
-from trl_suite.terrain.layout import GRID, Boxes
-from trl_suite.terrain.strip import Strip
+from trl_suite.terrain.planar.generators import SPACING
+from trl_suite.terrain.planar.ground import PlanarGround
+from trl_suite.terrain.spatial.ground import SpatialGround
+from trl_suite.terrain.spatial.layout import GRID, Boxes
 from trl_suite.terrain.surface import Y_UP, library
+from trl_suite.util.files import check_path, replacing
 
 if TYPE_CHECKING:
     import trimesh
@@ -27,7 +27,7 @@ _Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def to_mesh(
-    ground: Strip | Ground, low: npt.ArrayLike = -10.0, high: npt.ArrayLike = 10.0
+    ground: PlanarGround | SpatialGround, low: npt.ArrayLike = -10.0, high: npt.ArrayLike = 10.0
 ) -> trimesh.Trimesh:
     """Returns a piece of ground as a mesh; its upper side is where heights say it is.
 
@@ -52,12 +52,14 @@ def to_mesh(
         raise ValueError(
             f'low is {low!r} and high {high!r}; expected low below high, at most {LARGEST_SIDE:g} m apart'
         )
-    pieces = _strip(ground, *corners) if isinstance(ground, Strip) else _ground(ground, *corners)
+    pieces = (
+        _strip(ground, *corners) if isinstance(ground, PlanarGround) else _ground(ground, *corners)
+    )
     return trimesh.util.concatenate([trimesh.Trimesh(*piece, process=False) for piece in pieces])
 
 
 def save_mesh(
-    ground: Strip | Ground,
+    ground: PlanarGround | SpatialGround,
     path: str | os.PathLike[str],
     low: npt.ArrayLike = -10.0,
     high: npt.ArrayLike = 10.0,
@@ -84,14 +86,14 @@ def save_mesh(
 Piece = tuple[np.ndarray, np.ndarray]  # vertices (v, 3) m, faces (f, 3)
 
 
-def _strip(strip: Strip, low: np.ndarray, high: np.ndarray) -> list[Piece]:
+def _strip(strip: PlanarGround, low: np.ndarray, high: np.ndarray) -> list[Piece]:
     first, last = round(low[0] / SPACING), round(high[0] / SPACING)
     heights = strip.window(first, last - first + 1)[0]
     x = SPACING * np.arange(first, last + 1)
     return [_sheet(x, 0.5 * WIDTH * np.array([-1.0, 1.0]), np.repeat(heights[:, None], 2, 1))]
 
 
-def _ground(ground: Ground, low: np.ndarray, high: np.ndarray) -> list[Piece]:
+def _ground(ground: SpatialGround, low: np.ndarray, high: np.ndarray) -> list[Piece]:
     layout, pieces = ground.layout, []
     if layout.level is not None:
         x, y = np.stack([low, high], 1)

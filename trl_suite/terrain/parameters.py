@@ -46,11 +46,11 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.errors import unknown
-from trl_suite.files import existing
-from trl_suite.terrain.generators import GENERATORS, check
-from trl_suite.terrain.layout import GRID
-from trl_suite.terrain.spatial import GENERATORS3D
+from trl_suite.terrain.planar.generators import GENERATORS, check
+from trl_suite.terrain.spatial.generators import GENERATORS3D
+from trl_suite.terrain.spatial.layout import GRID
+from trl_suite.util.errors import unknown
+from trl_suite.util.files import existing
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
 
@@ -93,24 +93,28 @@ class Terrain:
 
     @property
     def spatial(self) -> bool:
-        """Whether it is three-dimensional: a `Ground`, not a `Strip`."""
+        """Whether it is three-dimensional: a `SpatialGround`, not a `PlanarGround`."""
         return self.type in GENERATORS3D
 
-    def parameters(self, blend: float = 0.0) -> dict[str, float]:
+    def parameters(self, terrain_level: float = 0.0) -> dict[str, float]:
         """Returns a value for every parameter of the type.
 
         Args:
-          blend: which set; between whole numbers, a linear interpolation of the two neighbours,
+          terrain_level: which set; between whole numbers, a linear interpolation of the two neighbours,
             number by number. Clamped to the sets there are.
 
         Raises:
-          ValueError: the blend is not a number.
+          ValueError: the terrain_level is not a number.
         """
-        if isinstance(blend, bool) or not isinstance(blend, numbers.Real) or math.isnan(blend):
-            raise ValueError(f'blend must be a number, not {blend!r}')
+        if (
+            isinstance(terrain_level, bool)
+            or not isinstance(terrain_level, numbers.Real)
+            or math.isnan(terrain_level)
+        ):
+            raise ValueError(f'terrain_level must be a number, not {terrain_level!r}')
         defaults = _defaults(self.type)
         sets = [{**defaults, **values} for values in self.parameter_sets] or [dict(defaults)]
-        clamped = min(max(float(blend), 0.0), len(sets) - 1.0)
+        clamped = min(max(float(terrain_level), 0.0), len(sets) - 1.0)
         k = int(clamped)
         weight = clamped - k
         if not weight:

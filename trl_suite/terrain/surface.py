@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from trl_suite.files import existing
-from trl_suite.terrain.generators import GENERATORS, Parameters, register_line
-from trl_suite.terrain.layout import GRID, Layout
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.spatial import GENERATORS3D, register3d
+from trl_suite.terrain.planar.generators import GENERATORS, Parameters, register_line
+from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
+from trl_suite.terrain.spatial.layout import GRID, Layout
+from trl_suite.util.files import existing
 
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')

@@ -1,0 +1,164 @@
+"""An expert for those who learn to plan footsteps: it has a map, and knows how boxes will move.
+
+What a policy has to make out in coarse maps from its own eyes the expert looks up: heights every
+0.125 m on all sides, and velocities. It finds the way to the goal that is short and keeps its
+distance from everything that is no level ground, and steps along it. In training a policy is shown
+what the expert would do (learning by cheating, Chen et al. 2019, arXiv:1912.12294); it is no
+baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.navigation import scripted
+from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
+from trl_suite.tasks.navigation.scripted import CAUTIOUS
+from trl_suite.terrain.spatial.layout import Trail
+from trl_suite.vector import VectorEnvironment
+
+REACH, FINE, COARSE = 5.0, 0.125, 2  # m to each side; m between heights; heights between two places
+LEVEL = 0.12  # m; what differs less from the ground at the goal is level
+DISTANCE = 0.7  # m; a way that is nearer to something counts as longer than it is,
+PRICE, WALL = 8.0, 60.0  # by up to so many times its length, and through something by so many
+DETOUR = 1.02  # a place is gone straight to if that costs no more times what the way there does
+AHEAD = 4.0  # step lengths; the same on a trail
+PACE = 1.0  # m/s; how fast the expert comes along where boxes move
+BEND, CLOSE = 0.35, 0.3  # rad, m; a sharper bend and what is closer are taken with small steps
+LOOKS = 33  # places on a straight line
+BEYOND = 1.5  # times the distance: what lies outside of the map is guessed to take
+
+
+class Map:
+    """Places on a square about somebody, and ways between neighbours."""
+
+    def __init__(self) -> None:
+        axis = np.arange(-REACH, REACH + FINE / 2, FINE)
+        self.fine = np.stack(np.meshgrid(axis, axis, indexing='ij'), -1)  # (k, k, 2) m
+        self.places = self.fine[::COARSE, ::COARSE].reshape(-1, 2)
+        side = len(axis[::COARSE])
+        self.shape = side, side
+        number = np.arange(side * side).reshape(side, side)
+        pairs = []
+        for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            a = number[: side - i, max(0, -j) : side - max(0, j)]
+            b = number[i:, max(0, j) : side + min(0, j)]
+            pairs += [(a.ravel(), b.ravel())]
+        self.a, self.b = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        self.length = np.linalg.norm(self.places[self.a] - self.places[self.b], axis=1)
+        self.middle = number[side // 2, side // 2]
+        self.rim = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
+
+    def aim(self, cost: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """The farthest place on the cheapest way to a goal that may be gone straight to, (2,) m.
+
+        From place to place the way turns by 45 degrees, which nobody should follow step by step.
+
+        Args:
+          cost: of the places, per m.
+          goal: off the middle, (2,) m; beyond the rim it is guessed how far it is from there.
+        """
+        n = len(self.places)
+        if np.abs(goal).max() < REACH:
+            into = np.array([np.linalg.norm(self.places - goal, axis=1).argmin()])
+        else:
+            into = self.rim
+        last = BEYOND * np.linalg.norm(self.places[into] - goal, axis=1) + 1e-3
+        price = 0.5 * (cost[self.a] + cost[self.b]) * self.length
+        ends = np.append(self.a, into), np.append(self.b, np.full(len(into), n))
+        graph = sparse.coo_array((np.append(price, last), ends), shape=(n + 1, n + 1))
+        left, before = csgraph.dijkstra(
+            graph.tocsr(), directed=False, indices=n, return_predecessors=True
+        )
+        at, way = self.middle, []
+        while at != n:
+            at = before[at]
+            way.append(at)
+        there = np.concatenate([self.places, [goal]])[way]
+        share = np.linspace(0, 1, LOOKS)
+        seen = (there[:, None] * share[:, None] + REACH) / (COARSE * FINE)
+        met = ndimage.map_coordinates(
+            cost.reshape(self.shape), np.moveaxis(seen, -1, 0), order=1, cval=BEYOND
+        )
+        straight = met.mean(1) * np.linalg.norm(there, axis=1)
+        best = straight <= DETOUR * (left[self.middle] - left[way])
+        return there[np.flatnonzero(best)[-1] if best.any() else 0]
+
+
+def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) -> np.ndarray:
+    """Where a trail's middle is so far ahead towards a goal, (2,) m off a place, or else the goal."""
+    length = np.linalg.norm(trail.end - trail.start, axis=1)
+    way = (trail.end - trail.start) / length[:, None]
+    begin = np.append(0.0, np.cumsum(length))
+
+    def nearest(point: np.ndarray) -> float:
+        along = np.clip(((point - trail.start) * way).sum(1), 0, length)
+        gaps = np.linalg.norm(trail.start + along[:, None] * way - point, axis=1)
+        return begin[gaps.argmin()] + along[gaps.argmin()]
+
+    here, there = nearest(place), nearest(goal)
+    on = here + np.clip(there - here, -ahead, ahead)
+    corners = np.concatenate([trail.start, trail.end[-1:]])
+    return np.array([np.interp(on, begin, corner) for corner in corners.T]) - place
+
+
+def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
+    """Makes an expert: like the values of `evaluation.BASELINES`.
+
+    Raises:
+      ValueError: a task whose steps are no plans, or whose way is that of a ball.
+    """
+    task = environments.task
+    if not isinstance(task, HierarchicalNavigation) or task.ball or task.interface != 'plan':
+        raise ValueError(
+            f'the expert knows no way for the task {type(task).__name__}; it does for high-level '
+            "tasks with the interface 'plan' and without a ball"
+        )
+    map_, arena = Map(), task.arena
+    moves = arena.surroundings.capacity.movers > 0
+
+    def level(env_id: int, place: np.ndarray) -> np.ndarray:
+        """How far every place is from what is not level, m."""
+        x, y = np.moveaxis(place + map_.fine, -1, 0).reshape(2, 1, -1)
+        height = arena.height(x, y, np.array([env_id])).reshape(map_.fine.shape[:2])
+        free = np.abs(height - task.goal[env_id, 2]) < LEVEL
+        if free.all():
+            return np.full(len(map_.places), REACH)
+        return FINE * ndimage.distance_transform_edt(free)[::COARSE, ::COARSE].ravel()
+
+    def apart(env_id: int, place: np.ndarray) -> np.ndarray:
+        """How far every place is from moving boxes when the expert may be there, m."""
+        s = arena.surroundings
+        velocity = (s.direction[env_id] * s.speed[env_id])[:, None] * s.axis[env_id]
+        centre = s.centres()[env_id] - place
+        near = np.abs(centre).max(1) < 2 * REACH
+        seconds = np.linalg.norm(map_.places, axis=1) / PACE
+        then = centre[near] + seconds[:, None, None] * velocity[near]
+        gap = np.abs(map_.places[:, None] - then) - s.half_size[env_id][near]
+        return np.linalg.norm(np.maximum(gap, 0), axis=2).min(1, initial=REACH)
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        found = task.figure.measure()
+        root, goal = found.root[:, :2], task.goal[:, :2]
+        off, length = np.empty_like(root), np.ones(len(root))
+        for env_id, place in enumerate(root):
+            trail = arena.grounds[env_id].layout.trail
+            if trail is not None:
+                off[env_id] = on_trail(trail, place, goal[env_id], AHEAD * task.step_length)
+                continue
+            free = apart(env_id, place) if moves else level(env_id, place)
+            cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= 0)
+            off[env_id] = map_.aim(cost, goal[env_id] - place)
+            bend = rewards.wrap(np.arctan2(off[env_id, 1], off[env_id, 0]) - found.heading[env_id])
+            careful = abs(bend) > BEND or free[map_.middle] < CLOSE
+            length[env_id] = CAUTIOUS if careful else 1.0
+        way = rewards.wrap(np.arctan2(off[:, 1], off[:, 0]) - found.heading)
+        plan = scripted.steps(way, task.step_length * length, task.stance, task.step_length)
+        return np.clip(task.action_map.action(plan), -1, 1)
+
+    return policy

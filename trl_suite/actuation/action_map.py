@@ -1,0 +1,244 @@
+"""Maps from actions in [-1, 1] to controls in physical units, as arrays, and what an action may be."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.util.compiled import compiled, compiled_inline
+
+AXIS_OFFSET = 0.2  # of the original's axis at action 0, to the right
+# The original's axis lies behind the angle: forward, up, right.
+_FORWARD_LEFT_UP, _SIGNS = np.array([1, 3, 2]), np.array([1.0, -1.0, 1.0])
+_TO_THE_RIGHT = np.array([0.0, -1.0, 0.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionMap:
+    """The map from an action in [-1, 1] to control: action_offset + action_scale * action.
+
+    Attributes:
+      names: what each action drives, shape (k,).
+      quantity: what the controls are, e.g. 'target angle'.
+      unit: physical unit of the controls; those of prismatic joints by name: 'rad (leg: m)'.
+      action_offset: control at action 0, shape (k,).
+      action_scale: change of control per unit action, shape (k,).
+      actuators: names of the actuators that take the controls, one after the other; those of ball
+        joints take three each. Empty where a controller stands between.
+    """
+
+    names: tuple[str, ...]
+    quantity: str
+    unit: str
+    action_offset: np.ndarray
+    action_scale: np.ndarray
+    actuators: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        """Maps actions (..., k), clipped to [-1, 1], to controls in physical units."""
+        low, high, action_scale, action_offset = self._rows
+        control = np.maximum(action, low)  # packed rows: quicker than scalars
+        np.minimum(control, high, out=control)
+        control *= action_scale
+        control += action_offset
+        return control if np.ndim(action) > 1 else control[0]
+
+    def drive(self, first: int) -> Drive:
+        """Returns the map for compiled functions; `first` is the address of the first control."""
+        vectors, none = np.zeros((0, 3), int), np.zeros(0, int)
+        return Drive(
+            self.action_offset, self.action_scale, first, vectors, np.zeros(0), none, vectors,
+            np.zeros((2, 0), int),
+        )  # fmt: skip
+
+    @functools.cached_property
+    def _rows(self) -> tuple[np.ndarray, ...]:
+        ones = np.ones((1, len(self)))
+        return -ones, ones, self.action_scale[None], self.action_offset[None]
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        """Maps controls (..., k) to the actions that cause them; not clipped."""
+        return (control - self.action_offset) / self.action_scale
+
+    def checked(self, action: npt.ArrayLike, *env_ids: int) -> np.ndarray:
+        """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k).
+
+        Raises:
+          ValueError: another shape, or NaN or infinity; the simulation and what is driven are named.
+        """
+        shape = (*env_ids, len(self))
+        are, have = ('actions are', 'actions have') if env_ids else ('action is', 'action has')
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'{are} not an array of numbers: {error}') from None
+        if action.shape != shape:
+            raise ValueError(f'{have} shape {action.shape}; expected {shape}')
+        # The quick test first; huge numbers fail it and pass the other.
+        if not np.vdot(action, action) < np.inf and not np.isfinite(action).all():
+            *env_id, i = np.argwhere(~np.isfinite(action))[0]
+            place = f'action of simulation {env_id[0]}, number {i}' if env_id else f'action[{i}]'
+            raise ValueError(
+                f'{place} ({self.names[i]}) is {action[(*env_id, i)]}; expected finite numbers'
+            )
+        return action
+
+
+class Drive(NamedTuple):
+    """An action map for compiled functions; its actuators lie one after the other.
+
+    Attributes:
+      offset: what action 0 means, (k,).
+      scale: change per unit action, (k,).
+      first: address of the first control.
+      torque_balls, torque_limits: of a `TorqueMap` where the torques of ball joints are, (B, 3), and
+        the largest norm of each, (B,); otherwise empty.
+      angles, angle_balls, hinges: of an `AngleAxisMap`, (B,), (B, 3) and (2, H); otherwise empty.
+    """
+
+    offset: np.ndarray
+    scale: np.ndarray
+    first: int
+    torque_balls: np.ndarray
+    torque_limits: np.ndarray
+    angles: np.ndarray
+    angle_balls: np.ndarray
+    hinges: np.ndarray
+
+
+@compiled_inline
+def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
+    """What number k of an action means, in physical units."""
+    return min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
+
+
+@compiled
+def drive(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
+    """Writes the controls of simulation i that its action (of (n, k), clipped) means."""
+    if len(by.angles):
+        _drive_rotations(i, action, by, ctrl)
+        return
+    for k in range(len(by.offset)):
+        ctrl[i, by.first + k] = _meant(i, k, action, by)
+    for ball in range(len(by.torque_limits)):
+        square = 0.0
+        for k in by.torque_balls[ball]:
+            square += ctrl[i, by.first + k] * ctrl[i, by.first + k]
+        limit = by.torque_limits[ball]
+        share = limit / max(math.sqrt(square), limit)
+        for k in by.torque_balls[ball]:
+            ctrl[i, by.first + k] *= share
+
+
+@compiled
+def _drive_rotations(i: int, action: np.ndarray, by: Drive, ctrl: np.ndarray) -> None:
+    """Writes the rotation vectors of ball joints that angles and axes mean; see `AngleAxisMap`."""
+    for k in range(by.hinges.shape[1]):
+        ctrl[i, by.first + by.hinges[1, k]] = _meant(i, by.hinges[0, k], action, by)
+    for ball in range(len(by.angles)):
+        column = by.angles[ball]
+        angle = _meant(i, column, action, by)
+        x = _meant(i, column + 1, action, by)
+        y = -_meant(i, column + 3, action, by)
+        z = _meant(i, column + 2, action, by)
+        length = math.sqrt(x * x + y * y + z * z)
+        if length == 0.0:
+            x, y, z, length = 0.0, -1.0, 0.0, 1.0
+        share = angle / length
+        ctrl[i, by.first + by.angle_balls[ball, 0]] = x * share
+        ctrl[i, by.first + by.angle_balls[ball, 1]] = y * share
+        ctrl[i, by.first + by.angle_balls[ball, 2]] = z * share
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueMap(ActionMap):
+    """Torques of joints, some of them spherical: their norm is clamped after the affine map.
+
+    Attributes:
+      balls: where the three torques of each ball joint are, shape (B, 3).
+      limits: the largest norm of each, N m, shape (B,).
+    """
+
+    balls: np.ndarray = dataclasses.field(kw_only=True)
+    limits: np.ndarray = dataclasses.field(kw_only=True)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        control = super().control(action)
+        torque = control.take(self.balls, -1)
+        torque *= (self.limits / np.maximum(_norm(torque), self.limits))[..., None]
+        control[..., self.balls] = torque
+        return control
+
+    def drive(self, first: int) -> Drive:
+        return super().drive(first)._replace(torque_balls=self.balls, torque_limits=self.limits)
+
+
+@dataclasses.dataclass(frozen=True)
+class AngleAxisMap(ActionMap):
+    """The position actions of the original: angle and axis of a rotation for every ball joint.
+
+    The affine map yields an angle, then an axis of any length, forward, up and right; the axis of
+    length 0 stands for the one to the right. `control` goes on to rotation vectors, so it returns
+    fewer numbers than it takes, and `action` gives back one of many equal actions.
+
+    Attributes:
+      angles: where the angle of each ball joint is in an action, shape (B,); its axis follows.
+      balls: where its rotation vector is in the controls, shape (B, 3).
+      hinges: where the other joints are in an action and in the controls, shape (2, H).
+    """
+
+    angles: np.ndarray = dataclasses.field(kw_only=True)
+    balls: np.ndarray = dataclasses.field(kw_only=True)
+    hinges: np.ndarray = dataclasses.field(kw_only=True)
+
+    def control(self, action: np.ndarray) -> np.ndarray:
+        value = super().control(action)
+        axis = value.take(self._axes, -1)
+        axis *= _SIGNS
+        length = _norm(axis)
+        if not length.all():
+            axis[length == 0] = _TO_THE_RIGHT
+            length[length == 0] = 1
+        axis *= (value.take(self.angles, -1) / length)[..., None]
+        control = np.empty((*value.shape[:-1], self.balls.size + len(self.hinges[1])))
+        control[..., self.hinges[1]] = value.take(self.hinges[0], -1)
+        control[..., self.balls] = axis
+        return control
+
+    def drive(self, first: int) -> Drive:
+        return (
+            super()
+            .drive(first)
+            ._replace(angles=self.angles, angle_balls=self.balls, hinges=np.asarray(self.hinges))
+        )
+
+    @functools.cached_property
+    def _axes(self) -> np.ndarray:
+        """Where forward, left and up are in an action, shape (B, 3)."""
+        return self.angles[:, None] + _FORWARD_LEFT_UP
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        vector = control[..., self.balls]
+        angle = _norm(vector)
+        turned = angle[..., None] > 0
+        axis = np.where(turned, vector / np.where(turned, angle[..., None], 1), _TO_THE_RIGHT)
+        value = np.empty((*control.shape[:-1], len(self)))
+        value[..., self.hinges[0]] = control[..., self.hinges[1]]
+        value[..., self.angles] = angle
+        # Of such a length that actions in [-1, 1] reach every axis.
+        value[..., self._axes] = axis * _SIGNS * (1 - AXIS_OFFSET)
+        return super().action(value)
+
+
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    """Lengths of vectors (..., 3); in every simulation the same whatever the number of simulations."""
+    square = vectors * vectors
+    return np.sqrt(square[..., 0] + square[..., 1] + square[..., 2])

@@ -1,0 +1,286 @@
+"""Gymnasium's interface: `gymnasium.make` and `gymnasium.make_vec` for every id of the suite.
+
+    import gymnasium
+    import trl_suite.adapters.gym  # registers trl_suite/ID for every ID
+
+    env = gymnasium.make('trl_suite/PD_Biped2D_Gaps_Terrain-v0')
+    envs = gymnasium.make_vec('trl_suite/PD_Biped2D_Gaps_Terrain-v0', num_envs=64)
+
+Gymnasium 1 has no plugins: without that import the id must name the module, as in
+'trl_suite.adapters.gym:trl_suite/PD_Biped2D_Gaps_Terrain-v0'. What has no id is wrapped by hand, as
+`SuiteEnv(suite.build('raptor', actuation='muscle'))`. A fall terminates an episode, the environment's
+own step limit truncates it; `info` has 'reward_terms' (a dict; their sum is the reward), 'fell',
+'diverged', 'distance' (m).
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from trl_suite import rendering, suite
+from trl_suite.environments.environment import Environment
+from trl_suite.environments.vector import VectorEnvironment
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.util import errors
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import iterate
+except ImportError as error:
+    message = (
+        f"trl_suite.adapters.gym needs Gymnasium ({error}): pip install 'trl_suite[gymnasium]'"
+    )
+    raise ImportError(message) from None
+
+METADATA = {'render_modes': ['rgb_array'], 'render_fps': int(rendering.CONTROL_FPS)}  # of most
+BOUNDS = {'phase': (0.0, 1.0)}  # of observation blocks; the others have none
+Info = dict[str, Any]
+
+
+class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
+    """A single environment; `environment` is the `trl_suite.environments.environment.Environment` underneath.
+
+    `reset(seed=s)` begins the same episode as the first reset of
+    `suite.make(id, task_kwargs={'random': s})`; a reset without a seed draws the next one.
+    """
+
+    metadata = METADATA
+
+    def __init__(
+        self, environment: str | EnvSpec | Environment, *, flat_observation: bool = True,
+        task_kwargs: Info | None = None, dtype: DTypeLike = np.float32,
+        max_episode_steps: int | None = None, render_mode: str | None = None,
+        render_kwargs: Info | None = None,
+    ) -> None:  # fmt: skip
+        """Makes the environment.
+
+        Args:
+          environment: id, alias, row of the catalogue, or an environment that nothing else uses.
+          flat_observation: give one vector of all blocks side by side, else a dict of blocks.
+          task_kwargs: as for `suite.load`.
+          dtype: of observations and actions, float32 or float64.
+          max_episode_steps: truncate after as many steps, if the environment's own limit does not
+            come first. `gymnasium.make` has a wrapper of its own for it.
+          render_mode: 'rgb_array', or None for no pictures.
+          render_kwargs: options of `trl_suite.rendering.frame`.
+
+        Raises:
+          ValueError: unknown names or options; the message has the closest matches.
+        """
+        if render_mode not in (None, 'rgb_array'):
+            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
+        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
+        if not isinstance(environment, Environment):
+            spec = suite.find(environment) if isinstance(environment, str) else environment
+            environment = suite.build_environment(
+                spec, limited(spec, task_kwargs, max_episode_steps), {}
+            )
+        elif task_kwargs or max_episode_steps is not None:
+            raise ValueError(
+                'task_kwargs and max_episode_steps cannot change an environment that is already made'
+            )
+        self.environment, self._flat, self._dtype = environment, flat_observation, np.dtype(dtype)
+        self.metadata = metadata(environment.task)
+        shapes = {name: spec.shape for name, spec in environment.observation_spec().items()}
+        self.observation_space = observation_space(shapes, flat_observation, dtype)
+        self.action_space = action_space((len(environment.action_map),), dtype)
+        self._running, self._closed = False, False
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Begins an episode, seeded anew by a `seed` in [0, 2**32); there are no options."""
+        self._check_open()
+        if seed is not None:
+            seed = operator.index(seed)
+            if not 0 <= seed < 2**32:
+                raise ValueError(f'seed is {seed}; expected an integer in [0, 2**32)')
+            self.environment.random_state.seed(seed)
+        super().reset(seed=seed)
+        time_step = self.environment.reset()
+        self._running = True
+        return self._observation(time_step.observation), self.environment.info
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, Info]:
+        """Takes one action, clipped to [-1, 1]; `ResetNeeded` is raised where no episode runs."""
+        self._check_open()
+        if not self._running:
+            raise gymnasium.error.ResetNeeded('no episode is running; call reset first')
+        time_step = self.environment.step(action)
+        last = time_step.last()
+        terminated = last and time_step.discount == 0
+        self._running = not last
+        observation, truncated = self._observation(time_step.observation), last and not terminated
+        return observation, float(time_step.reward), terminated, truncated, self.environment.info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Draws the current state, (h, w, 3) uint8; None if render_mode is None."""
+        self._check_open()
+        return self.render_mode and rendering.frame(self.environment, **self._render_kwargs)  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """Frees the simulation; may be called twice."""
+        if not self._closed:
+            self._closed = True
+            self.environment.close()
+
+    def _observation(self, blocks: Mapping[str, np.ndarray]) -> Any:
+        if self._flat:
+            if len(blocks) == 1:
+                return next(iter(blocks.values())).astype(self._dtype)
+            return np.concatenate([part.ravel() for part in blocks.values()], dtype=self._dtype)
+        return {name: part.astype(self._dtype) for name, part in blocks.items()}
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError('the environment is closed')
+
+
+class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
+    """A `trl_suite.environments.vector.VectorEnvironment`: what `gymnasium.make_vec` makes by default.
+
+    With the same seeds, simulation i returns what simulation i of a `SyncVectorEnv` of `SuiteEnv` does.
+    `reset(seed=[s0, s1, ...])` gives every simulation its own. `reset(seed=s)` seeds the whole: simulation i gets
+    the i-th number of `numpy.random.SeedSequence(s).generate_state(n)`, not s + i, so that
+    neighbouring seeds have no episodes in common.
+    """
+
+    def __init__(
+        self, environment: str | EnvSpec, num_envs: int = 1, *, num_threads: int = 0,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        flat_observation: bool = True, task_kwargs: Info | None = None,
+        dtype: DTypeLike = np.float32, max_episode_steps: int | None = None,
+        render_mode: str | None = None, render_kwargs: Info | None = None,
+    ) -> None:  # fmt: skip
+        """Makes the environment; the other arguments and errors are those of `SuiteEnv`.
+
+        Args:
+          num_envs: number of simulations.
+          num_threads: threads that step the physics; 0 takes all cores.
+          autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's own constants.
+          dtype: of observations, actions and rewards.
+        """
+        modes = {mode.value: mode for mode in AutoresetMode}
+        mode = getattr(autoreset_mode, 'value', autoreset_mode)
+        if mode not in modes:
+            raise ValueError(errors.unknown('autoreset_mode', mode, modes))
+        self.autoreset_mode = modes[mode]  # as Gymnasium's own have it; TorchRL looks for it
+        if render_mode not in (None, 'rgb_array'):
+            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
+        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
+        spec = suite.find(environment) if isinstance(environment, str) else environment
+        options = limited(spec, task_kwargs, max_episode_steps)
+        self.environment = VectorEnvironment(
+            spec, num_envs, num_threads, options.pop('random', None),
+            autoreset=modes[mode].name.lower(), dtype=dtype, flat_observation=flat_observation,
+            task_kwargs=options,
+        )  # fmt: skip
+        self.metadata = {**metadata(self.environment.task), 'autoreset_mode': modes[mode]}
+        self.num_envs = n = self.environment.num_envs
+        shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
+        self.single_observation_space = observation_space(shapes, flat_observation, dtype)
+        self.observation_space = observation_space(shapes, flat_observation, dtype, (n,))
+        self.action_space = action_space((n, len(self.environment.action_map)), dtype)
+        self.single_action_space = action_space(self.action_space.shape[1:], dtype)
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: Info | None = None
+    ) -> tuple[Any, Info]:
+        """Begins episodes, seeded anew if `seed` is given, in `options['reset_mask']` or all simulations."""
+        env_ids = np.array((options or {}).get('reset_mask', np.ones(self.num_envs, bool)))
+        if env_ids.dtype != bool or env_ids.shape != (self.num_envs,) or not env_ids.any():
+            raise ValueError(
+                f'reset_mask is {env_ids}; expected {self.num_envs} bools, not all false'
+            )
+        observation = self.environment.reset(env_ids, seed)
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        return observation, masked(self.environment.info, env_ids)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """Takes one step in every simulation; arguments and errors are those of `VectorEnvironment.step`."""
+        observation, reward, terminated, truncated, info = self.environment.step(actions)
+        result: Info = {}
+        ended = info.pop('ended', np.zeros(1, bool))
+        if ended.any():  # and begun anew in the same step
+            finals = iterate(self.observation_space, info.pop('final_observation'))
+            last = (each if end else None for each, end in zip(finals, ended, strict=True))
+            result = masked({'final_info': info}, ended)
+            result |= {'final_obs': np.fromiter(last, object), '_final_obs': ended}
+            info = self.environment.info
+        result |= masked(info, np.ones(self.num_envs, bool))
+        return observation, reward, terminated, truncated, result
+
+    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
+        """Draws every simulation; None if render_mode is None."""
+        env_ids = range(self.num_envs if self.render_mode else 0)
+        return (
+            tuple(self.environment.render(env_id, **self._render_kwargs) for env_id in env_ids)
+            or None
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the simulations."""
+        self.environment.close()
+
+
+def metadata(task: Any) -> Info:
+    """What is said of pictures; one per step plays as fast as it happened, but for cycles of gaits."""
+    return {**METADATA, 'render_fps': max(1, round(1 / task.control_timestep))}
+
+
+def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
+    """Options whose step limit is the smaller of a simulation's and Gymnasium's (None or -1 for none)."""
+    options = dict(task_kwargs or {})
+    if max_episode_steps is None or max_episode_steps == -1:
+        return options
+    if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
+        raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
+    own = options.get('step_limit', spec.step_limit)
+    options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
+    return options
+
+
+def observation_space(
+    shapes: Mapping[str, tuple[int, ...]], flat: bool, dtype: Any, n: tuple[int, ...] = ()
+) -> spaces.Box | spaces.Dict:
+    """Returns the space of blocks of these shapes, flat or not; of n simulations if n is given."""
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
+        raise ValueError(f'dtype is {np.dtype(dtype)}; expected float32 or float64')
+    bounds = {name: BOUNDS.get(name, (-np.inf, np.inf)) for name in shapes}
+    boxes = [(key, spaces.Box(*bounds[key], (*n, *shapes[key]), dtype)) for key in shapes]
+    if not flat:
+        return spaces.Dict(boxes)  # pairs: of a dict it would sort the keys
+    low = np.concatenate([box.low.reshape(*n, -1) for _, box in boxes], -1)
+    high = np.concatenate([box.high.reshape(*n, -1) for _, box in boxes], -1)
+    return spaces.Box(low, high, dtype=dtype)
+
+
+def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
+    """Returns the space of actions, [-1, 1] for each number."""
+    return spaces.Box(-1.0, 1.0, shape, dtype)
+
+
+def masked(info: Info, env_ids: np.ndarray) -> Info:
+    """Info as Gymnasium has it: 0 in other simulations, and beside each key '_key', the mask of simulations."""
+    result: Info = {}
+    for name, value in info.items():
+        result[name] = masked(value, env_ids) if isinstance(value, dict) else value.copy()
+        if not isinstance(value, dict):
+            result[name][~env_ids] = 0
+        result[f'_{name}'] = env_ids.copy()
+    return result
+
+
+for _id in suite.ALL_IDS:
+    if f'trl_suite/{_id}' not in gymnasium.registry:
+        gymnasium.register(
+            f'trl_suite/{_id}',
+            entry_point='trl_suite.adapters.gym:SuiteEnv',
+            vector_entry_point='trl_suite.adapters.gym:SuiteVectorEnv',
+            kwargs={'environment': _id},
+        )

@@ -1,0 +1,152 @@
+"""Stable-Baselines3's interface: its `VecEnv` over our vector environment.
+
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecMonitor
+    from trl_suite.adapters.stable_baselines import SuiteVecEnv
+
+    envs = VecMonitor(SuiteVecEnv('PD_Biped2D_Flat-v0', num_envs=64))
+    PPO('MlpPolicy', envs).learn(1_000_000)
+
+Single environments need no adapter: `gymnasium.make('trl_suite/ID')` is what Stable-Baselines3 takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.adapters.gym import action_space, observation_space
+from trl_suite.environments.vector import VectorEnvironment
+from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.util import errors
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    message = f"trl_suite.adapters.stable_baselines needs an extra ({error}): pip install 'trl_suite[sb3]'"
+    raise ImportError(message) from None
+
+Indices = None | int | Iterable[int]
+
+
+class SuiteVecEnv(VecEnv):
+    """Many simulations on threads; a simulation that ends begins anew in the same step.
+
+    The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_terms' (a dict) and
+    'TimeLimit.truncated'; that of a simulation which ended also has 'terminal_observation'. `seed(s)` gives
+    simulation i the seed s + i at the next reset, as everywhere in Stable-Baselines3.
+
+    Attributes:
+      environment: the `trl_suite.environments.vector.VectorEnvironment` underneath.
+    """
+
+    def __init__(
+        self, environment: str | EnvSpec, num_envs: int, num_threads: int = 0,
+        seed: int | Sequence[int] | None = None, *, flat_observation: bool = True,
+        step_limit: int | None = -1, task_kwargs: dict[str, Any] | None = None,
+        render_mode: str | None = None, render_kwargs: dict[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Makes the environment; arguments that are not listed are those of `VectorEnvironment`.
+
+        Args:
+          environment: id, alias, or row of the catalogue.
+          num_envs: number of simulations.
+          num_threads: threads that step the physics; 0 takes all cores.
+          seed: of the whole: simulation i gets a child seed; or a sequence of n seeds.
+          flat_observation: give one vector, for 'MlpPolicy'; else a dict, for 'MultiInputPolicy'.
+          render_mode: 'rgb_array', or None for no pictures.
+          render_kwargs: options of `trl_suite.rendering.frame`.
+
+        Raises:
+          ValueError: unknown names or options; the message has the closest matches.
+        """
+        if render_mode not in (None, 'rgb_array'):
+            raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
+        self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
+        self.environment = VectorEnvironment(
+            environment, num_envs, num_threads, seed, autoreset='same_step', dtype=np.float32,
+            flat_observation=flat_observation, step_limit=step_limit, task_kwargs=task_kwargs,
+        )  # fmt: skip
+        shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
+        super().__init__(
+            self.environment.num_envs,
+            observation_space(shapes, flat_observation, np.float32),
+            action_space((len(self.environment.action_map),), np.float32),
+        )
+
+    def reset(self) -> Any:
+        """Begins an episode in every simulation; options of `set_options` have no meaning here."""
+        seeds = None if None in self._seeds else [int(seed) % 2**32 for seed in self._seeds]  # type: ignore[arg-type]
+        self._reset_seeds()
+        self._reset_options()
+        observation = self.environment.reset(seed=seeds)
+        self.reset_infos = rows_of(self.environment.info)
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Takes the actions, (n, k) in [-1, 1], clipped there, of the step that `step_wait` makes."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Makes the step; errors are those of `VectorEnvironment.step`."""
+        observation, reward, terminated, truncated, info = self.environment.step(self._actions)
+        ended, final = info.pop('ended'), info.pop('final_observation', None)
+        infos = rows_of({**info, 'TimeLimit.truncated': truncated})
+        if ended.any():
+            begun = rows_of(self.environment.info)
+            for env_id in np.flatnonzero(ended).tolist():
+                infos[env_id]['terminal_observation'] = row_of(final, env_id)
+                self.reset_infos[env_id] = begun[env_id]
+        return observation, reward, terminated | truncated, infos
+
+    def close(self) -> None:
+        """Frees the simulations; may be called twice."""
+        self.environment.close()
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Draws every simulation, (h, w, 3) uint8 each; None if render_mode is None."""
+        if self.render_mode is None:
+            return [None] * self.num_envs
+        return [
+            self.environment.render(env_id, **self._render_kwargs)
+            for env_id in range(self.num_envs)
+        ]
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Returns an attribute of this object or of `environment`, once for each simulation asked for."""
+        owner = self if attr_name in ('render_mode', 'observation_space', 'action_space') else None
+        value = getattr(owner or self.environment, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        raise NotImplementedError(
+            f'simulations share one object: set {attr_name} on its `environment`'
+        )
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        raise NotImplementedError(
+            f'simulations share one object: call {method_name} of its `environment`'
+        )
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
+        """No simulation has a Gymnasium wrapper."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def rows_of(info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Turns a dict of arrays of n simulations into n dicts of plain values."""
+    columns = (
+        rows_of(value) if isinstance(value, dict) else value.tolist() for value in info.values()
+    )
+    return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def row_of(observation: Any, env_id: int) -> Any:
+    """Returns the observation of one simulation."""
+    if isinstance(observation, dict):
+        return {name: value[env_id] for name, value in observation.items()}
+    return observation[env_id]

@@ -1,0 +1,301 @@
+"""The characters as rows of data. Source: the character files of the original simulator."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from trl_suite.characters.character import CharacterSpec, Joint
+
+# The dog's pelvis box is rotated; the original measures these two limits against it (they act 0.61
+# rad higher), but scales actions by the file's numbers.
+_FILE_RANGE = (-1.57, 1.57)
+
+# Joint(kp N m/rad, kd N m s/rad, reward weight, working posture rad), in link order; a prismatic
+# joint has m for rad and N for N m. Which joints are spherical, the MJCF files say.
+_DOG_JOINTS = {
+    'spine0': Joint(200, 20, 0.5, original_range=_FILE_RANGE),
+    'spine1': Joint(200, 20, 0.5),
+    'spine2': Joint(200, 20, 0.5),
+    'spine3': Joint(200, 20, 0.5),
+    'torso': Joint(200, 20, 1),
+    'neck0': Joint(50, 5, 0.2, 0.68507),
+    'neck1': Joint(50, 5, 0.2, 0.2),
+    'head': Joint(50, 5, 0.2, 0.20456),
+    'tail0': Joint(4, 0.4, 0.001, 0.4),
+    'tail1': Joint(4, 0.4, 0.001, 0.2),
+    'tail2': Joint(4, 0.4, 0.001, 0.2),
+    'tail3': Joint(4, 0.4, 0.001, 0.2),
+    'shoulder': Joint(160, 16, 1, -0.5224),
+    'elbow': Joint(80, 8, 1, 0.87117),
+    'wrist': Joint(80, 8, 1, 0.11488),
+    'finger': Joint(80, 8, 1, -0.46365),
+    'hip': Joint(130, 13, 1, 0.61719, original_range=_FILE_RANGE),
+    'knee': Joint(50, 5, 1, -1.31193),
+    'ankle': Joint(50, 5, 1, 1.32022),
+    'toe': Joint(50, 5, 1, -0.62549),
+}
+
+_RAPTOR_JOINTS = {
+    'spine0': Joint(200, 20, 0.5, 0.16682),
+    'spine1': Joint(200, 20, 0.5, 0.03457),
+    'spine2': Joint(100, 10, 0.5, 0.11743),
+    'spine3': Joint(100, 10, 0.5, 0.11914),
+    'head': Joint(100, 10, 0.5, 0.75355),
+    'tail0': Joint(100, 10, 0.25, 0.09288),
+    'tail1': Joint(50, 5, 0.25, 0.04206),
+    'tail2': Joint(50, 5, 0.25, 0.12818),
+    'tail3': Joint(50, 5, 0.25, 0.01178),
+    'tail4': Joint(50, 5, 0.25, 0.24638),
+    'right_hip': Joint(300, 30, 1, 0.46487),
+    'right_knee': Joint(300, 30, 0.5, -1.456),
+    'right_ankle': Joint(250, 25, 0.5, 1.37779),
+    'right_toe': Joint(100, 10, 0.5, -0.3883),
+    'left_hip': Joint(300, 30, 1, 0.46487),
+    'left_knee': Joint(300, 30, 0.5, -1.456),
+    'left_ankle': Joint(250, 25, 0.5, 1.37779),
+    'left_toe': Joint(100, 10, 0.5, -0.3883),
+}
+
+_BIPED2D_JOINTS = {
+    'right_hip': Joint(300, 30, 0.3),
+    'right_knee': Joint(300, 30, 0.3),
+    'right_ankle': Joint(100, 10, 0.2),
+    'left_hip': Joint(300, 30, 0.3),
+    'left_knee': Joint(300, 30, 0.3),
+    'left_ankle': Joint(100, 10, 0.2),
+}
+
+_BIPED2D_SIMBICON_JOINTS = {
+    'right_hip': Joint(200, 20, 0.3),
+    'right_knee': Joint(200, 20, 0.3),
+    'right_ankle': Joint(150, 15, 0.2),
+    'left_hip': Joint(200, 20, 0.3),
+    'left_knee': Joint(200, 20, 0.3),
+    'left_ankle': Joint(150, 15, 0.2),
+}
+
+_BIPED2D_FULL_JOINTS = {
+    'right_hip': Joint(200, 20, 0.3),
+    'right_knee': Joint(200, 20, 0.3),
+    'right_ankle': Joint(100, 10, 0.2),
+    'left_hip': Joint(200, 20, 0.3),
+    'left_knee': Joint(200, 20, 0.3),
+    'left_ankle': Joint(100, 10, 0.2),
+    'right_shoulder': Joint(150, 15, 0.3),
+    'right_forearm': Joint(100, 10, 0.3),
+    'left_shoulder': Joint(150, 15, 0.3),
+    'left_forearm': Joint(100, 10, 0.3),
+    'neck': Joint(100, 10, 0.3),
+}
+
+# The original calls these two spine0 and spine1. The leg is prismatic.
+_HOPPER_JOINTS = {
+    'hip': Joint(200, 20, 0.5),
+    'leg': Joint(1000, 20, 0.5),
+}
+
+_BIPED3D_JOINTS = {
+    'torso': Joint(1000, 100, 0.5),
+    'right_hip': Joint(300, 30, 0.5),
+    'right_knee': Joint(300, 30, 0.3),
+    'right_ankle': Joint(100, 10, 0.2),
+    'left_hip': Joint(300, 30, 0.5),
+    'left_knee': Joint(300, 30, 0.3),
+    'left_ankle': Joint(100, 10, 0.2),
+}
+
+# Five times the gain on half the foot: with an armature of 0.01 an ankle that has met its torque
+# limit may go on shivering there.
+_BIPED3D_MOCAP_RUN_JOINTS = {
+    'torso': Joint(1000, 100, 0.5),
+    'right_hip': Joint(500, 50, 0.5),
+    'right_knee': Joint(500, 50, 0.3),
+    'right_ankle': Joint(500, 50, 0.2, armature=0.03),
+    'left_hip': Joint(500, 50, 0.5),
+    'left_knee': Joint(500, 50, 0.3),
+    'left_ankle': Joint(500, 50, 0.2, armature=0.03),
+}
+
+# The original spells sholder. Arms and head move by a hundredth of a radian.
+_BIPED3D_FULL_MOCAP_JOINTS = {
+    **_BIPED3D_JOINTS,
+    'right_shoulder': Joint(100, 10, 0.001),
+    'right_elbow': Joint(100, 10, 0.001),
+    'right_wrist': Joint(100, 10, 0.001),
+    'left_shoulder': Joint(100, 10, 0.001),
+    'left_elbow': Joint(100, 10, 0.001),
+    'left_wrist': Joint(100, 10, 0.001),
+    'neck': Joint(100, 10, 0.001),
+    'head': Joint(100, 10, 0.001),
+}
+
+# The only spherical joints whose limits are not the same to both sides.
+_BIPED3D_SIMBICON_JOINTS = {
+    'right_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
+    'right_knee': Joint(200, 20, 0.3),
+    'right_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
+    'left_hip': Joint(200, 20, 0.3, original_range=(-0.7, 1.4)),
+    'left_knee': Joint(200, 20, 0.3),
+    'left_ankle': Joint(100, 10, 0.2, original_range=(-1, 0.57)),
+}
+
+_TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
+_BORROWED = ('the original has no muscles for this character; they are borrowed',)
+
+DOG = CharacterSpec(
+    name='dog',
+    joints=_DOG_JOINTS,
+    fall_links=(
+        'root', 'spine0', 'spine1', 'spine2', 'spine3', 'torso', 'neck0', 'neck1', 'head',
+    ),
+    end_effectors=('finger', 'toe'),
+    stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
+    description='Dog, 21 links: a segmented spine, a tail, one simulated front and hind leg.',
+    clip='dog_bound',
+    differences={'position': _TO_PARENT},
+)  # fmt: skip
+
+_GOAT_JOINTS = {name: dataclasses.replace(joint, weight=1.0) for name, joint in _DOG_JOINTS.items()}
+_GOAT_JOINTS['neck0'] = dataclasses.replace(_GOAT_JOINTS['neck0'], target=0.40041)
+
+GOAT = CharacterSpec(
+    name='goat',
+    joints=_GOAT_JOINTS,
+    fall_links=('root', 'spine0'),
+    end_effectors=('finger', 'toe'),
+    stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
+    description='Goat, 21 links: the skeleton of the dog with horns; only its rump is a fall.',
+    clip='dog_bound',
+    differences={
+        'position': _TO_PARENT,
+        'muscle': _BORROWED,
+        'gait': (
+            "action 0 is a gait tuned anew: the original's fall here on flat ground; the original has the "
+            'gait and no environment for it',
+        ),
+    },
+)
+
+RAPTOR = CharacterSpec(
+    name='raptor',
+    joints=_RAPTOR_JOINTS,
+    fall_links=('root', 'spine0', 'spine1', 'spine2', 'spine3', 'head'),
+    end_effectors=('right_toe', 'left_toe'),
+    stumble_exempt=('right_toe', 'left_toe', 'right_ankle', 'left_ankle'),
+    description='Raptor, 19 links: a heavy pelvis between a neck, a tail and two bird legs.',
+    clip='raptor_run_050',
+    differences={
+        'position': _TO_PARENT,
+        'gait': (
+            "action 0 is the original's base action 1, which is steadier than its base action 0",
+        ),
+    },
+)
+
+BIPED2D = CharacterSpec(
+    name='biped2d',
+    joints=_BIPED2D_JOINTS,
+    fall_links=('root',),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle'),
+    description='Biped, 7 links: a trunk of 25 kg and two legs; the feet are the ankle links.',
+    clip='biped2d_walk',
+)
+
+BIPED2D_SIMBICON = CharacterSpec(
+    name='biped2d_simbicon',
+    joints=_BIPED2D_SIMBICON_JOINTS,
+    fall_links=('root',),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
+    differences={
+        'gait': (
+            "action 0 is a gait tuned anew: the original's falls here; torque is not rewarded",
+        ),
+    },
+)
+
+BIPED2D_FULL = CharacterSpec(
+    name='biped2d_full',
+    joints=_BIPED2D_FULL_JOINTS,
+    fall_links=(
+        'root', 'right_hip', 'left_hip', 'right_shoulder', 'right_forearm', 'left_shoulder',
+        'left_forearm', 'neck',
+    ),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle'),
+    description='Biped with arms and head, 12 links, with human torque limits.',
+    clip='biped2d_full_walk',
+    differences={'muscle': _BORROWED},
+)  # fmt: skip
+
+HOPPER = CharacterSpec(
+    name='hopper',
+    joints=_HOPPER_JOINTS,
+    fall_links=('root',),
+    end_effectors=('leg',),  # none in the original's file; the foot is the lower end of the leg
+    stumble_exempt=('leg',),
+    description='Hopper, 3 links: a body on one leg, which slides along the thigh.',
+    differences={
+        'gait': (
+            '9 parameters, taken at touch-down; the original announces 8 and takes them in mid-air',
+        ),
+    },
+)
+
+BIPED3D = CharacterSpec(
+    name='biped3d',
+    joints=_BIPED3D_JOINTS,
+    fall_links=('root', 'torso'),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle'),
+    description='Biped in 3D, 8 links: a pelvis, a torso and two legs; waist, hips and ankles are balls.',
+    spatial=True,
+    clip='biped3d_walk',
+)
+
+BIPED3D_MOCAP = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_mocap',
+    description='Biped in 3D with longer legs and a narrower pelvis, 8 links: the walker of DeepLoco.',
+    clip='biped3d_mocap_walk',
+)
+
+BIPED3D_MOCAP_RUN = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_mocap_run',
+    joints=_BIPED3D_MOCAP_RUN_JOINTS,
+    description='Biped in 3D that runs, 8 links: light legs, strong and stiff joints.',
+    clip='biped3d_mocap_run',
+    differences={'position': ('its ankles have an armature of 0.03 kg m^2',)},
+)
+
+BIPED3D_FULL_MOCAP = dataclasses.replace(
+    BIPED3D,
+    name='biped3d_full_mocap',
+    joints=_BIPED3D_FULL_MOCAP_JOINTS,
+    fall_links=tuple(
+        link for link in ('root', *_BIPED3D_FULL_MOCAP_JOINTS) if not link.endswith('ankle')
+    ),
+    description='Biped in 3D with arms and head, 16 links; these are all but rigid.',
+    clip='biped3d_full_walk',
+)
+
+BIPED3D_SIMBICON = CharacterSpec(
+    name='biped3d_simbicon',
+    joints=_BIPED3D_SIMBICON_JOINTS,
+    fall_links=('root',),
+    end_effectors=('right_ankle', 'left_ankle'),
+    stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    description='Biped of the gait state machines in 3D, 7 links: no waist, hips close to the middle.',
+    spatial=True,
+)
+
+CHARACTERS: dict[str, CharacterSpec] = {
+    spec.name: spec
+    for spec in (
+        DOG, GOAT, RAPTOR, BIPED2D, BIPED2D_SIMBICON, BIPED2D_FULL, HOPPER, BIPED3D, BIPED3D_MOCAP,
+        BIPED3D_MOCAP_RUN, BIPED3D_FULL_MOCAP, BIPED3D_SIMBICON,
+    )
+}  # fmt: skip

@@ -1,0 +1,287 @@
+"""How fast this machine runs an environment: ratios to raw MuJoCo within one run.
+
+    trl-suite bench PD_Dog2D_Slopes_Terrain-v0
+
+Rates count physics steps, so that environments whose steps last differently compare; actions are
+random, resets with new terrain included. `benchmarks/vector_environment.py` measures more with the same
+parts: many sizes, memory, and other suites.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from trl_suite import suite
+from trl_suite.cli import machine
+from trl_suite.environments.vector import VectorEnvironment
+from trl_suite.util import files
+
+ID = 'PD_Biped2D_Gaps_Terrain-v0'
+NUM_ENVS = 64
+CONTROL_TIMESTEP = 1 / 30  # s; longer steps have controllers inside
+SECONDS = 2.0  # per measurement
+WARM = 4 / 3  # s of simulated time; most simulations have fallen once by then
+RESET = 30  # calls between two resets of what is stepped raw, a second of simulated time
+ROUNDS = 8  # in which environment and raw batch take turns: machines are now faster, now slower
+PROJECTED = (16, 64)  # cores
+DRAWN = 100  # random actions, which are repeated
+
+
+class Stopwatch:
+    """Adds up the time that calls of a function take, and what they do.
+
+    Attributes:
+      seconds: spent in the function.
+      items: the sum of what `count` made of the arguments.
+    """
+
+    def __init__(self, function: Callable[..., Any], count: Callable[..., int]) -> None:
+        self._function, self._count = function, count
+        self.seconds, self.items = 0.0, 0
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        begin = time.perf_counter()
+        found = self._function(*arguments, **keywords)
+        self.seconds += time.perf_counter() - begin
+        self.items += self._count(*arguments, **keywords)
+        return found
+
+
+def rate(step: Callable[[], object], seconds: float, per_call: int = 1) -> float:
+    """Calls `step` for about `seconds`; returns items per second."""
+    step()
+    calls, begin = 0, time.perf_counter()
+    while time.perf_counter() - begin < seconds:
+        step()
+        calls += 1
+    return calls * per_call / (time.perf_counter() - begin)
+
+
+def actions(low: Any, high: Any, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """Yields random actions for ever, drawn beforehand with seed 0."""
+    drawn = np.random.default_rng(0).uniform(low, high, (DRAWN, *shape))
+    while True:
+        yield from drawn
+
+
+def warmed(id: str, num_envs: int, threads: int) -> tuple[VectorEnvironment, Iterator[np.ndarray]]:
+    """Makes a vector environment whose simulations are over their first episodes, and random actions."""
+    environments = VectorEnvironment(id, num_envs, threads, seed=0)
+    environments.reset()
+    drawn = actions(-1, 1, (num_envs, len(environments.action_map)))
+    while physics_steps(environments) * environments.task.physics_timestep < WARM * num_envs:
+        environments.step(next(drawn))
+    return environments, drawn
+
+
+def physics_steps(environments: VectorEnvironment) -> int:
+    """Returns how many physics steps the simulations have taken, in all."""
+    return int(environments.task.world.engine.steps.sum())
+
+
+def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> dict[str, float]:
+    """Measures the vector environment, and MuJoCo alone with the same models and threads.
+
+    Args:
+      id: of the environment.
+      num_envs: number of simulations.
+      threads: that step them; 0 takes all cores.
+      seconds: for the environment, and as many for the raw batch.
+
+    Returns:
+      'control' and 'physics': steps per second of all simulations; 'engine': physics steps per second of
+      MuJoCo alone, terrains included, whose bodies are never reset; 'serial': us per simulation and control
+      step in which one thread works; 'resets': share of the threads' time that resets take; 'reset': ms
+      per simulation.
+    """
+    threads = threads or machine.cores()
+    environments, drawn = warmed(id, num_envs, threads)
+    others, _ = warmed(id, num_envs, threads)
+    world: Any = others.task.world
+    begin = Stopwatch(environments.begin, len)
+    environments.begin = begin  # type: ignore[method-assign]
+    parallel = Stopwatch(environments.share, lambda *_: num_envs)
+    environments.share = parallel  # type: ignore[method-assign]
+    before = physics_steps(environments)
+    substeps, controls = control_substeps(others), world.ctrl
+    directly = acts_directly(others, world.models[0])  # else raw bodies are limp
+
+    def step() -> None:
+        controls[:] = others.action_map.control(next(drawn)) if directly else 0.0
+        world.share(lambda part: world.step(substeps, part), world.all_ids)
+
+    control = Stopwatch(lambda: environments.step(next(drawn)), lambda: num_envs)
+    alone = Stopwatch(step, lambda: num_envs * substeps)
+    for _ in range(ROUNDS):
+        for turn in (control, alone):
+            rate(turn, seconds / ROUNDS)
+    physics = physics_steps(environments) - before
+    environments.close()
+    others.close()
+    return {
+        'control': control.items / control.seconds,
+        'physics': physics / control.seconds,
+        'engine': alone.items / alone.seconds,
+        'serial': 1e6 * (control.seconds - parallel.seconds) / control.items,
+        'reset': 1e3 * begin.seconds / max(1, begin.items),
+        'resets': begin.seconds / (threads * control.seconds),
+    }
+
+
+def projection(found: dict[str, float], threads: int) -> dict[str, float]:
+    """Returns the speed-up over one core that more cores would give, by Amdahl's law.
+
+    Args:
+      found: what `vector` measured.
+      threads: with how many.
+
+    Returns:
+      Number of cores -> how many times as many control steps per second as one core. Only what one
+      thread does is counted against it, not caches and memory that the cores share.
+    """
+    total = 1e6 / found['control']  # us per simulation and control step
+    serial = found['serial']
+    parallel = threads * (total - serial)
+    return {
+        str(cores): round((serial + parallel) / (serial + parallel / cores), 1)
+        for cores in PROJECTED
+    }
+
+
+def control_substeps(environment: Any) -> int:
+    """How many physics steps there are between two controls of an environment."""
+    task = environment.task
+    return max(1, round(min(task.control_timestep, CONTROL_TIMESTEP) / task.physics_timestep))
+
+
+def acts_directly(environment: Any, model: mujoco.MjModel) -> bool:
+    """Whether actions are controls of the model, with no controller in between."""
+    action_map = environment.action_map
+    return np.size(action_map.control(np.zeros(len(action_map)))) == model.nu
+
+
+def raw(
+    model: mujoco.MjModel,
+    substeps: int,
+    seconds: float = SECONDS,
+    state: np.ndarray | None = None,
+    limp: bool = False,
+) -> float:
+    """Measures `mj_step` of a model under random controls, reset each second of simulated time.
+
+    Args:
+      model: whose it is.
+      substeps: physics steps per control.
+      seconds: how long.
+      state: mjSTATE_INTEGRATION that it is reset to; its own by default.
+      limp: controls are 0.
+
+    Returns:
+      Controls per second, of `substeps` each.
+    """
+    data = mujoco.MjData(model)
+    low, high = model.actuator_ctrlrange.T.copy()
+    free = ~model.actuator_ctrllimited.astype(bool)
+    low[free], high[free] = -1, 1
+    drawn = actions(low * (not limp), high * (not limp), (model.nu,))
+    calls = 0
+
+    def step() -> None:
+        nonlocal calls
+        if calls % RESET == 0:
+            mujoco.mj_resetData(model, data)
+            if state is not None:
+                mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        calls += 1
+        data.ctrl[:] = next(drawn)
+        mujoco.mj_step(model, data, substeps)
+
+    return rate(step, seconds)
+
+
+def single(id: str, seconds: float = SECONDS) -> dict[str, float]:
+    """Measures raw `mj_step` from the start of an environment, and the environment itself.
+
+    Returns:
+      'mj_step': physics steps per second; 'environment': control steps per second, resets included.
+    """
+    environment = suite.make(id, {'random': 0})
+    environment.reset()
+    physics, substeps = environment.physics, control_substeps(environment)
+    state = physics.get_state(sig=mujoco.mjtState.mjSTATE_INTEGRATION)
+    model = physics.model.ptr
+    limp = not acts_directly(environment, model)
+    found = {'mj_step': substeps * raw(model, substeps, seconds, state, limp)}
+    drawn = actions(-1, 1, environment.action_spec().shape)
+    found['environment'] = rate(lambda: environment.step(next(drawn)), seconds)
+    environment.close()
+    return found
+
+
+def bench(
+    id: str = ID, num_envs: int = NUM_ENVS, threads: int = 0, seconds: float = SECONDS
+) -> dict[str, Any]:
+    """Measures an environment on this machine.
+
+    Args:
+      id: of the environment, or an alias.
+      num_envs: of the vector environment.
+      threads: that step them; 0 takes all cores that may be used.
+      seconds: per measurement, of which there are four.
+
+    Returns:
+      What JSON can hold: 'machine', 'id', 'simulations', 'threads'; 'control steps per second' of all simulations,
+      and of a 'single environment'; 'ratio to the engine' (MuJoCo alone on as many
+      threads) and 'ratio to mj_step' (on one thread) of the physics steps per second; 'serial' (us per
+      simulation and control step); 'reset' (ms per simulation); and 'projection': the speed-up that 16 and 64 cores
+      would give, by Amdahl's law from the part that one thread does.
+
+    Raises:
+      ValueError: unknown id, or numbers out of range.
+    """
+    if not 0 < seconds < float('inf'):
+        raise ValueError(f'seconds is {seconds}; expected a positive number')
+    id, threads = suite.find(id).id, threads or machine.cores()
+    many, one = vector(id, num_envs, threads, seconds), single(id, seconds)
+    return {
+        'machine': machine.sentence(), 'id': id, 'num_envs': num_envs, 'threads': threads,
+        'control steps per second': round(many['control']),
+        'ratio to the engine': round(many['physics'] / many['engine'], 3),
+        'ratio to mj_step': round(many['physics'] / one['mj_step'], 3),
+        'serial': round(many['serial'], 3), 'reset': round(many['reset'], 3),
+        'projection': projection(many, threads),
+        'single environment': round(one['environment']),
+    }  # fmt: skip
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, and prints what was found."""
+    if arguments.json is not None:
+        files.check_path(arguments.json, ('.json',))
+    result = bench(arguments.id, arguments.num_envs, arguments.threads, arguments.seconds)
+    if arguments.json is not None:
+        files.write_json(result, arguments.json)
+    print(
+        f'{result["id"]}, {result["num_envs"]} simulations, {result["threads"]} threads, random actions'
+    )
+    print(f'  on {result["machine"]}')
+    for name, text in (
+        ('control steps', f'{result["control steps per second"]} per second, resets included'),
+        ('physics', f'{result["ratio to the engine"]:.2f} of the rate of MuJoCo alone on these threads'),
+        ('', f'{result["ratio to mj_step"]:.2f} of the rate of raw mj_step on one thread'),
+        ('serial', f'{result["serial"]:.2f} us per simulation and control step in one thread'),
+        ('reset', f'{result["reset"]:.2f} ms per simulation'),
+        (
+            'projected',
+            ', '.join(f'{v:.3g} times on {k} cores' for k, v in result['projection'].items())
+            + " of one core's rate, by Amdahl's law",
+        ),
+        ('alone', f'{result["single environment"]} control steps per second in a single environment'),
+    ):  # fmt: skip
+        print(f'  {name:<14} {text}')

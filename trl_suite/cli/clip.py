@@ -1,0 +1,70 @@
+"""`trl-suite clip`: carries a motion file over to a character, and checks it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+
+from trl_suite import rendering
+from trl_suite.cli import engine
+from trl_suite.util import files
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Carries a motion file over to a character, and prints what is wrong with the clip."""
+    for path, suffixes in (
+        (arguments.output, ('.npz',)),
+        (arguments.strip, rendering.IMAGE_SUFFIXES),
+    ):
+        if path is not None:
+            files.check_path(path, suffixes)
+    if arguments.cycle and len(arguments.cycle) != 2:
+        raise ValueError(f'--cycle: {len(arguments.cycle)} times; expected none or two')
+    engine.load()
+    from trl_suite import retargeting
+    from trl_suite.rendering.kinematic_viewer import KinematicViewer
+    from trl_suite.retargeting import clip_check
+
+    chosen = None
+    if arguments.map is not None:
+        chosen = _joint_map(arguments.map)
+    name = arguments.character
+    motion = retargeting.read(arguments.file, name, arguments.skeleton)
+    clip = retargeting.retarget(motion, name, chosen, arguments.scale)
+    if clip is not motion:
+        joints = KinematicViewer(name).layout.joints
+        followed = retargeting.counterparts(motion, joints, chosen)
+        still = [joint for joint in joints if joint not in followed]
+        print('joints:', ', '.join(f'{own} from {other}' for own, other in followed.items()))
+        if still:
+            print('joints that nothing moves:', ', '.join(still))
+    if arguments.cycle is not None:
+        clip = retargeting.cycle(clip, *arguments.cycle)
+    report = clip_check.check(clip, name)
+    print(report)
+    for fault in report.faults if arguments.frames else ():
+        print(
+            f'frame {fault.frame}, {fault.time:.3f} s: {fault.kind}, {fault.name}, '
+            f'{fault.amount:.3g} {fault.unit}'
+        )
+    if arguments.output is not None:
+        clip.save(arguments.output)
+        print(arguments.output)
+    if arguments.strip is not None:
+        image = KinematicViewer(name).film_strip(clip, height=240, width=320)
+        rendering.film_strip([image], arguments.strip)
+        print(arguments.strip)
+
+
+def _joint_map(path: pathlib.Path) -> dict[str, str]:
+    """Reads which joint of the motion each joint of the character follows."""
+    try:
+        content = json.loads(files.existing(path, ('.json',)).read_text(encoding='utf-8'))
+    except ValueError as error:
+        raise ValueError(f'{path}: not JSON: {error}') from None
+    if not isinstance(content, dict) or not all(isinstance(v, str) for v in content.values()):
+        raise ValueError(
+            f'{path}: expected an object of names, {{"joint of the character": "joint of the motion"}}'
+        )
+    return content

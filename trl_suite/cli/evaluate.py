@@ -1,0 +1,53 @@
+"""`trl-suite evaluate`: runs a policy for whole episodes, and sums up."""
+
+from __future__ import annotations
+
+import argparse
+
+from trl_suite.cli import engine
+from trl_suite.environments import named_policies as acting
+from trl_suite.util import files
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Runs a policy for whole episodes, and prints the sums."""
+    if arguments.json is not None:
+        files.check_path(arguments.json, ('.json',))
+    spec = engine.load().find(arguments.id)
+    from trl_suite import evaluation
+
+    baseline = evaluation.BASELINES.get(arguments.policy)
+    limits = {} if arguments.step_limit is None else {'step_limit': arguments.step_limit}
+    result = evaluation.evaluate(
+        spec, baseline or acting.trained(arguments.policy, spec.id), arguments.episodes, arguments.seed,
+        arguments.threads, limits, factory=baseline is not None, progress=True,
+    )  # fmt: skip
+    if arguments.json is not None:
+        files.write_json({**result, 'policy': arguments.policy}, arguments.json)
+    interval, distances = result['return_interval'], result['distance_interval']
+    lines = (
+        ('policy', arguments.policy),
+        ('episodes', f'{result["episodes"]}, seed {result["seed"]}'),
+        (
+            'return',
+            f'{result["return"]:.2f}'
+            + ('' if interval is None else f' +- {interval:.2f} (95 % confidence)')
+            + f', {result["normalized_return"]:.1%} of the maximum {result["step_limit"]}',
+        ),
+        ('length', f'{result["length"]:.1f} of {result["step_limit"]} steps'),
+        (
+            'distance',
+            f'{result["distance"]:.2f} m'
+            + (
+                ''
+                if distances is None
+                else ' ({:.2f} to {:.2f}, 95 % confidence)'.format(*distances)
+            )
+            + f', median {result["median_distance"]:.2f} m, at {result["speed"]:.2f} m/s',
+        ),
+        ('full length', f'{result["completion_rate"]:.0%} of the episodes'),
+        ('falls', f'{result["falls"]:.0%} of the episodes'),
+    )
+    print(spec.id)
+    for name, text in lines:
+        print(f'  {name:<12} {text}')

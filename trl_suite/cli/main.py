@@ -1,0 +1,213 @@
+"""The command line: `trl-suite` or `python -m trl_suite`.
+
+    trl-suite list --domain plaid --tag original
+    trl-suite info PD_Dog2D_Gaps_Terrain-v0
+    trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy clip --video dog.mp4 --ghost
+    trl-suite view PD_Dog2D_Gaps_Terrain-v0 --policy clip
+    trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
+    trl-suite terrain slopes_mixed --output slopes.png
+    trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
+    trl-suite doctor
+    trl-suite bench PD_Dog2D_Gaps_Terrain-v0
+    trl-suite gallery --filter Dog2D_Gaps
+
+Bad input ends with one line on stderr and exit status 2. A command NAME is the function `run` of the
+module `trl_suite.cli.NAME`; the engine is imported only by those that need it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import pathlib
+import re
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+import trl_suite
+from trl_suite.cli import engine
+from trl_suite.cli.list import FILTERS
+from trl_suite.environments import named_policies as acting
+
+
+def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
+    """Runs a command.
+
+    Args:
+      argv: arguments, without the program's name; by default those of the process.
+      prog: name of the program in the help.
+
+    Returns:
+      The exit status: 0; 1 if the doctor finds something wrong or a picture failed; 2 after an
+      error, with one line on stderr; 130 after an interrupt.
+    """
+    try:
+        arguments = _parser(prog).parse_args(argv)
+        command = engine.load(f'trl_suite.cli.{arguments.command}')
+        status = command.run(arguments) or 0
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except KeyboardInterrupt:
+        print('trl-suite: interrupted', file=sys.stderr)
+        return 130
+    except (ValueError, ImportError, RuntimeError, OSError) as error:
+        print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    return status
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f'{message} (see {self.prog} --help)')
+
+
+def _parser(prog: str) -> argparse.ArgumentParser:
+    parser = _Parser(prog=prog, description='Locomotion environments over random terrain.')
+    parser.add_argument('--version', action='version', version=f'trl-suite {trl_suite.__version__}')
+    commands = parser.add_subparsers(required=True, metavar='command', parser_class=_Parser)
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + '.',
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )  # fmt: skip
+        command.set_defaults(command=name)
+        return command
+
+    def add_policy(command: argparse.ArgumentParser, default: str) -> None:
+        command.add_argument(
+            '--policy', default=default, type=_policy_name, metavar='POLICY',
+            help=f'{", ".join(acting.POLICIES)}, or an .npz file; the reference is the trained one shipped',
+        )  # fmt: skip
+
+    command = add('list', 'list the environments of the catalogue')
+    for name in FILTERS:
+        command.add_argument(f'--{name}', help=f'only those of one {name}')
+    command.add_argument('--trained', action='store_true', help='only those with a shipped policy')
+
+    command = add('info', 'tell everything about one environment')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+
+    command = add('rollout', 'run a policy, over ends of episodes')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+    command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+    command.add_argument('--steps', type=_positive, default=256, help='control steps')
+    add_policy(command, 'random')
+    command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
+    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+    command.add_argument('--columns', type=_positive, default=8, help='pictures in the strip')
+    command.add_argument('--trajectory', type=pathlib.Path, metavar='FILE', help='an .npz')
+    command.add_argument('--ghost', action='store_true', help='draw the reference clip as well')
+    command.add_argument('--size', type=_size, default='640x480', metavar='WxH', help='in pixels')
+    command.add_argument('--camera', default='side', help='name of a camera')
+
+    command = add(
+        'view', "open dm_control's viewer, in which a policy acts; F1 there shows the keys"
+    )
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+    command.add_argument(
+        '--policy', default='best', type=_best_or_policy, metavar='POLICY',
+        help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that there is',
+    )  # fmt: skip
+    command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+
+    command = add('evaluate', 'run a policy for whole episodes, and sum up')
+    command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
+    add_policy(command, 'reference')
+    command.add_argument('--episodes', type=_positive, default=50, help='how many')
+    command.add_argument('--seed', type=int, default=0, help='of all episodes')
+    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument(
+        '--step-limit', type=_positive, metavar='N',
+        help="steps after which an episode is cut, instead of the environment's limit",
+    )  # fmt: skip
+    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
+
+    command = add('terrain', 'plot draws of a terrain, or write one as a mesh')
+    command.add_argument(
+        'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
+    )
+    command.add_argument('--draws', type=_positive, default=3, help='how many')
+    command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
+    command.add_argument('--seed', type=int, default=0, help='of the draws')
+    command.add_argument(
+        '--terrain-level', type=float, default=0.0, help='which of the parameter sets'
+    )
+    command.add_argument(
+        '--output', type=pathlib.Path, metavar='FILE',
+        help='a .png; or a mesh of the first draw, .obj, .glb or .stl',
+    )  # fmt: skip
+
+    command = add('clip', 'carry a motion file over to a character, and check it')
+    command.add_argument(
+        'file', metavar='FILE', type=pathlib.Path,
+        help='a .bvh, .amc, .json (TerrainRL, DeepMimic) or .npz',
+    )  # fmt: skip
+    command.add_argument('--character', required=True, help='name of a character')
+    command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')
+    command.add_argument(
+        '--map', type=pathlib.Path, metavar='FILE',
+        help="a .json of joints: the character's to the motion's; by usual names",
+    )  # fmt: skip
+    command.add_argument('--scale', type=float, help='of lengths; by the length of limbs')
+    command.add_argument(
+        '--cycle', nargs='*', type=float, metavar='TIME',
+        help='cut one cycle out, from a time to another (s); without times, where it fits best',
+    )  # fmt: skip
+    command.add_argument('--frames', action='store_true', help='print every fault in every frame')
+    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
+    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+
+    add('doctor', 'look at the installation; say what is wrong and what to do')
+
+    command = add('bench', 'measure the speed of this machine against raw MuJoCo')
+    command.add_argument(
+        'id', metavar='ID', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0', help="or 'domain/task'"
+    )
+    command.add_argument('--num-envs', type=_positive, default=64, help='of the vector environment')
+    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument('--seconds', type=float, default=2.0, help='of each of four measurements')
+    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
+
+    command = add('gallery', 'make pictures of all environments, terrains and characters')
+    command.add_argument(
+        '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='where to'
+    )
+    command.add_argument(
+        '--filter', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
+    )
+    command.add_argument('--overwrite', action='store_true', help='also what is there already')
+    return parser
+
+
+def _positive(text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if int(text) > 0:
+            return int(text)
+    raise argparse.ArgumentTypeError(f'{text!r} is not a positive integer')
+
+
+def _policy_name(text: str) -> str:
+    try:
+        return acting.check(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _best_or_policy(text: str) -> str:
+    return text if text == 'best' else _policy_name(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r'(\d+)x(\d+)', text)
+    if not match:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a size such as 640x480')
+    return int(match[1]), int(match[2])

@@ -1,0 +1,158 @@
+"""`trl-suite rollout`: runs a policy, over ends of episodes."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite import rendering
+from trl_suite.cli import engine
+from trl_suite.environments import named_policies as acting
+from trl_suite.util import files, tables
+
+if TYPE_CHECKING:
+    import dm_env
+
+    from trl_suite.environments.environment import Environment
+
+SHOWN_EPISODES = 8  # episodes that are printed one by one
+_ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in a task's information
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Runs a policy, writes what was asked for, and prints a line per episode and per file."""
+    for path, suffixes in (
+        (arguments.video, rendering.VIDEO_SUFFIXES),
+        (arguments.strip, rendering.IMAGE_SUFFIXES),
+        (arguments.trajectory, ('.npz',)),
+    ):
+        if path is not None:  # before the work rather than after it
+            files.check_path(path, suffixes)
+    suite = engine.load()
+    environment = suite.make(arguments.id, {'random': arguments.seed})
+    policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
+    width, height = arguments.size
+    in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
+    pictures: list[np.ndarray] = []
+    record = _Record(environment)
+    with contextlib.ExitStack() as stack:
+        video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
+
+        def picture() -> np.ndarray:
+            return rendering.frame(environment, height, width, arguments.camera, arguments.ghost)
+
+        watched = video and stack.enter_context(
+            rendering.watching(environment, lambda: video.add(picture()))
+        )
+        for done, time_step, action in _run(environment, policy, arguments.steps):
+            record.add(time_step, action)
+            into_strip = arguments.strip is not None and done in in_strip
+            into_video = video and (time_step.first() or not watched)
+            if not (into_video or into_strip):
+                continue
+            image = picture()
+            if into_video:
+                video.add(image)
+            if into_strip:
+                in_strip.discard(done)  # the start that follows an end has the same number
+                pictures.append(image)
+    if arguments.strip is not None:
+        rendering.film_strip(pictures, arguments.strip, arguments.columns)
+    if arguments.trajectory is not None:
+        with files.replacing(arguments.trajectory) as part:
+            np.savez_compressed(
+                part, **record.arrays(), seed=arguments.seed, id=suite.find(arguments.id).id
+            )
+    print(record.summary())
+    for path in (arguments.video, arguments.strip, arguments.trajectory):
+        if path is not None:
+            print(path)
+
+
+def _run(
+    environment: Environment, policy: rendering.Policy, steps: int
+) -> Iterator[tuple[int, dm_env.TimeStep, np.ndarray]]:
+    """Yields steps done, every time step, and the action taken from it: zeros where none is."""
+    import tqdm  # dm_control brings it
+
+    from trl_suite.evaluation import PROGRESS_DELAY
+
+    none = np.zeros(len(environment.action_map))
+    time_step, done = environment.reset(), 0
+    # disable=None: no bar where stderr is not a terminal.
+    with tqdm.tqdm(total=steps, delay=PROGRESS_DELAY, disable=None, unit='step') as bar:
+        while True:
+            action = none if done == steps or time_step.last() else policy(time_step)
+            yield done, time_step, action
+            if done == steps:
+                return
+            if time_step.last():
+                time_step = environment.reset()
+            else:
+                time_step = environment.step(action)
+                done += 1
+                bar.update()
+
+
+class _Record:
+    """What a rollout leaves behind: a row per time step, and an entry per episode."""
+
+    def __init__(self, environment: Environment) -> None:
+        self._environment = environment
+        self._rows: list[tuple[Any, ...]] = []
+        self._episodes: list[dict[str, Any]] = []
+
+    def add(self, time_step: dm_env.TimeStep, action: np.ndarray) -> None:
+        environment = self._environment
+        first = time_step.first()
+        self._rows.append((
+            np.concatenate([np.ravel(part) for part in time_step.observation.values()]), action,
+            0.0 if first else time_step.reward, 1.0 if first else time_step.discount,
+            int(time_step.step_type), environment.physics.data.qpos.copy(),
+        ))  # fmt: skip
+        if first:
+            self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'goes on'})
+            return
+        episode, info = self._episodes[-1], environment.info
+        episode['steps'] += 1
+        episode['return'] += time_step.reward
+        episode['distance'] = info.get('distance', 0.0)
+        if time_step.last():
+            cut = 'was cut' if time_step.discount else 'failed'
+            episode['end'] = next((end for end in _ENDS if info.get(end)), cut)
+
+    def arrays(self) -> dict[str, Any]:
+        """The rows as arrays; actions[i] was taken from observations[i], if step i had any."""
+        names = ('observations', 'actions', 'rewards', 'discounts', 'step_types', 'qpos')
+        return {
+            name: np.array(column)
+            for name, column in zip(names, zip(*self._rows, strict=True), strict=True)
+        }
+
+    def summary(self) -> str:
+        shown = self._episodes[:SHOWN_EPISODES]
+        lines = [
+            tables.table(
+                ('episode', 'steps', 'return', 'distance (m)', 'end'),
+                (
+                    (i, e['steps'], f'{e["return"]:.2f}', f'{e["distance"]:.2f}', e['end'])
+                    for i, e in enumerate(shown, 1)
+                ),
+                indent='',
+            )
+        ]
+        if len(self._episodes) > len(shown):
+            lines.append(f'... and {len(self._episodes) - len(shown)} more')
+        steps, total, distance = (
+            sum(e[name] for e in self._episodes) for name in ('steps', 'return', 'distance')
+        )
+        count = len(self._episodes)
+        lines.append(
+            f'{steps} steps in {count} episode{"" if count == 1 else "s"}: return {total:.2f}, '
+            f'{total / steps:.3f} per step; {distance:.2f} m'
+        )
+        return '\n'.join(lines)

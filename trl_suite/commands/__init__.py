@@ -1,1 +1,0 @@
-"""The commands of `trl-suite`, one module each; and what several of them need."""

@@ -1,0 +1,1 @@
+"""Tasks as environments: one with dm_env time steps, or many that step together."""

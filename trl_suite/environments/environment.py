@@ -1,0 +1,257 @@
+"""A single environment: dm_env timesteps, fused substeps, save and restore, pickling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_control import composer
+from dm_control.composer import observation as composer_observation
+from dm_env import specs
+
+from trl_suite.tasks.task import Task
+
+FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
+_SUBSTEP_HOOKS = ('before_substep', 'after_substep')
+_NO_SUBSTEPS = 'substeps run fused in C; use a plain composer.Environment with this task'
+
+
+class Environment(composer.Environment):
+    """`composer.Environment` with all substeps of a control step in one call.
+
+    What differs from composer: substeps run in C (`before_substep` and `after_substep` hooks are
+    refused), observation blocks bypass the observation updater, divergence ends the episode instead
+    of raising, and the full state can be saved and restored.
+
+    `TimeStep.discount` is 0 where the task failed and 1 where the step or time limit cut the
+    episode, as dm_env has it.
+    """
+
+    _task: Task
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        step_limit: int | None = None,
+        time_limit: float = float('inf'),
+        random: int | Sequence[int] | np.random.RandomState | None = None,
+        flat_observation: bool = False,
+    ) -> None:
+        """Compiles the task.
+
+        Args:
+          task: a task that nothing else uses.
+          step_limit: control steps after which an episode is cut.
+          time_limit: simulated time in s after which an episode is cut.
+          random: seed; drawn from the system if None.
+          flat_observation: give one vector, all blocks side by side, under the key 'observations'.
+
+        Raises:
+          ValueError: a limit that is not positive, a bad seed, or substep hooks.
+          TypeError: a seed that is no integer.
+        """
+        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
+            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
+        if not time_limit > 0:
+            raise ValueError(f'time_limit is {time_limit}; expected a positive number of seconds')
+        if isinstance(random, (float, str, bytes)):
+            raise TypeError(f'random is {random!r}; expected a seed, an integer in [0, 2**32)')
+        if isinstance(random, int) and not 0 <= random < 2**32:
+            raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
+        self._flat_observation = flat_observation
+        self._step_limit = step_limit
+        self._steps = 0
+        self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
+        super().__init__(
+            task,
+            time_limit=time_limit,
+            random_state=random,
+            strip_singleton_obs_buffer_dim=True,
+            recompile_mjcf_every_episode=False,
+        )
+        # The constructor has compiled already; composer would do it again at the first reset.
+        self._mjcf_never_compiled = False
+        self._parts = tuple(task.blocks.items())
+        # Whether anything but the task has hooks around a step; asking them each time takes longer.
+        self._hooked = bool(
+            self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
+        )
+        for name in _SUBSTEP_HOOKS:
+            hook = getattr(self._hooks, f'_{name}')
+            overridden = getattr(type(task), name) is not getattr(composer.Task, name)
+            if hook.entity_hooks or overridden:
+                raise ValueError(f'the task or an entity in it has a {name} hook: {_NO_SUBSTEPS}')
+
+    def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
+        if hook_name in _SUBSTEP_HOOKS:
+            raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
+        super().add_extra_hook(hook_name, hook_callable)
+        self._hooked = True
+
+    def _make_observation_updater(self) -> composer_observation.Updater:
+        # One substep: the updater must see a control step as a single update.
+        self._extra_observables = [
+            name
+            for name, item in self._task.observables.items()
+            if item.enabled and name not in self._task.blocks
+        ]
+        return composer_observation.Updater(self._task.observables, 1, True, False)
+
+    def reset(self) -> dm_env.TimeStep:
+        """Begins an episode.
+
+        Raises:
+          RuntimeError: after `close`.
+        """
+        self._check_open()
+        self._steps = 0
+        self._reset_next_step = False
+        self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+        if self._extra_observables:
+            self._observation_updater.reset(self._physics_proxy, self._random_state)
+        return dm_env.restart(self._observe())
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Takes one action.
+
+        Args:
+          action: numbers in [-1, 1] (clipped there), shape of `action_spec()`.
+
+        Raises:
+          ValueError: an action of another shape, or with NaN or infinity.
+          RuntimeError: after `close`.
+        """
+        self._check_open()
+        action = self._task.action_map.checked(action)
+        if self._reset_next_step:
+            return self.reset()
+        task, physics = self._task, self._physics_proxy
+        if self._extra_observables:
+            self._observation_updater.prepare_for_next_control_step()
+        if self._hooked:
+            self._hooks.before_step(physics, action, self._random_state)
+            task.simulate(task.world.all_ids)
+            self._hooks.after_step(physics, self._random_state)
+        else:
+            task.step(action[None], task.world.all_ids)
+        self._steps += 1
+        if self._extra_observables:
+            self._observation_updater.update()
+        observation = self._observe()
+        failed = bool(task.failed[0])
+        self._reset_next_step = (
+            failed
+            or (self._step_limit is not None and self._steps >= self._step_limit)
+            or (self._time_limit < np.inf and self._physics.time() >= self._time_limit)
+        )
+        step_type = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
+        return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
+
+    def close(self) -> None:
+        """Frees the simulation; may be called twice."""
+        if self._physics is not None:
+            super().close()
+
+    def _check_open(self) -> None:
+        if self._physics is None:
+            raise RuntimeError('the environment is closed')
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        row = self._task.observation[0].copy()
+        if self._flat_observation:
+            observation = {FLAT_OBSERVATION_KEY: row}
+        else:
+            observation = {name: row[part] for name, part in self._parts}
+        if self._extra_observables:
+            updated = self._observation_updater.get_observation()
+            extra = {name: np.asarray(updated[name], float) for name in self._extra_observables}
+            if self._flat_observation:
+                parts = [row, *(value.ravel() for value in extra.values())]
+                observation[FLAT_OBSERVATION_KEY] = np.concatenate(parts)
+            else:
+                observation.update(extra)
+        return observation
+
+    def observation_spec(self) -> dict[str, specs.Array]:
+        return {
+            name: specs.Array(value.shape, value.dtype, name)
+            for name, value in self._observe().items()
+        }
+
+    def reward_spec(self) -> specs.Array:
+        return specs.Array((), float, 'reward')
+
+    def discount_spec(self) -> specs.BoundedArray:
+        return specs.BoundedArray((), float, 0.0, 1.0, 'discount')
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """Where each observation block lies in the flat vector."""
+        return dict(self._task.blocks)
+
+    @property
+    def action_map(self) -> Any:
+        """The map from actions to physical units (`trl_suite.actuation.action_map.ActionMap`)."""
+        return self._task.action_map
+
+    @property
+    def step_limit(self) -> int | None:
+        return self._step_limit
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What happened in the last step beyond the time step: see the task's `info_arrays`."""
+        return self._task.info_of(0)
+
+    # State.
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns everything that the future depends on: physics, task, terrain, randomness.
+
+        The dict holds arrays and plain values; it can be pickled and set on any environment built
+        in the same way.
+        """
+        return {
+            'made_for': self._task.signature,
+            'world': self._task.world.get_state(0),
+            'task': self._task.get_state(0),
+            'random': self._random_state.get_state(),
+            'steps': self._steps,
+            'reset_next_step': self._reset_next_step,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restores what `get_state` returned; the future then repeats bit for bit.
+
+        Raises:
+          ValueError: the state belongs to another environment; this one is left as it was.
+        """
+        expected, found = self._task.signature, state.get('made_for')
+        if found != expected:
+            raise ValueError(f'the state belongs to {found}; this environment is {expected}')
+        self._task.set_state(0, state['task'])
+        self._task.world.set_state(0, state['world'])
+        self._random_state.set_state(state['random'])
+        self._steps = state['steps']
+        self._reset_next_step = state['reset_next_step']
+        if self._extra_observables:
+            self._observation_updater.reset(self._physics_proxy, self._random_state)
+
+    def observation(self) -> dict[str, np.ndarray]:
+        """Returns the observation of the current state, e.g. after `set_state`."""
+        return self._observe()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.recipe is None:
+            raise TypeError(
+                'this environment was not made by trl_suite.suite, so nothing tells how to build '
+                'it again; pickle env.get_state() instead'
+            )
+        build, arguments = self.recipe
+        return build, arguments, self.get_state()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.set_state(state)

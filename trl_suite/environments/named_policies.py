@@ -1,0 +1,99 @@
+"""Policies for a single environment, by name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite import policies
+from trl_suite.registry import catalogue
+from trl_suite.util import errors
+
+if TYPE_CHECKING:
+    import dm_env
+
+    from trl_suite.environments.environment import Environment
+    from trl_suite.rendering import Policy
+
+POLICIES = ('reference', 'clip', 'scripted', 'zero', 'random')  # or a file
+
+
+def check(name: str) -> str:
+    """Returns the name of a policy, one of `POLICIES` or a file.
+
+    Raises:
+      ValueError: neither; the message has the closest matches.
+    """
+    if name not in POLICIES and not name.endswith('.npz'):
+        raise ValueError(errors.unknown('policy', name, (*POLICIES, 'FILE.npz')))
+    return name
+
+
+def trained(name: str, id: str) -> policies.Policy:
+    """Returns the policy shipped for an environment, 'reference', or one from a file.
+
+    Args:
+      name: 'reference', or an .npz file.
+      id: of the environment, or an alias.
+    """
+    if name == 'reference':
+        return policies.reference(catalogue.find(id).id)
+    return policies.load(name)
+
+
+def policy(name: str, environment: Environment, id: str, seed: int = 0) -> Policy:
+    """Makes a policy for an environment.
+
+    Args:
+      name: one of `POLICIES`, or an .npz file.
+      environment: which it acts in.
+      id: of the environment, or an alias.
+      seed: of 'random'.
+
+    Returns:
+      A function from time steps to actions in [-1, 1].
+
+    Raises:
+      ValueError: the environment has no such policy, or the policy does not fit.
+      FileNotFoundError: there is no such file, or no reference is shipped.
+    """
+    size = len(environment.action_map)
+    if name == 'zero':
+        return lambda time_step: np.zeros(size)
+    if name == 'random':
+        generator = np.random.default_rng(seed)
+        return lambda time_step: generator.uniform(-1, 1, size)
+    if name == 'scripted':
+        from trl_suite.tasks.navigation.scripted import scripted
+
+        walk = scripted(environment)
+
+        def act(time_step: dm_env.TimeStep) -> np.ndarray:
+            return walk(np.concatenate(list(time_step.observation.values()))[None])[0]
+
+        return act
+    if name != 'clip':
+        network = trained(check(name), id)
+        network.check(environment)
+        return lambda time_step: network(time_step.observation)
+    task: Any = environment.task
+    if not hasattr(task, 'clip_action'):
+        raise ValueError(f'{id} has no clip to follow')
+    return lambda time_step: np.clip(task.clip_action(0), -1, 1)
+
+
+def best(environment: Environment, id: str) -> tuple[str, Policy]:
+    """Returns name and policy of the first that an environment has: the order of `POLICIES`.
+
+    What cannot act in its first state, as a clip cannot where torques act, does not count.
+    """
+    time_step = environment.reset()
+    for name in POLICIES:
+        try:
+            found = policy(name, environment, id)
+            found(time_step)
+            return name, found
+        except (ValueError, FileNotFoundError):
+            continue
+    raise AssertionError('the zero policy always acts')

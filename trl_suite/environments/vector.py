@@ -1,0 +1,425 @@
+"""Many simulations of one environment on threads, each on a terrain of its own, as arrays.
+
+    environments = VectorEnvironment('PD_Biped2D_Gaps_Terrain-v0', num_envs=64, seed=1)
+    observation = environments.reset()
+    step = environments.step(actions)  # (64, 11) in [-1, 1]
+
+Simulation i behaves, bit for bit, as the single environment whose seed is `environments.seeds[i]`,
+whatever the number of simulations and threads, and whenever simulations are reset.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from trl_suite import rendering
+from trl_suite.engine import BatchWorld, light_model
+from trl_suite.environments.environment import Environment
+from trl_suite.registry.build import build_task
+from trl_suite.registry.catalogue import EnvSpec, find
+from trl_suite.tasks.task import Task
+from trl_suite.util import errors
+
+AUTORESET = ('next_step', 'same_step', 'disabled')
+
+
+class Step(NamedTuple):
+    """What one step of all simulations returned.
+
+    Attributes:
+      observation: (n, size), or a dict of blocks (n, ...) in order.
+      reward: (n,).
+      terminated: simulations that failed, (n,) bool.
+      truncated: simulations that were cut by the step or time limit, (n,) bool.
+      info: arrays of n simulations: 'fell', 'diverged', 'distance', 'reward_terms' (a dict), and with
+        autoreset 'same_step' 'final_observation' where 'ended' says so.
+    """
+
+    observation: Any
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    info: dict[str, Any]
+
+
+class VectorEnvironment:
+    """n simulations of one environment.
+
+    Autoreset is what Gymnasium 1 calls so. With 'next_step' a simulation that has ended ignores its action
+    in the next step and returns the first observation of a new episode with reward 0. With
+    'same_step' it begins anew in the step in which it ended; the observation is then the new
+    episode's, and the last one is in `info['final_observation']`. With 'disabled' the caller resets
+    simulations; stepping an ended simulation raises.
+
+    Attributes:
+      num_envs: number of simulations n.
+      seeds: seed of each simulation, (n,) uint32.
+      blocks: where each observation block lies in the flat vector.
+      action_map: what actions mean.
+      control_timestep: duration of a step, s.
+    """
+
+    def __init__(
+        self,
+        environment: str | EnvSpec,
+        num_envs: int,
+        num_threads: int = 0,
+        seed: int | Sequence[int] | None = None,
+        *,
+        autoreset: str = 'next_step',
+        dtype: DTypeLike = np.float64,
+        flat_observation: bool = True,
+        step_limit: int | None = -1,
+        task_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Compiles one light model and makes n simulations of it.
+
+        Args:
+          environment: id, alias, or row of the catalogue.
+          num_envs: number of simulations.
+          num_threads: threads that step the physics; 0 takes all cores.
+          seed: of the whole: simulation i gets the i-th number that
+            `numpy.random.SeedSequence(seed).generate_state(n)` gives. Or a sequence of n seeds, one
+            per simulation. Drawn from the system if None.
+          autoreset: one of `AUTORESET`.
+          dtype: of observations and rewards, float64 or float32.
+          flat_observation: give one array of all blocks side by side, else a dict of blocks.
+          step_limit: control steps after which an episode is cut; by default the simulation's own.
+          task_kwargs: as for `suite.load`, `time_limit` (s) and `step_limit` included, which goes
+            before the argument above; the seed is an argument here, not an option.
+
+        Raises:
+          ValueError: unknown names or options, or numbers out of range.
+        """
+        if int(num_envs) != num_envs or num_envs < 1:
+            raise ValueError(f'num_envs is {num_envs}; expected a positive integer')
+        if int(num_threads) != num_threads or num_threads < 0:
+            raise ValueError(f'num_threads is {num_threads}; expected 0 or a positive integer')
+        if autoreset not in AUTORESET:
+            raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
+        if np.dtype(dtype) not in (np.dtype(np.float64), np.dtype(np.float32)):
+            raise ValueError(f'dtype is {np.dtype(dtype)}; expected float64 or float32')
+        self.spec = find(environment) if isinstance(environment, str) else environment
+        self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
+        self.flat_observation = flat_observation
+        self._task_kwargs = options = dict(task_kwargs or {})
+        if 'random' in options:
+            raise ValueError("task_kwargs has 'random'; here the argument `seed` takes its place")
+        own = self.spec.step_limit if step_limit == -1 else step_limit
+        self.step_limit = step_limit = options.pop('step_limit', own)
+        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
+            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
+        self.time_limit: float = options.pop('time_limit', float('inf'))
+        if not self.time_limit > 0:
+            raise ValueError(
+                f'time_limit is {self.time_limit}; expected a positive number of seconds'
+            )
+        self._num_threads = int(num_threads)
+        self._task = build_task(self.spec, self._task_kwargs)
+        model = light_model(self._task.root_entity.mjcf_model)
+        self._world: BatchWorld | None = BatchWorld(
+            model, self.num_envs, self._num_threads, self._task.fields
+        )
+        self._task.bind(self._world)
+        self._pid = os.getpid()
+        self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
+        self.control_timestep: float = self._task.control_timestep
+        self._steps = np.zeros(self.num_envs, int)
+        self._ended = np.ones(self.num_envs, bool)  # simulations that need a reset
+        self._fresh = True  # whether no simulation was ever reset
+        self._picture: Environment | None = None
+        self.seeds = np.zeros(self.num_envs, np.uint32)
+        self._random = [np.random.RandomState(0)] * self.num_envs
+        self.seed(seed)
+
+    def seed(
+        self,
+        seed: int | Sequence[int] | None,
+        env_ids: np.ndarray | Sequence[int] | None = None,
+    ) -> None:
+        """Gives some simulations, or all, new streams of random numbers, from which resets draw.
+
+        Args:
+          seed: of all n simulations, as the constructor takes it.
+          env_ids: simulations that get theirs; numbers, or a mask (n,) bool; None for all.
+        """
+        if seed is None or np.ndim(seed) == 0:
+            sequence = np.random.SeedSequence(seed)  # type: ignore[arg-type]
+            seeds = sequence.generate_state(self.num_envs, np.uint32)
+        else:
+            seeds = np.asarray(seed)
+            if seeds.shape != (self.num_envs,):
+                raise ValueError(f'{seeds.size} seeds for {self.num_envs} simulations')
+            if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
+                raise ValueError('seeds must be integers in [0, 2**32)')
+        for env_id in self._numbers(env_ids).tolist():
+            self.seeds[env_id] = seeds[env_id]
+            self._random[env_id] = np.random.RandomState(int(seeds[env_id]))
+
+    def reset(
+        self,
+        env_ids: np.ndarray | Sequence[int] | None = None,
+        seed: int | Sequence[int] | None = None,
+    ) -> Any:
+        """Begins an episode in some simulations, or in all, without touching the others.
+
+        Args:
+          env_ids: numbers of simulations, or a mask (n,) bool; None for all.
+          seed: also seed these simulations anew, as the constructor does: as part of a seed of all n.
+
+        Returns:
+          The observations of all simulations.
+        """
+        self._check_usable()
+        numbers = self._numbers(env_ids)
+        if self._fresh and len(numbers) < self.num_envs:
+            raise ValueError('the first reset must be of all simulations')
+        if seed is not None:
+            self.seed(seed, numbers)
+        self._fresh = False
+        self.share(self.begin, numbers)
+        return self._observation()
+
+    def step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None = None) -> Step:
+        """Takes one step in every simulation, or in some.
+
+        Args:
+          action: (n, k) in [-1, 1], clipped there.
+          env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others do not move; their
+            reward and its terms are 0, and all else in `info` is of their last step.
+
+        Raises:
+          ValueError: an action of another shape, or with NaN or infinity; the simulation is named.
+          RuntimeError: before the first reset, after `close`, in a forked process, or with autoreset
+            'disabled' for a simulation that has ended.
+        """
+        self._check_usable()
+        if self._fresh:
+            raise RuntimeError('step before the first reset')
+        action = self.action_map.checked(action, self.num_envs)
+        task, world, ended = self._task, self._world, self._ended
+        assert world is not None
+        asked = world.all_ids if env_ids is None else self._numbers(env_ids)
+        resetting, env_ids = asked[ended[asked]], asked[~ended[asked]]
+        if len(resetting) and self.autoreset == 'disabled':
+            raise RuntimeError(
+                f'simulation {resetting[0]} has ended; reset it, or choose another autoreset'
+            )
+
+        def work(part: np.ndarray) -> None:
+            over = np.isin(part, resetting)
+            self.begin(part[over])
+            task.step(action, part[~over])
+            # A slice of neighbours is copied faster than a choice of simulations.
+            near = len(part) and part[-1] - part[0] == len(part) - 1
+            env_ids = slice(part[0], part[-1] + 1) if near else part
+            observation[env_ids] = task.observation[env_ids]
+
+        observation = np.empty(task.observation.shape, self.dtype)
+        self.share(work, asked)
+        self._steps[env_ids] += 1
+        reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
+        if len(env_ids) < self.num_envs:
+            resting = np.ones(self.num_envs, bool)
+            resting[env_ids] = False
+            for each in (reward, terminated, *info.get('reward_terms', {}).values()):
+                each[resting] = 0
+        truncated = np.zeros(self.num_envs, bool)
+        if self.step_limit is not None:
+            truncated[asked] = self._steps[asked] >= self.step_limit
+        if self.time_limit < np.inf:
+            truncated[asked] |= world.time[asked] >= self.time_limit
+        truncated &= ~terminated
+        ended[asked] = terminated[asked] | truncated[asked]
+        if self.autoreset == 'same_step':
+            info['ended'] = ended.copy()
+            if ended.any():
+                info['final_observation'] = self._observation()
+                self.share(self.begin, ended.nonzero()[0])
+                observation = task.observation.astype(self.dtype)
+        if len(asked) < self.num_envs:
+            observation = task.observation.astype(self.dtype)
+        reward = reward.astype(self.dtype, copy=False)
+        return Step(self._parts(observation), reward, terminated, truncated, info)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What happened in each simulation's last step, or its reset: see the task's `info`."""
+        self._check_usable()
+        return self._task.info()
+
+    def render(self, env_id: int = 0, **options: Any) -> np.ndarray:
+        """Draws one simulation; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
+        self._check_usable()
+        assert self._world is not None
+        if self._picture is None:  # the batch's models have no pictures in them
+            self._picture = Environment(build_task(self.spec, self._task_kwargs))
+            self._picture.reset()
+        self._picture.task.set_state(0, self._task.get_state(env_id))
+        self._picture.task.world.set_state(0, self._world.get_state(env_id))
+        return rendering.frame(self._picture, **options)
+
+    @property
+    def task(self) -> Task:
+        """The rules, with arrays of n simulations."""
+        self._check_usable()
+        return self._task
+
+    def close(self) -> None:
+        """Frees the simulations; may be called twice."""
+        if self._world is not None and os.getpid() == self._pid:
+            self._world.close()
+        self._world = None
+        self._task = None  # type: ignore[assignment]
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def get_state(self, env_ids: Sequence[int] | None = None) -> dict[str, Any]:
+        """Returns everything that the future of some simulations, or of all, depends on.
+
+        Args:
+          env_ids: numbers of m simulations; None for all.
+        """
+        self._check_usable()
+        assert self._world is not None
+        env_ids = list(range(self.num_envs) if env_ids is None else env_ids)
+        self._numbers(env_ids)
+        return {
+            'world': [self._world.get_state(env_id) for env_id in env_ids],
+            'task': [self._task.get_state(env_id) for env_id in env_ids],
+            'random': [self._random[env_id].get_state() for env_id in env_ids],
+            'seeds': self.seeds[env_ids],
+            'steps': self._steps[env_ids],
+            'ended': self._ended[env_ids],
+            'fresh': self._fresh,
+        }
+
+    def set_state(self, state: dict[str, Any], env_ids: Sequence[int] | None = None) -> None:
+        """Restores what `get_state` of an environment of the same id and options returned.
+
+        Args:
+          state: of m simulations.
+          env_ids: numbers of the m simulations that go on from it, each named once; None for all.
+
+        Raises:
+          ValueError: the state has another number of simulations, or there are no such simulations.
+          RuntimeError: some simulations are restored before the first reset.
+        """
+        self._check_usable()
+        assert self._world is not None
+        if env_ids is not None and self._fresh:
+            raise RuntimeError('set_state of some simulations before the first reset')
+        numbers = list(range(self.num_envs) if env_ids is None else env_ids)
+        if len(state['world']) != len(numbers):
+            raise ValueError(
+                f'the state has {len(state["world"])} simulations; expected {len(numbers)}'
+            )
+        if len(self._numbers(numbers)) != len(numbers):
+            raise ValueError(
+                f'simulations {numbers}; expected each of {len(numbers)} simulations once'
+            )
+        for i, env_id in enumerate(numbers):
+            self._task.set_state(env_id, state['task'][i])
+            self._world.set_state(env_id, state['world'][i])
+            self._random[env_id].set_state(state['random'][i])
+        self.seeds[numbers] = state['seeds']
+        self._steps[numbers], self._ended[numbers] = state['steps'], state['ended']
+        if env_ids is None:
+            self._fresh = state['fresh']
+
+    def copy_from(
+        self, other: VectorEnvironment, other_rows: Sequence[int], env_ids: Sequence[int]
+    ) -> None:
+        """Puts some simulations where simulations of another environment are, to try what would come of an action.
+
+        Random numbers and seeds stay: the simulations share the present, and the future as far as nothing is
+        drawn.
+
+        Args:
+          other: environment of the same id and options.
+          other_rows: numbers of its simulations.
+          env_ids: as many simulations of this one; each may be named once.
+
+        Raises:
+          ValueError: another environment, or as many simulations do not exist.
+          RuntimeError: one of the two was never reset.
+        """
+        self._check_usable()
+        other._check_usable()
+        if self._fresh or other._fresh:
+            raise RuntimeError('copy_from before the first reset')
+        assert self._world is not None and other._world is not None
+        if other.spec != self.spec or other._task_kwargs != self._task_kwargs:
+            raise ValueError(
+                f'simulations of {other.spec.id} cannot go on in {self.spec.id} as it is here'
+            )
+        if len(other_rows) != len(env_ids) or len(self._numbers(env_ids)) != len(env_ids):
+            raise ValueError(
+                f'{len(other_rows)} simulations to put into simulations {list(env_ids)}'
+            )
+        other._numbers(other_rows)
+        for source, env_id in zip(other_rows, env_ids, strict=True):
+            self._task.set_state(env_id, other._task.get_state(source))
+            self._world.set_state(env_id, other._world.get_state(source))
+            self._steps[env_id], self._ended[env_id] = other._steps[source], other._ended[source]
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError(
+            'a live batch cannot be pickled; pickle what made it (id, num_envs, seed) and '
+            'get_state(), and build it again where it is needed'
+        )
+
+    def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
+        """Has the threads do some work, each for a part of the simulations."""
+        assert self._world is not None
+        if self._task.in_parts:
+            self._world.share(work, env_ids)
+        else:
+            work(env_ids)
+
+    def begin(self, env_ids: np.ndarray) -> None:
+        """Begins episodes in some simulations; `reset` checks its arguments and observes as well."""
+        if not len(env_ids):
+            return
+        self._task.reset(env_ids, [self._random[env_id] for env_id in env_ids.tolist()])
+        self._steps[env_ids] = 0
+        self._ended[env_ids] = False
+
+    def _observation(self) -> Any:
+        return self._parts(self._task.observation.astype(self.dtype))
+
+    def _parts(self, flat: np.ndarray) -> Any:
+        """Returns observations (n, size) as they are given: one array, or a dict of blocks."""
+        if self.flat_observation:
+            return flat
+        return {name: flat[:, part] for name, part in self.blocks.items()}
+
+    def _numbers(self, env_ids: np.ndarray | Sequence[int] | None) -> np.ndarray:
+        if env_ids is None:
+            return np.arange(self.num_envs)
+        env_ids = np.asarray(env_ids)
+        if env_ids.dtype == bool:
+            if env_ids.shape != (self.num_envs,):
+                raise ValueError(f'a mask of shape {env_ids.shape}; expected ({self.num_envs},)')
+            return np.flatnonzero(env_ids)
+        numbers = np.unique(env_ids.astype(int))
+        if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < self.num_envs):
+            raise ValueError(
+                f'simulations {env_ids.tolist()} of an environment of {self.num_envs} simulations'
+            )
+        return numbers
+
+    def _check_usable(self) -> None:
+        if self._world is None:
+            raise RuntimeError('the environment is closed')
+        if os.getpid() != self._pid:
+            raise RuntimeError(
+                'a vector environment does not survive a fork: its threads stay in the parent. Make '
+                "it in the child, or start processes with multiprocessing's 'spawn'"
+            )

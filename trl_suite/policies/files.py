@@ -1,0 +1,281 @@
+"""Trained policies as data: a small network in one .npz file, run with NumPy alone.
+
+    from trl_suite import policies, suite
+
+    policy = policies.reference('PD_Biped2D_Gaps_Terrain-v0')  # shipped with the suite
+    environment = suite.make(policy.id, task_kwargs={'random': 1})
+    policy.check(environment)
+    time_step = environment.reset()
+    while not time_step.last():
+        time_step = environment.step(policy(time_step.observation))
+
+A file holds these arrays and no pickled objects (U is text, a the number of actions, k the number
+of observations, L the number of layers, c the number of inputs of the network: k, unless there are
+`places` or `columns`):
+
+    format       U ()        'trl_suite policy'
+    version      int ()      1
+    id           U ()        environment in which the policy was trained
+    block_names  U (B,)      observation blocks in order
+    block_sizes  int (B,)    numbers in each; they sum to k
+    actions      U (a,)      names of the actions in order
+    quantity     U ()        what an action sets, e.g. 'target angle'
+    mean, std    float (c,)  normalisation: (observation - mean) / std
+    clip         float ()    bound of the normalised observation
+    activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
+    layers       int ()      L
+    weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
+    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b
+    log_std      float (a,)  logarithm of the exploration noise's standard deviation
+    info         U ()        a JSON object: how the policy was made
+
+and, if the policy sees left stance as right stance in a mirror (see `trl_suite.policies.mirror`):
+
+    mirror_phase              int ()    column of the phase; or
+    mirror_feet               int (2,)  columns of how far ahead the right and the left foot are
+    mirror_observation_index  int (k,)  what stands where in a reflected observation
+    mirror_observation_sign   float (k,)
+    mirror_action_index       int (a,)
+    mirror_action_sign        float (a,)
+
+and, if the network sees p places that are observed as bearing and distance in a straight line, too:
+
+    places       int (p, 2)  columns of the bearing, rad, and of the distance, m, after any mirror;
+                             `placed` has what it sees of them, after all else
+
+and, if the network sees only a part of it, say of a map of the terrain what is near:
+
+    columns      int (c,)    of the observation, after any mirror and with the 2p numbers of places
+
+and, if it chooses among b actions instead of composing one, as mixtures of experts do:
+
+    choices      float (b, a)  the action is the simulation whose output is the largest
+
+and, if the first l of its inputs are a line, say of ground heights, that goes through C convolutions
+before the other c - l inputs join what comes out, position by position:
+
+    line           int ()    l
+    strides        int (C,)  of each layer
+    filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters); channel 0 of the
+                             first is the line; window (positions, channels) @ filter
+    filter_bias_0  float     (filters,); the activation is that of the hidden layers
+    origin         int ()    optional: number of the input that is subtracted from each of the line
+                             before the normalisation, as the height of the root is
+
+and, if what the hidden layers sum up is brought to mean 0 and standard deviation 1 (over the layer's
+outputs, with 1e-5 added to the variance) before the activation:
+
+    layer_norm   int ()      1
+
+Floats are written as float32, or as float16 where nothing is lost by it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+import json
+import os
+from typing import Any
+
+import numpy as np
+
+from trl_suite.policies.mirror import Mirror
+from trl_suite.policies.network import Convolution, Policy
+from trl_suite.util import resources
+from trl_suite.util.files import check_path, existing, replacing
+
+FORMAT = 'trl_suite policy'
+VERSION = 1
+# Key in the file -> kinds of dtype, number of axes.
+_FIELDS = {
+    'format': ('U', 0), 'version': ('iu', 0), 'id': ('U', 0), 'block_names': ('U', 1),
+    'block_sizes': ('iu', 1), 'actions': ('U', 1), 'quantity': ('U', 0), 'mean': ('f', 1), 'std': ('f', 1),
+    'clip': ('f', 0), 'activation': ('U', 0), 'layers': ('iu', 0), 'log_std': ('f', 1),
+    'info': ('U', 0),
+}  # fmt: skip
+_MIRROR = {
+    'observation_index': ('iu', 1), 'observation_sign': ('f', 1),
+    'action_index': ('iu', 1), 'action_sign': ('f', 1),
+}  # fmt: skip
+_SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
+_OPTIONAL = {'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2)}
+_LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
+
+
+def save(policy: Policy, path: str | os.PathLike[str]) -> None:
+    """Writes a policy as .npz; an old file stays until the new one is whole.
+
+    Raises:
+      ValueError: another suffix.
+      OSError: the file cannot be written.
+    """
+    fields: dict[str, Any] = {
+        'format': FORMAT,
+        'version': VERSION,
+        'id': policy.id,
+        'block_names': [name for name, _ in policy.blocks],
+        'block_sizes': [size for _, size in policy.blocks],
+        'actions': policy.actions,
+        'quantity': policy.quantity,
+        'mean': policy.mean,
+        'std': policy.std,
+        'clip': np.float32(policy.clip),
+        'activation': policy.activation,
+        'layers': len(policy.weights),
+        'log_std': policy.log_std,
+        'info': json.dumps(policy.info),
+    }
+    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        fields[f'weight_{i}'], fields[f'bias_{i}'] = weight, bias
+    if policy.mirror is not None:
+        side = 'phase' if policy.mirror.feet is None else 'feet'
+        for name, (kind, _) in {**_MIRROR, side: _SIDES[side]}.items():
+            value = np.asarray(getattr(policy.mirror, name))
+            fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
+    if policy.convolution is not None:
+        fields |= {name: getattr(policy.convolution, name) for name in _LINE}
+        if policy.convolution.origin is not None:
+            fields['origin'] = policy.convolution.origin
+        layers = zip(policy.convolution.weights, policy.convolution.biases, strict=True)
+        for i, (weight, bias) in enumerate(layers):
+            fields[f'filter_{i}'], fields[f'filter_bias_{i}'] = weight, bias
+    if policy.layer_norm:
+        fields['layer_norm'] = 1
+    optional = {name: getattr(policy, name) for name in _OPTIONAL}
+    fields |= {name: value for name, value in optional.items() if value is not None}
+    with replacing(check_path(path, ('.npz',))) as part:
+        np.savez_compressed(
+            part, allow_pickle=False, **{name: _small(value) for name, value in fields.items()}
+        )
+
+
+def load(path: str | os.PathLike[str]) -> Policy:
+    """Reads a policy that `save` wrote.
+
+    Raises:
+      ValueError: a broken or malformed file; the message names file and field.
+      FileNotFoundError: there is no such file.
+    """
+    path = existing(path, ('.npz',))
+    content = io.BytesIO(path.read_bytes())
+    fields: dict[str, Any] = {}
+    read = _Reader()
+    try:
+        archive = np.load(content, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError('a single array')
+        read.archive = archive
+        for name, (kind, axes) in _FIELDS.items():
+            fields[name] = read(name, kind, axes).tolist()
+            if name == 'format' and fields[name] != FORMAT:
+                raise ValueError(f'is {fields[name]!r}; expected {FORMAT!r}')
+            if name == 'version' and fields[name] != VERSION:
+                raise ValueError(f'is {fields[name]}; expected {VERSION}')
+        weights, biases = read.layers('', fields['layers'], 2)
+        if any(name.startswith('mirror_') for name in archive.files):
+            side = 'feet' if 'mirror_feet' in archive else 'phase'
+            parts: dict[str, Any] = {}
+            for name, (kind, axes) in {**_MIRROR, side: _SIDES[side]}.items():
+                parts[name] = read(f'mirror_{name}', kind, axes)
+            fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
+        if any(name in archive for name in _LINE):
+            line = {name: read(name, *_LINE[name]).tolist() for name in _LINE}
+            if 'origin' in archive:
+                line['origin'] = read('origin', 'iu', 0).tolist()
+            filters = read.layers('filter', len(line['strides']), 3)
+            read.field = 'line'
+            fields['convolution'] = Convolution(weights=filters[0], biases=filters[1], **line)
+        if 'layer_norm' in archive:
+            fields['layer_norm'] = read('layer_norm', 'iu', 0).tolist()
+            if fields['layer_norm'] != 1:
+                raise ValueError(f'is {fields["layer_norm"]}; expected 1')
+        for name in _OPTIONAL.keys() & archive.files:
+            fields[name] = read(name, *_OPTIONAL[name])
+        read.field = 'info'
+        fields['info'] = json.loads(fields['info'])
+        for left in sorted({*archive.files} - read.taken):
+            read.field = left
+            if left.partition('_')[0] not in ('weight', 'bias'):
+                raise ValueError('is unknown')
+            read.field = 'layers'
+            raise ValueError(f'is {len(weights)}, and there are arrays of others')
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        where = f'field {read.field!r}' if read.field else 'no readable policy'
+        raise ValueError(f'{path}: {where}: {error}') from None
+    names, sizes = fields.pop('block_names'), fields.pop('block_sizes')
+    for name in ('format', 'version', 'layers'):
+        del fields[name]
+    try:
+        return Policy(
+            blocks=tuple(zip(names, sizes, strict=True)),
+            weights=weights,
+            biases=biases,
+            **fields,
+        )
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def reference(id: str) -> Policy:
+    """Returns the policy shipped for an environment.
+
+    Args:
+      id: id of the environment; `suite.reference_policy` takes aliases, too.
+
+    Raises:
+      FileNotFoundError: no policy is shipped for it; the message has the closest that have one.
+    """
+    shipped = available()
+    if id not in shipped:
+        near = difflib.get_close_matches(id, shipped, n=3, cutoff=0)
+        raise FileNotFoundError(
+            f'no policy is shipped for {id!r}; '
+            + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
+        )
+    path = resources.directory('trained') / f'{id}.npz'
+    policy = load(path)
+    if policy.id != id:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {id!r}")
+    return policy
+
+
+def available() -> tuple[str, ...]:
+    """Returns the ids of the environments that have a shipped policy, sorted."""
+    return tuple(sorted(path.stem for path in resources.directory('trained').glob('*.npz')))
+
+
+def _small(value: Any) -> Any:
+    """Returns an array in half precision, if nothing is lost by it."""
+    if not isinstance(value, np.ndarray) or value.dtype != np.float32:
+        return value
+    with np.errstate(over='ignore'):
+        half = value.astype(np.float16)
+    return half if np.array_equal(half, value) else value
+
+
+class _Reader:
+    """Takes arrays out of an archive, and knows which one it took last and which it took."""
+
+    def __init__(self) -> None:
+        self.archive: Any = {}
+        self.field = ''
+        self.taken: set[str] = set()
+
+    def __call__(self, field: str, kind: str, axes: int) -> np.ndarray:
+        self.field = field
+        self.taken.add(field)
+        if field not in self.archive:
+            raise ValueError('is missing')
+        array = self.archive[field]
+        if array.dtype.kind not in kind or array.ndim != axes:
+            raise ValueError(f'has type {array.dtype} and {array.ndim} axes')
+        return array
+
+    def layers(self, kind: str, count: int, axes: int) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Returns weights and biases of so many layers, of a kind other than fully connected."""
+        weight, bias = (kind, f'{kind}_bias') if kind else ('weight', 'bias')
+        found = [
+            (self(f'{weight}_{i}', 'f', axes), self(f'{bias}_{i}', 'f', 1)) for i in range(count)
+        ]
+        return tuple(part[0] for part in found), tuple(part[1] for part in found)

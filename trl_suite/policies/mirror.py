@@ -1,0 +1,113 @@
+"""Left for right: observations and actions of a walker in left stance as in right stance.
+
+Half of what a symmetric walker must learn is the other half seen in a mirror. `Mirror` is data: it
+reflects what a policy sees while the left foot stands, and reflects back what the policy answers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror:
+    """How an observation (n, size) and an action (n, k) look in a mirror.
+
+    Attributes:
+      observation_index, observation_sign: a reflected observation is `o[:, index] * sign`, and its
+        phase half a cycle less or more; (size,).
+      action_index, action_sign: a reflected action is `a[:, index] * sign`, (k,).
+      phase: the column that holds the phase of the cycle; from 0.5 on the left foot stands.
+      feet: if no column does, those of how far ahead the right foot and the left foot are: where a step
+        begins, the foot stands that is ahead.
+    """
+
+    observation_index: np.ndarray
+    observation_sign: np.ndarray
+    action_index: np.ndarray
+    action_sign: np.ndarray
+    phase: int | None = None
+    feet: tuple[int, int] | None = None
+
+    def check(self, observations: int, actions: int) -> None:
+        """Checks that this reflects observations and actions of so many numbers.
+
+        Raises:
+          ValueError: it does not; the message names the field.
+        """
+        for kind, size in (('observation', observations), ('action', actions)):
+            index, sign = getattr(self, f'{kind}_index'), getattr(self, f'{kind}_sign')
+            if not np.array_equal(np.sort(index), np.arange(size)):
+                raise ValueError(f'mirror_{kind}_index: expected each of 0 to {size - 1} once')
+            if np.shape(sign) != (size,) or not np.isin(sign, (-1, 1)).all():
+                raise ValueError(f'mirror_{kind}_sign: expected {size} numbers, each 1 or -1')
+        if (self.phase is None) == (self.feet is None):
+            raise ValueError('mirror_phase, mirror_feet: expected one of them')
+        if self.phase is not None and not 0 <= self.phase < observations:
+            raise ValueError(f'mirror_phase: {self.phase} is no column of {observations}')
+        if self.feet is not None:
+            right, left = self.feet if len(self.feet) == 2 else (-1, -1)
+            if not 0 <= right < observations or self.observation_index[right] != left:
+                raise ValueError(
+                    f'mirror_feet: {tuple(self.feet)} are no two of {observations} columns that stand '
+                    'for each other'
+                )
+
+    def left(self, observation: np.ndarray) -> np.ndarray:
+        """Returns which observations are of left stance, (n,) bool."""
+        if self.feet is not None:
+            return observation[:, self.feet[1]] > observation[:, self.feet[0]]
+        return observation[:, self.phase] >= 0.5
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Reflects observations (n, size)."""
+        reflected = observation.take(self.observation_index, 1) * self.observation_sign
+        if self.phase is not None:
+            phase = reflected[:, self.phase]
+            reflected[:, self.phase] = np.where(phase >= 0.5, phase - 0.5, phase + 0.5)
+        return reflected
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """Reflects actions (n, k)."""
+        return action.take(self.action_index, 1) * self.action_sign
+
+    def canonical(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns observations as in right stance, and which of them were of left stance."""
+        left = self.left(observation)
+        if left.all():
+            return self.observation(observation), left
+        if left.any():
+            observation = np.where(left[:, None], self.observation(observation), observation)
+        return observation, left
+
+    def unmirror_action(self, action: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Returns actions, those that answer to left stance reflected."""
+        if left.all():
+            return self.action(action)
+        if left.any():
+            action = np.where(left[:, None], self.action(action), action)
+        return action
+
+
+def exchanged(count: int, pairs: list[tuple[int, int]]) -> np.ndarray:
+    """Returns the numbers of 0 to count - 1 with those of each pair exchanged."""
+    index = np.arange(count)
+    for a, b in pairs:
+        index[a], index[b] = b, a
+    return index
+
+
+def blocks(index: np.ndarray, signs: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns index and sign of columns that come in equal blocks.
+
+    Args:
+      index: which block takes the place of each, (b,).
+      signs: of the columns of a block, c of them.
+
+    Returns:
+      Index and sign, both (b * c,).
+    """
+    width = len(signs)
+    return (index[:, None] * width + np.arange(width)).ravel(), np.tile(signs, len(index))

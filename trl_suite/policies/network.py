@@ -1,0 +1,388 @@
+"""A policy: a small network from observations to actions, run with NumPy alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.policies.mirror import Mirror
+from trl_suite.util import errors
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    'tanh': np.tanh,
+    'relu': lambda x: np.maximum(x, 0),
+    'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+}
+_FLAT = 'observations'  # key of the flat vector, where an environment gives one
+_LEAST_VARIANCE = 1e-5  # of the sums of a layer that are brought to deviation 1
+REACH = 1.0  # m; within which a network sees where a place is, and farther away its direction
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Convolution:
+    """1-D convolutions over a line, the first l inputs of a network, such as ground heights.
+
+    What comes out takes the place of the line, position by position, before the other inputs.
+
+    Attributes:
+      line: number of inputs that form the line, l.
+      strides: of each layer, in positions of its input.
+      weights: per layer (width, channels, filters), float32, like all arrays read-only; the first has
+        one channel, each other as many as the one before has filters.
+      biases: per layer (filters,).
+      origin: number of the input that is subtracted from those of the line, such as the root's
+        height, before they are normalised; None: nothing is.
+      outputs: how many numbers come out: positions times filters of the last layer.
+
+    Raises:
+      ValueError: fields do not fit each other; the message names one.
+    """
+
+    line: int
+    strides: tuple[int, ...]
+    weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    origin: int | None = None
+    outputs: int = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put('line', int(self.line))
+        put('strides', tuple(map(int, self.strides)))
+        layers = len(self.strides)
+        if not layers or len(self.weights) != layers or len(self.biases) != layers:
+            raise ValueError(
+                f'strides: {layers} layers with {len(self.weights)} weights and '
+                f'{len(self.biases)} biases'
+            )
+        weights, biases, positions, channels = [], [], self.line, 1
+        for i, stride in enumerate(self.strides):
+            width, _, filters = (
+                np.shape(self.weights[i]) if np.ndim(self.weights[i]) == 3 else 3 * (0,)
+            )
+            weights.append(_array(f'filter_{i}', self.weights[i], (width, channels, filters)))
+            biases.append(_array(f'filter_bias_{i}', self.biases[i], (filters,)))
+            if stride < 1 or not 1 <= width <= positions or not filters:
+                raise ValueError(
+                    f'filter_{i}: {filters} of width {width} and stride {stride} on {positions} positions'
+                )
+            positions, channels = (positions - width) // stride + 1, filters
+        put('weights', tuple(weights))
+        put('biases', tuple(biases))
+        put('outputs', positions * channels)
+
+    def check(self, inputs: int) -> None:
+        """Raises ValueError unless a network with so many inputs can have it."""
+        if not self.line <= inputs:
+            raise ValueError(f'line: has {self.line} of {inputs} inputs')
+        if self.origin is not None and not 0 <= self.origin < inputs:
+            raise ValueError(f'origin: is {self.origin}; expected a number of 0 to {inputs - 1}')
+
+    def relative(self, seen: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, c) in which the line is relative to the origin."""
+        if self.origin is None:
+            return seen
+        line = seen[:, : self.line] - seen[:, self.origin, None]
+        return np.concatenate([line, seen[:, self.line :]], axis=1)
+
+    def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Returns what comes of normalised inputs (n, c), (n, outputs + c - l)."""
+        line = x[:, : self.line, None]
+        for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
+            width, channels, filters = weight.shape
+            places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
+            windows = line[:, places].reshape(len(x), len(places), width * channels)
+            # One product per simulation, so that it does not depend on how many simulations there are.
+            line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
+        return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """A network from observations to actions in [-1, 1].
+
+    Simulation i of a batch gets, bit for bit, the action that it would get alone.
+
+    Attributes:
+      id: environment in which the policy was trained.
+      blocks: name and size of the observation blocks, in order; k numbers in all.
+      actions: names of the a actions, in order.
+      quantity: what an action sets, as `ActionMap.quantity` has it.
+      mean: subtracted from what the network sees, (c,) float32, like all arrays read-only.
+      std: divides what is left, (c,).
+      clip: bound of the normalised observation.
+      weights: per layer (inputs, outputs).
+      biases: per layer (outputs,).
+      activation: of all layers but the last, convolutions included, one of `ACTIVATIONS`.
+      log_std: logarithm of the exploration noise's standard deviation, (a,).
+      info: how the policy was made; what JSON can hold.
+      mirror: how it sees left stance as right stance; None if it sees all as it is.
+      places: columns of bearing and distance of what the network sees in a straight line, too, as
+        `placed` adds it, (p, 2); None: nothing.
+      columns: of the observation, after any mirror and with such places, that the network sees, (c,);
+        None: all.
+      choices: actions of which the one with the largest output is taken, (b, a); None: the outputs
+        are the action.
+      convolution: what the first of the inputs go through before the others join them, so that
+        `weights[0]` has as many inputs as then are left; None: nothing.
+      layer_norm: whether the sums of each fully connected layer but the last are brought to mean 0
+        and standard deviation 1 before the activation.
+
+    Raises:
+      ValueError: a field is malformed, or fields do not fit each other; the message names it.
+    """
+
+    id: str
+    blocks: tuple[tuple[str, int], ...]
+    actions: tuple[str, ...]
+    quantity: str
+    mean: np.ndarray = dataclasses.field(repr=False)
+    std: np.ndarray = dataclasses.field(repr=False)
+    clip: float
+    weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    activation: str
+    log_std: np.ndarray = dataclasses.field(repr=False)
+    info: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+    mirror: Mirror | None = dataclasses.field(default=None, repr=False)
+    places: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    columns: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    choices: np.ndarray | None = dataclasses.field(default=None, repr=False)
+    convolution: Convolution | None = dataclasses.field(default=None, repr=False)
+    layer_norm: bool = False
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put('id', str(self.id))
+        put('blocks', tuple((str(name), int(size)) for name, size in self.blocks))
+        put('actions', tuple(map(str, self.actions)))
+        put('quantity', str(self.quantity))
+        for name, items in (('blocks', [n for n, _ in self.blocks]), ('actions', self.actions)):
+            if not items or len(set(items)) < len(items) or '' in items:
+                raise ValueError(f'{name}: expected at least one name, each once; got {items}')
+        if min(size for _, size in self.blocks) < 1:
+            raise ValueError(f'blocks: expected positive sizes; got {_words(self.blocks)}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(errors.unknown('activation', self.activation, ACTIVATIONS))
+        k, a = self.observation_size, len(self.actions)
+        seen = k
+        if self.places is not None:
+            put('places', _columns('places', self.places, 2, k))
+            if self.places.shape[1] != 2:
+                raise ValueError(f'places: has shape {self.places.shape}; expected (p, 2)')
+            seen += self.places.size
+        if self.columns is not None:
+            put('columns', _columns('columns', self.columns, 1, seen))
+            seen = len(self.columns)
+        put('mean', _array('mean', self.mean, (seen,)))
+        put('std', _array('std', self.std, (seen,)))
+        if not (self.std > 0).all():
+            raise ValueError('std: expected positive numbers')
+        put('log_std', _array('log_std', self.log_std, (a,)))
+        put('clip', float(_array('clip', self.clip, ())))
+        if not self.clip > 0:
+            raise ValueError(f'clip: expected a positive number; got {self.clip}')
+        last = a
+        if self.choices is not None:
+            last = len(self.choices)
+            put('choices', _array('choices', self.choices, (last, a)))
+            if not last or np.abs(self.choices).max() > 1:
+                raise ValueError('choices: expected at least one action, in [-1, 1]')
+            if self.mirror is not None:
+                raise ValueError('choices: a policy with a mirror cannot have them')
+        layers = len(self.weights)
+        if not layers or len(self.biases) != layers:
+            raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
+        inputs = seen
+        if self.convolution is not None:
+            self.convolution.check(seen)
+            inputs += self.convolution.outputs - self.convolution.line
+        put('layer_norm', bool(self.layer_norm))
+        weights, biases = [], []
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            outputs = last if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
+            weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
+            biases.append(_array(f'bias_{i}', bias, (outputs,)))
+            inputs = outputs
+        put('weights', tuple(weights))
+        put('biases', tuple(biases))
+        try:
+            put('info', json.loads(json.dumps(self.info, allow_nan=False)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'info: JSON cannot hold it ({error})') from None
+        if not isinstance(self.info, dict):
+            raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
+        if self.mirror is not None:
+            self.mirror.check(k, a)
+
+    @property
+    def observation_size(self) -> int:
+        """How many numbers an observation has, k."""
+        return sum(size for _, size in self.blocks)
+
+    def __call__(self, observation: Any) -> np.ndarray:
+        """Returns the action without noise, in [-1, 1].
+
+        Args:
+          observation: (k,) or (n, k); or a mapping with all blocks, each (size,) or (n, size), of
+            which entries that are no blocks of the policy are left out.
+
+        Returns:
+          (a,) or (n, a), float64.
+
+        Raises:
+          ValueError: an observation of another size, or a missing block.
+        """
+        return _bounded(self._output(self._flat(observation)), 1.0)
+
+    def sample(self, observation: Any, random: np.random.Generator) -> np.ndarray:
+        """Returns the action with exploration noise, clipped to [-1, 1].
+
+        Arguments, results and errors are those of calling the policy.
+        """
+        output = self._output(self._flat(observation))
+        noise = random.standard_normal(output.shape)
+        return np.clip(output + np.exp(self.log_std.astype(float)) * noise, -1, 1)
+
+    def check(self, environment: Any) -> None:
+        """Checks that observation and action are what the policy was trained with.
+
+        Args:
+          environment: an `Environment` or `VectorEnvironment`.
+
+        Raises:
+          ValueError: they are not; the message has both.
+        """
+        blocks = tuple((name, part.stop - part.start) for name, part in environment.blocks.items())
+        if blocks != self.blocks:
+            raise ValueError(
+                f'the policy of {self.id!r} observes {_words(self.blocks)}; the environment gives '
+                f'{_words(blocks)}'
+            )
+        actions, quantity = tuple(environment.action_map.names), environment.action_map.quantity
+        if (actions, quantity) != (self.actions, self.quantity):
+            raise ValueError(
+                f'the policy of {self.id!r} sets the {self.quantity} of {", ".join(self.actions)}; '
+                f'the environment takes the {quantity} of {", ".join(actions)}'
+            )
+
+    def _flat(self, observation: Any) -> np.ndarray:
+        names = [name for name, _ in self.blocks]
+        if isinstance(observation, Mapping):
+            if _FLAT in observation and _FLAT not in names:
+                return self._flat(observation[_FLAT])
+            missing = [name for name in names if name not in observation]
+            if missing:
+                raise ValueError(
+                    f'the observation lacks {", ".join(missing)}; expected {_words(self.blocks)}'
+                )
+            parts = [np.asarray(observation[name], dtype=float) for name in names]
+            for (name, size), part in zip(self.blocks, parts, strict=True):
+                if part.ndim not in (1, 2) or part.shape != (*parts[0].shape[:-1], size):
+                    raise ValueError(
+                        f'observation block {name!r} has shape {part.shape}; expected ({size},) or '
+                        f'(n, {size}), with the same n in all blocks'
+                    )
+            return np.concatenate(parts, axis=-1)
+        flat = np.asarray(observation, dtype=float)
+        k = self.observation_size
+        if flat.ndim not in (1, 2) or flat.shape[-1] != k:
+            raise ValueError(
+                f'the observation has shape {flat.shape}; expected ({k},) or (n, {k}): '
+                f'{_words(self.blocks)}'
+            )
+        return flat
+
+    @functools.cached_property
+    def _scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and deviation as doubles, so that they need not be cast at every call."""
+        return self.mean.astype(float), self.std.astype(float)
+
+    def _output(self, flat: np.ndarray) -> np.ndarray:
+        seen, left = np.atleast_2d(flat), None
+        if self.mirror is not None:
+            seen, left = self.mirror.canonical(seen)
+        if self.places is not None:
+            seen = placed(seen, self.places)
+        if self.columns is not None:
+            seen = seen.take(self.columns, 1)
+        if self.convolution is not None:
+            seen = self.convolution.relative(seen)
+        mean, std = self._scales
+        x = _bounded((seen - mean) / std, self.clip).astype(np.float32, order='C')
+        activation = ACTIVATIONS[self.activation]
+        if self.convolution is not None:
+            x = self.convolution(x, activation)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            # Row by row, so that an action does not depend on how many rows there are.
+            x = (x @ weight if len(x) == 1 else np.matmul(x[:, None], weight)[:, 0]) + bias
+            if i < len(self.weights) - 1:
+                if self.layer_norm:
+                    x = x - x.mean(1, keepdims=True)
+                    x /= np.sqrt((x * x).mean(1, keepdims=True) + np.float32(_LEAST_VARIANCE))
+                x = activation(x)
+        if self.choices is not None:
+            x = self.choices[x.argmax(1)]
+        if self.mirror is not None and left is not None:
+            x = self.mirror.unmirror_action(x, left)
+        return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+
+def _bounded(x: np.ndarray, bound: float) -> np.ndarray:
+    """Returns numbers clipped to [-bound, bound]; of few numbers quicker than `numpy.clip`."""
+    return np.minimum(np.maximum(x, -bound), bound)
+
+
+def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Adds to observations (n, k) how far ahead and to the left places are, (n, k + 2p).
+
+    A bearing jumps behind the back, and what is near is seen too coarsely beside what is far. So a
+    place within `REACH` is seen where it is, in units of it, and one farther away as a direction.
+
+    Args:
+      observation: (n, k).
+      places: columns of bearing and distance, (p, 2).
+    """
+    bearing, distance = observation[:, places[:, 0]], observation[:, places[:, 1]]
+    near = np.minimum(distance / REACH, 1)
+    straight = np.stack([near * np.cos(bearing), near * np.sin(bearing)], axis=-1)
+    return np.concatenate([observation, straight.reshape(len(observation), -1)], axis=1)
+
+
+def _columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
+    """Returns a read-only copy of numbers of columns."""
+    array = np.array(value)
+    if array.ndim != axes or array.dtype.kind not in 'iu' or not array.size:
+        raise ValueError(f'{name}: expected integers, at least one')
+    if array.min() < 0 or array.max() >= inputs:
+        raise ValueError(f'{name}: expected numbers of 0 to {inputs - 1}')
+    array.setflags(write=False)
+    return array
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns a read-only copy, float32, of the given shape."""
+    try:
+        with np.errstate(over='ignore'):
+            array = np.array(value, dtype=np.float32, order='C')
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
+    if array.shape != shape:
+        raise ValueError(f'{name}: has shape {array.shape}; expected {shape}')
+    if not np.isfinite(array).all():
+        raise ValueError(f'{name}: has numbers that are not finite')
+    array.setflags(write=False)
+    return array
+
+
+def _words(blocks: Sequence[tuple[str, int]]) -> str:
+    return ', '.join(f'{name} {size}' for name, size in blocks)

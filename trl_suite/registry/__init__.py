@@ -1,0 +1,1 @@
+"""Every environment as data."""

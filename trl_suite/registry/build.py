@@ -1,0 +1,141 @@
+"""From the data of an environment to its task."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from trl_suite import characters, motion, policies
+from trl_suite import terrain as terrains
+from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.registry.catalogue import find
+from trl_suite.registry.spec import EnvSpec
+from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks import composed
+from trl_suite.tasks.task import Task
+from trl_suite.tasks.task_type import Parts, TaskType
+from trl_suite.util import errors
+from trl_suite.util.options import Config, Option
+
+DIMENSIONS = {False: 'planar', True: 'three-dimensional'}
+
+
+def task_type(spec: EnvSpec) -> TaskType | None:
+    """Returns the task type of an environment; None where a function of the user's makes the task."""
+    own = spec.own.get('task_type')
+    if own is None:
+        return TASK_TYPES[spec.task_type]
+    return own if isinstance(own, TaskType) else None
+
+
+def character_of(spec: EnvSpec) -> characters.CharacterSpec:
+    """Returns the data of an environment's character."""
+    character = spec.part('character')
+    return characters.CHARACTERS[character] if isinstance(character, str) else character
+
+
+def config_of(spec: EnvSpec) -> type[Config] | None:
+    """Returns the options of an environment's task; None of a function of the user's."""
+    type_ = task_type(spec)
+    if type_ is not None:
+        return type_.config
+    config = getattr(spec.own['task_type'], 'CONFIG', None)
+    return config[character_of(spec).spatial] if isinstance(config, Mapping) else config
+
+
+def task_options(spec: EnvSpec) -> list[Option]:
+    """Returns the options of an environment's task, besides those of every task."""
+    config = config_of(spec)
+    if config is None:
+        known = [
+            Option(name, parameter.default, '')
+            for name, parameter in inspect.signature(spec.own['task_type']).parameters.items()
+            if parameter.kind is parameter.KEYWORD_ONLY and name != 'actuation_model'
+        ]
+    else:
+        known = config.options()
+    return [
+        option._replace(default=spec.options.get(option.name, option.default)) for option in known
+    ]
+
+
+def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
+    """Builds the task of an environment, for a plain `composer.Environment` or many simulations.
+
+    Args:
+      spec: of the environment.
+      options: of the task that override those of the spec; besides those every task takes `rewards`,
+        `observations` and `failures`, see `trl_suite.tasks.composed`.
+
+    Raises:
+      ValueError: an unknown option, or one out of range; the message has the closest matches. Or
+        parts that do not fit each other.
+    """
+    merged = {**spec.options, **(options or {})}
+    extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
+    type_, others = task_type(spec), (*composed.OPTIONS, 'random')
+    config_type, config = config_of(spec), None
+    if config_type is None:
+        known = {option.name for option in task_options(spec)}
+        for name in merged:
+            if name not in known:
+                choices = [*known, *others]
+                raise ValueError(errors.unknown(f'option of {spec.id}', name, choices))
+    else:
+        policies_ = {
+            option.name: option.default for option in config_type.options() if option.policy
+        }
+        for name, default in policies_.items():
+            merged[name] = _policy(merged.get(name, default))
+        config = config_type.of(spec.id, merged, others)
+    if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
+        raise ValueError(
+            f'{spec.task}: joints are driven by {" or ".join(type_.actuations or ())} control, not by '
+            f'{spec.actuation}'
+        )
+    parts = _parts(spec, type_)
+    if type_ is not None:
+        return composed.compose(type_.make(parts, config), extras)
+    given: dict[str, Any] = merged if config is None else {'config': config}
+    if spec.clip is not None:
+        given['clip'] = parts.motion
+    task = spec.own['task_type'](
+        parts.character, parts.arena, actuation_model=parts.actuation, **given
+    )
+    return composed.compose(task, extras)
+
+
+def _policy(source: Any) -> Any:
+    """Returns the policy that is shipped for an id or alias; what is no id stays as it is."""
+    if not isinstance(source, str) or source.endswith('.npz'):
+        return source
+    return policies.reference(find(source).id)
+
+
+def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
+    """Makes what the task is composed of."""
+    character, ground = character_of(spec), terrains.load(spec.part('terrain'))
+    if ground.spatial != character.spatial:
+        presets = terrains.PRESETS3D if character.spatial else terrains.PRESETS
+        raise ValueError(
+            f'character {character.name!r} is {DIMENSIONS[character.spatial]} and terrain '
+            f'{ground.name!r} ({ground.type}) {DIMENSIONS[ground.spatial]}; presets that fit: '
+            f'{", ".join(sorted(presets))}'
+        )
+    kind: Any = motion.Clip if type_ is None else type_.motion
+    tracked = None if kind is None or spec.clip is None else _motion(spec, kind)
+    arena = (SpatialArena if character.spatial else PlanarArena)(ground)
+    return Parts(characters.make(character), arena, tracked, spec.actuation)
+
+
+def _motion(spec: EnvSpec, kind: type) -> Any:
+    """Returns the clip or the library of steps of an environment."""
+    given = spec.part('clip')
+    if kind is motion.Steps:
+        if isinstance(given, motion.Clip):
+            raise ValueError(f'{given.name!r} is a clip; for footsteps, give a library of steps')
+        return given if isinstance(given, motion.Steps) else motion.load_steps(given)
+    if isinstance(given, motion.Steps):
+        raise ValueError(f'{given.name!r} is a library of steps; to be imitated, give a clip')
+    return given if isinstance(given, motion.Clip) else motion.load(given)

@@ -1,0 +1,194 @@
+"""DeepLoco: footstep controllers, high-level tasks above one, and the same tasks without hierarchy.
+
+Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Any
+
+from trl_suite.registry.spec import EnvSpec
+
+
+def _step(
+    id_: str,
+    task: str,
+    words: str,
+    *,
+    character: str = 'biped3d_mocap',
+    preset: str = 'plane',
+    original: bool = True,
+    aliases: tuple[str, ...] = (),
+    differences: tuple[str, ...] = (
+        'the steps are our own, 27 of them; the original chooses among 14 captured ones',
+    ),
+    **options: Any,
+) -> EnvSpec:
+    return EnvSpec(
+        id=id_,
+        domain='deeploco',
+        task=task,
+        character=character,
+        actuation='position',
+        terrain=preset,
+        task_type='spatial_footsteps',
+        clip=character,
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}.',
+        differences=differences,
+        tags=frozenset({'spatial', 'original' if original else 'completion'}),
+        aliases=aliases,
+    )
+
+
+_STEP2D = EnvSpec(
+    id='PD_Biped2D_LLC_Flat_Step-v0',
+    domain='deeploco',
+    task='llc_flat_step',
+    character='biped2d_full',
+    actuation='position',
+    terrain='flat',
+    task_type='planar_footsteps',
+    clip='biped2d_full_walk',
+    description='The biped with arms walks along planned footsteps, straight on over flat ground.',
+    tags=frozenset({'planar', 'flat', 'completion'}),
+)
+
+_STEPS = (
+    _step(
+        'PD_Biped3D_LLC_General_Step-v0', 'llc_general_step',
+        'walks along planned footsteps, around turns',
+    ),
+    _step(
+        'PD_Biped3D_LLC_Symetric_Step-v0', 'llc_symmetric_step',
+        'walks along planned footsteps; what it sees and does is mirrored in left stance',
+        aliases=('PD_Biped3D_LLC_Symmetric_Step-v0',), mirrored=True,
+    ),
+    _step(
+        'PD_Biped3D_LLC_Run_FootStep-v0', 'llc_run_footstep', 'runs along planned footsteps',
+        character='biped3d_mocap_run',
+        differences=(
+            'the footstep is rewarded in the second half of every step; in the original that clock is slower '
+            'than the steps',
+            "the step is our own, 3.83 m/s; the original's is captured, 4.4 m/s",
+        ),
+        plans={'length': (1.15, 1.15), 'turn': 0.0, 'sharp': 0.0},
+    ),
+    _step(
+        'PD_Biped3D_LLC_Bumps_Step-v0', 'llc_bumps_step',
+        'walks along planned footsteps over a raised chequerboard', preset='checkers_3d',
+        original=False,
+    ),
+    _step(
+        'PD_Biped3D_LLC_Trail_Step-v0', 'llc_trail_step',
+        'walks along footsteps that head for goals on a trail', preset='trail3d2', original=False,
+        goal=True, plans={'length': (0.4, 0.4)},
+    ),
+    _step(
+        'PD_Biped3D_FULL_Imitate-Steps-v0', 'llc_full_step',
+        'with arms and head walks along planned footsteps', character='biped3d_full_mocap',
+        aliases=('PD_Biped3D_Full_LLC_Step-v0',),
+    ),
+)  # fmt: skip
+
+HIKE_LIMIT = 400  # plans after which an episode is cut: 200 s
+RUN_LIMIT = 667  # the same of a run, whose footsteps last 0.3 s
+
+
+def _hike(
+    name: str, preset: str, words: str, *, character: str = 'biped3d_mocap', original: bool = True,
+    task_type: str = 'goal_navigation', limit: int = HIKE_LIMIT, aliases: tuple[str, ...] = (), rate: int = 1200, differences: tuple[str, ...] = (), **options: Any,
+) -> EnvSpec:  # fmt: skip
+    return EnvSpec(
+        id=f'PD_Biped3D_HLC_{name}-v0',
+        domain='deeploco',
+        task=f'hlc_{name.lower()}',
+        character=character,
+        actuation='position',
+        terrain=preset,
+        task_type=task_type,
+        clip=character,
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}; an action plans its next two footsteps.',
+        differences=(
+            f'MuJoCo at 300 Hz instead of Bullet at {rate} Hz; task option substeps',
+            *differences,
+        ),
+        tags=frozenset({'spatial', 'hierarchical', 'original' if original else 'completion'}),
+        aliases=aliases,
+        step_limit=limit,
+    )
+
+
+_FROM_ZERO = (0.0,)  # phase of the start
+_HIKES = (
+    _hike('LargeBlocks', 'obstacles3d', 'goes from goal to goal among large blocks'),
+    _hike(
+        'DynamicsObstacles', 'dynamic_obstacles3d', 'goes from goal to goal among moving boxes',
+        aliases=('PD_Biped3D_HLC_DynamicObstacles-v0',), rate=3000, terrain_observation='velocity',
+        start_phases=_FROM_ZERO,
+    ),
+    _hike('Soccer', 'plane', 'dribbles a ball to a goal', task_type='soccer', terrain_observation=()),
+    _hike(
+        'Forest', 'pillars3d', 'goes from goal to goal between the pillars of a forest',
+        rate=3000,
+        differences=(
+            'the heights of its pillars are observed; the original gives a map of velocities that are all '
+            'zero',
+        ),
+        start_phases=_FROM_ZERO,
+    ),
+    _hike(
+        'Conveyors', 'conveyor3d', 'goes from goal to goal over conveyor belts',
+        rate=3000, terrain_observation='velocity', start_phases=_FROM_ZERO,
+    ),
+    _hike(
+        'Conveyors_Wide', 'conveyor3d_wide', 'goes from goal to goal over a wide conveyor belt',
+        rate=3000, terrain_observation='velocity', start_phases=_FROM_ZERO,
+    ),
+    _hike('PathFollowing', 'trail3d1', 'follows a winding trail between hills', original=False),
+    _hike(
+        'PathFollowing_Run', 'trail3d_wide', 'runs along a wide trail between hills',
+        character='biped3d_mocap_run', original=False, limit=RUN_LIMIT,
+        controller='PD_Biped3D_LLC_Run_FootStep-v0', start_phases=_FROM_ZERO, step_length=1.0,
+        target_speed=3.0, goal_reached=2.0,
+    ),
+)  # fmt: skip
+
+
+def _hard(
+    name: str, preset: str, words: str, *, original: bool = True, task_type: str = 'direct_navigation',
+    aliases: tuple[str, ...] = (), **options: Any,
+) -> EnvSpec:  # fmt: skip
+    return EnvSpec(
+        id=f'PD_Biped3D_Terrain_{name}_Hard-v0',
+        domain='deeploco',
+        task=f'{name.lower()}_hard',
+        character='biped3d_mocap',
+        actuation='position',
+        terrain=preset,
+        task_type=task_type,
+        clip='biped3d_mocap_walk',
+        options=MappingProxyType(options),
+        description=f'The 3D biped {words}, without hierarchy: by PD targets 30 times a second.',
+        tags=frozenset({'spatial', 'flat_control', 'original' if original else 'completion'}),
+        aliases=aliases,
+    )
+
+
+_JOURNEYS = (
+    _hard('Trail', 'trail3d1', 'follows a winding trail between hills'),
+    _hard('Forest', 'pillars3d', 'goes from goal to goal between the pillars of a forest'),
+    _hard('Blocks', 'obstacles3d', 'goes from goal to goal among large blocks'),
+    _hard(
+        'Dyanmics_Obs', 'dynamic_obstacles3d', 'goes from goal to goal among moving boxes',
+        aliases=('PD_Biped3D_Terrain_Dynamic_Obs_Hard-v0',),
+    ),
+    _hard(
+        'Soccer', 'plane', 'dribbles a ball to a goal', original=False, task_type='direct_soccer',
+        terrain_observation=(),
+    ),
+)  # fmt: skip
+
+SPECS = (*_STEPS, _STEP2D, *_HIKES, *_JOURNEYS)

@@ -1,0 +1,66 @@
+"""TerrainRL: planar characters driven through gait state machines over random terrain.
+
+Source: the registry of Terrain RL Simulator (Berseth, Peng, van de Panne 2018).
+"""
+
+from __future__ import annotations
+
+from trl_suite.registry.spec import EnvSpec
+
+# Steps are cycles of 1 to 2 m: the best policies of the 2016 paper fall after 2 km on average, some 1200
+# cycles, and one episode in sixty of theirs would last longer than this.
+STEP_LIMIT = 5000
+
+# Name in ids, preset, words; then who crosses it in a completion of ours.
+_GAIT_TERRAINS = (
+    ('Gaps', 'gaps', 'gaps'),
+    ('Cliffs', 'cliffs_humanoid', 'drops'),
+    ('Mixed', 'mixed', 'a mix of gaps, walls and steps'),
+    ('Slopes_Mixed', 'slopes_mixed', 'gaps, walls and steps on rolling slopes'),
+    ('Slopes', 'slopes', 'rolling slopes'),
+    ('Stairs_Rugged', 'cliffs_rugged', 'rugged stairs'),
+    ('Walls', 'walls', 'walls'),
+    ('Steps', 'steps', 'steps up and down'),
+)
+_GAIT_CHARACTERS = {
+    'biped2d_simbicon': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D', 'hopper': 'Hopper2D',
+}  # fmt: skip
+_MORE_GAITS = (
+    ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
+    ('dog', 'Tight_Gaps', 'tight_gaps', 'clusters of gaps with little room between'),
+    ('dog', 'Slopes_Gaps', 'slopes_gaps0', 'gaps on rolling slopes'),
+    ('dog', 'Slopes_Steps', 'slopes_steps', 'steps on rolling slopes'),
+    ('dog', 'Slopes_Walls', 'slopes_walls', 'walls on rolling slopes'),
+    ('raptor', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
+    ('raptor', 'Mixed_Raptor', 'mixed_raptor', 'gaps, walls and steps of its own size'),
+    ('goat', 'Variable_Steps', 'cliffs_rugged', 'rugged stairs'),
+    ('goat', 'Cliffs', 'cliffs_humanoid', 'drops'),
+    ('hopper', 'Gaps_Easy', 'gaps_hopper', 'gaps of its own size'),
+    ('hopper', 'Mixed_Easy', 'mixed_hopper', 'gaps, walls and steps of its own size'),
+)
+
+
+def _gait(character: str, name: str, preset: str, words: str, original: bool) -> EnvSpec:
+    figure = {**_GAIT_CHARACTERS, 'goat': 'Goat2D'}[character]
+    return EnvSpec(
+        id=f'FSM_{figure}_Terrain_{name}-v0',
+        domain='terrainrl',
+        task=f'{figure[:-2].lower()}_{name.lower()}',
+        character=character,
+        actuation='gait',
+        terrain=preset,
+        task_type='gait',
+        description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait of a cycle.',
+        tags=frozenset({'planar', 'original' if original else 'completion'}),
+        step_limit=STEP_LIMIT,
+    )
+
+
+SPECS = (
+    *(
+        _gait(character, *terrain, original=True)
+        for character in _GAIT_CHARACTERS
+        for terrain in _GAIT_TERRAINS
+    ),
+    *(_gait(*each, original=False) for each in _MORE_GAITS),
+)

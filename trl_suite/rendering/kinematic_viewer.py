@@ -1,0 +1,160 @@
+"""A character without its physics: put into poses, measured, and drawn on a level floor.
+
+from trl_suite import motion
+from trl_suite.rendering import kinematic_viewer as kinematic viewer
+
+figure = kinematic viewer.KinematicViewer('raptor')
+figure.put(motion.load('raptor_run_050').pose(0.1))
+image = figure.picture(camera='side')  # (480, 640, 3) uint8
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import mujoco
+import numpy as np
+from dm_control import composer
+
+from trl_suite import characters, rendering
+from trl_suite.arenas import scene as stage
+from trl_suite.motion import Clip, Layout
+from trl_suite.motion.layout import ROOT_SIZES
+
+FLOOR = 200.0  # m; half length
+SHADOWS = 8.0  # extents of the scene that have shadows; their edge, with its specks, is far away
+TILE = 1.0  # m; edge of a square of the floor, so that distances can be seen
+_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+class KinematicViewer:
+    """One character on a level floor at height 0.
+
+    Attributes:
+      character: the entity.
+      layout: what the columns of its poses are, as of a `Clip`.
+      links: names of the links that have collision geoms, in the order of `corners`; some occur twice if
+        they have more than one.
+      environment: a `composer.Environment` without any task, as `rendering` takes it.
+    """
+
+    def __init__(self, character: str | characters.CharacterSpec) -> None:
+        """Compiles a character.
+
+        Args:
+          character: a name in `trl_suite.characters.CHARACTERS`, or a row of the user's own.
+
+        Raises:
+          ValueError: an unknown name; the message has the closest matches.
+        """
+        arena = composer.Arena()
+        root = arena.mjcf_model
+        stage.prepare(root)
+        root.visual.map.shadowclip = SHADOWS
+        root.visual.quality.shadowsize = 4096
+        root.asset.add(
+            'texture', name='floor', type='2d', builtin='checker', width=256, height=256,
+            rgb1=(0.47, 0.52, 0.44), rgb2=(0.42, 0.47, 0.40),
+        )  # fmt: skip
+        root.asset.add(
+            'material', name='floor', texture='floor', texuniform=True, specular=0,
+            texrepeat=(0.5 / TILE, 0.5 / TILE),
+        )  # fmt: skip
+        root.worldbody.add(
+            'geom', name='floor', type='box', size=(FLOOR, FLOOR, 1), pos=(0, 0, -1),
+            material='floor',
+        )  # fmt: skip
+        self.character = figure = characters.make(character)
+        root_joints = figure.create_root_joints(arena.attach(figure))
+        self.environment = composer.Environment(composer.NullTask(arena), random_state=0)
+        self.environment.reset()
+        physics = self._physics = self.environment.physics
+        kind = 'free' if figure.spec.spatial else 'planar'
+        self.layout = Layout(
+            kind, tuple(figure.spec.joints), np.where(figure.spherical, 4, 1).tolist()
+        )
+        joints = [*root_joints, *figure.joints]
+        starts = np.concatenate([np.atleast_1d(physics.bind(joint).qposadr) for joint in joints])
+        sizes = [ROOT_SIZES[kind] // len(root_joints)] * len(root_joints) + list(self.layout.sizes)
+        self._pose_qpos = np.concatenate(
+            [start + np.arange(size) for start, size in zip(starts, sizes, strict=True)]
+        )
+        model = physics.model
+        geoms = [geom.full_identifier for geom in figure.collision_geoms]
+        self._geoms = np.array([model.name2id(name, 'geom') for name in geoms])
+        bodies = [model.name2id(body.full_identifier, 'body') for body in figure.bodies]
+        self._bodies = np.array(bodies)
+        self.links = tuple(
+            figure.spec.links[bodies.index(body)] for body in model.geom_bodyid[self._geoms]
+        )
+        box = model.geom_aabb[self._geoms]
+        self._local = box[:, None, :3] + _SIGNS * box[:, None, 3:]
+        self.put(self.standing())
+
+    def standing(self) -> np.ndarray:
+        """Returns the pose with all joints at 0, feet on the floor, (columns,)."""
+        pose = np.zeros(self.layout.columns)
+        for column, _ in self.layout.rotations:
+            pose[column] = 1.0
+        height = 1 if self.layout.root == 'planar' else 2
+        self.put(pose)
+        pose[height] = -self.corners()[..., 2].min()
+        return pose
+
+    def put(self, pose: np.ndarray) -> None:
+        """Puts it into a pose, (columns,) as of `layout`.
+
+        Raises:
+          ValueError: a pose of another length.
+        """
+        pose = np.asarray(pose, float)
+        if pose.shape != (self.layout.columns,):
+            raise ValueError(f'a pose of shape {pose.shape}; expected ({self.layout.columns},)')
+        data = self._physics.data
+        data.qpos[self._pose_qpos] = pose
+        # What follows the character, cameras and light, needs its centre of mass.
+        mujoco.mj_fwdPosition(self._physics.model.ptr, data.ptr)
+
+    def corners(self) -> np.ndarray:
+        """Returns the corners of the bounding boxes of all collision geoms, m, (collision geoms, 8, 3)."""
+        data = self._physics.data
+        frames = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+        return data.geom_xpos[self._geoms][:, None] + self._local @ frames.transpose(0, 2, 1)
+
+    def places(self) -> np.ndarray:
+        """Returns where the joints of all links are, m, (links, 3), the root's place first."""
+        return self._physics.data.xpos[self._bodies].copy()
+
+    def orientations(self) -> np.ndarray:
+        """Returns the orientations of all links, unit quaternions wxyz, (links, 4)."""
+        return self._physics.data.xquat[self._bodies].copy()
+
+    def axes(self) -> list[np.ndarray | None]:
+        """Returns the axis of every hinge in the frame of its link, (3,); None of other joints."""
+        joints = self._physics.bind(self.character.joints)
+        hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
+        return [
+            np.array(axis) if kind == hinge else None
+            for kind, axis in zip(joints.type, joints.axis, strict=True)
+        ]
+
+    def parents(self) -> list[int]:
+        """Returns the number of each link's parent in link order, -1 of the root."""
+        model, bodies = self._physics.model, self._bodies.tolist()
+        return [
+            bodies.index(parent) if (parent := model.body_parentid[body]) in bodies else -1
+            for body in bodies
+        ]
+
+    def picture(self, **options: Any) -> np.ndarray:
+        """Draws it; see `trl_suite.rendering.frame` for the options. Shape (h, w, 3) uint8."""
+        return rendering.frame(self.environment, **options)
+
+    def film_strip(self, clip: Clip, columns: int = 8, **options: Any) -> np.ndarray:
+        """Draws evenly spaced poses of a clip side by side; options are those of `picture`."""
+        images = []
+        for time in np.linspace(0, clip.duration, columns):
+            self.put(clip.pose(time))
+            images.append(self.picture(**options))
+        return rendering.film_strip(images, columns=columns)

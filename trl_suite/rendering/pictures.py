@@ -1,0 +1,348 @@
+"""Pictures as files: videos, film strips, plots of terrain, height maps. None needs OpenGL.
+
+The names are also those of `trl_suite.rendering`, which draws the frames. Files appear under their
+names when they are complete, never before. Videos, PNG files and plots need
+`pip install 'trl_suite[video]'`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Iterable
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite import terrain as terrains
+from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
+from trl_suite.util.files import Path, check_path, replacing
+
+if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
+    from dm_control import composer
+
+CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
+STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
+MAP_PIXELS = 8  # of each sample of a height map, along both axes
+HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
+ROOT_COLOUR = (20, 20, 20)  # where the character stands on its height map
+MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
+MAP_POINTS = 400  # at most, along each axis of such a plot
+VIDEO_SUFFIXES = ('.mp4', '.gif')
+IMAGE_SUFFIXES = ('.png',)
+
+
+def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:
+    """Writes pictures as a video; what `Video` does, in one call.
+
+    Args:
+      frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as
+        `rendering.frames`.
+      path: where to write; .mp4 (h264) or .gif.
+      fps: pictures per second; 30 is real time. A .gif can only last whole 1/100 s per picture.
+
+    Raises:
+      ValueError: another suffix, no pictures, pictures of different sizes, or an odd size for h264.
+      ImportError: the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    with Video(path, fps) as writer:
+        for image in frames:
+            writer.add(image)
+
+
+class Video:
+    """A video to which pictures are added one by one, so that none is kept in memory.
+
+    Used as a context manager; the file appears at the end, and not at all after an exception.
+    Arguments and errors are those of `video`.
+    """
+
+    def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
+        self._path = check_path(path, VIDEO_SUFFIXES)
+        if not 0 < fps < np.inf:
+            raise ValueError(f'fps is {fps}; expected a positive number')
+        self._fps = fps
+        self._imageio = _optional('imageio.v2')
+        if self._path.suffix == '.mp4':
+            _optional('imageio_ffmpeg')
+        self._shape: tuple[int, ...] | None = None
+        self._files = contextlib.ExitStack()
+
+    def __enter__(self) -> Video:
+        self._part = self._files.enter_context(replacing(self._path))
+        if self._path.suffix == '.mp4':
+            options: dict[str, Any] = {
+                # imageio would scale frames up to multiples of 16 by itself.
+                'fps': self._fps, 'codec': 'libx264', 'macro_block_size': 1, 'quality': 7,
+                'ffmpeg_log_level': 'error',
+            }  # fmt: skip
+        else:
+            options = {'duration': 1000 / self._fps, 'loop': 0}  # ms per frame; play for ever
+        self._writer = self._imageio.get_writer(self._part, **options)
+        return self
+
+    def add(self, image: np.ndarray) -> None:
+        """Adds a picture, shape (h, w, 3), uint8."""
+        image = _image(image)
+        if self._shape is None:
+            self._shape = image.shape
+            if self._path.suffix == '.mp4' and (image.shape[0] % 2 or image.shape[1] % 2):
+                raise ValueError(
+                    f'{self._path}: frames are {image.shape[1]}x{image.shape[0]} pixels; h264 needs '
+                    'even numbers'
+                )
+        elif image.shape != self._shape:
+            raise ValueError(
+                f'{self._path}: a frame has shape {image.shape}, those before it {self._shape}'
+            )
+        self._writer.append_data(image)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.close()
+        except Exception:
+            if kind is None:
+                self._files.__exit__(OSError, OSError(), None)
+                raise
+        if kind is None and not (self._part.exists() and self._part.stat().st_size):
+            reason = 'no frames were given' if self._shape is None else 'the encoder wrote nothing'
+            error = ValueError(f'{self._path}: {reason}')
+            self._files.__exit__(ValueError, error, None)
+            raise error
+        self._files.__exit__(kind, error, traceback)
+
+
+def film_strip(
+    frames: Iterable[np.ndarray], path: Path | None = None, columns: int = 8
+) -> np.ndarray:
+    """Puts evenly spaced pictures side by side, the first and the last among them.
+
+    Args:
+      frames: pictures (h, w, 3) uint8, all of one size.
+      path: where to write it as .png; not written if None.
+      columns: how many pictures; all of them if there are fewer.
+
+    Returns:
+      The strip, shape (h, about columns * w, 3), uint8.
+
+    Raises:
+      ValueError: no pictures, pictures of different sizes, columns below 1, or another suffix.
+      ImportError: a path is given and the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    if columns < 1:
+        raise ValueError(f'columns is {columns}; expected at least 1')
+    images = [_image(image) for image in frames]
+    if not images:
+        raise ValueError('a film strip needs at least one frame')
+    if len({image.shape for image in images}) > 1:
+        raise ValueError('the frames of a film strip must all have the same size')
+    chosen = spread(len(images), columns)
+    margin = np.full((len(images[0]), STRIP_MARGIN, 3), 255, np.uint8)
+    parts = [part for i in chosen for part in (margin, images[i])]
+    strip = np.concatenate(parts[1:], axis=1)
+    if path is not None:
+        imageio = _optional('imageio.v3')
+        with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
+            imageio.imwrite(part, strip)
+    return strip
+
+
+def spread(count: int, chosen: int) -> list[int]:
+    """Returns up to `chosen` indices of `count`, evenly spaced, first and last among them."""
+    if chosen == 1:
+        return [0]
+    return sorted(set(np.linspace(0, count - 1, min(chosen, count)).round().astype(int).tolist()))
+
+
+def plot_terrain(
+    terrain: Any,
+    path: Path,
+    draws: int = 3,
+    length: float = 40.0,
+    seed: int = 0,
+    terrain_level: float = 0.0,
+) -> None:
+    """Plots several draws of a terrain: profiles below each other, or maps side by side.
+
+    Three-dimensional terrain is seen from above, x to the right, y up; an arrow is a start.
+
+    Args:
+      terrain: what `trl_suite.terrain.load` takes.
+      path: where to write; .png.
+      draws: how many.
+      length: how far ahead of the start, m; of a map its side, about the origin, at most 300 m.
+      seed: draw i is the strip or ground with the seed sequence (seed, i).
+      terrain_level: which of the terrain's parameter sets.
+
+    Raises:
+      ValueError: bad arguments; see also `trl_suite.terrain.load`.
+      ImportError: the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    terrain = terrains.load(terrain)
+    target = check_path(path, IMAGE_SUFFIXES)
+    if draws < 1:
+        raise ValueError(f'draws is {draws}; expected at least 1')
+    longest = MAX_SPAN if terrain.spatial else 10_000.0
+    if not 0 < length <= longest:
+        raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
+    if seed < 0:
+        raise ValueError(f'seed is {seed}; expected 0 or more')
+    # Figures of their own class draw without a screen and leave the user's pyplot alone.
+    make = _optional('matplotlib.figure').Figure
+    if terrain.spatial:
+        figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
+        _plot_maps(figure, terrain, draws, length, seed, terrain_level)
+    else:
+        figure = make(figsize=(10, 0.8 + 1.3 * draws), layout='constrained')
+        _plot_profiles(figure, terrain, draws, length, seed, terrain_level)
+    with replacing(target) as part:
+        figure.savefig(part, dpi=100)
+
+
+def _plot_profiles(
+    figure: Any,
+    terrain: terrains.Terrain,
+    draws: int,
+    length: float,
+    seed: int,
+    terrain_level: float,
+) -> None:
+    panels = figure.subplots(draws, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    first = round(-2 / terrains.SPACING)
+    count = round(length / terrains.SPACING) - first + 1
+    x = (first + np.arange(count)) * terrains.SPACING
+    grounds = []
+    for i in range(draws):
+        strip = terrains.PlanarGround(
+            terrain, np.random.SeedSequence((seed, i)), terrain_level=terrain_level
+        )
+        grounds.append(strip.window(first, count)[0])
+    low, high = min(map(np.min, grounds)), max(map(np.max, grounds))
+    room = 0.15 * max(high - low, 1.0)
+    for panel, heights in zip(panels, grounds, strict=True):
+        panel.fill_between(x, heights, low - room, color='0.75', linewidth=0)
+        panel.plot(x, heights, color='0.2', linewidth=1)
+        panel.axvline(0, color='tab:red', linewidth=0.8, linestyle=':')  # where episodes start
+        panel.set_ylabel('z (m)')
+    panels[0].set(
+        xlim=(x[0], x[-1]), ylim=(low - room, high + room), title=f'{terrain.name} ({terrain.type})'
+    )
+    panels[-1].set_xlabel('x (m)')
+
+
+def _plot_maps(
+    figure: Any,
+    terrain: terrains.Terrain,
+    draws: int,
+    length: float,
+    seed: int,
+    terrain_level: float,
+) -> None:
+    panels = figure.subplots(1, draws, sharex=True, sharey=True, squeeze=False)[0]
+    count = min(MAP_POINTS, max(2, round(length / (0.25 * terrains.GRID))))
+    # Middles of pixels.
+    places = ((np.arange(count) + 0.5) / count - 0.5) * length
+    maps, starts = [], []
+    for i in range(draws):
+        sequence = np.random.SeedSequence((seed, i))
+        ground = terrains.SpatialGround(terrain, sequence, terrain_level=terrain_level)
+        starts.append(ground.spawn(np.random.default_rng(sequence)))
+        # Line by line, each of which meets few of the boxes.
+        maps.append(np.stack([ground.height(places, y) for y in places]))
+    low, high = float(np.min(maps)), float(np.max(maps))
+    if low == high:
+        low, high = low - 0.5, high + 0.5
+    half = 0.5 * length
+    for panel, heights, (x, y, heading) in zip(panels, maps, starts, strict=True):
+        image = panel.imshow(
+            heights, origin='lower', extent=(-half, half, -half, half), vmin=low, vmax=high,
+            cmap='viridis', interpolation='nearest',
+        )  # fmt: skip
+        panel.annotate(
+            '', xytext=(x, y),
+            xy=(x + 0.06 * length * np.cos(heading), y + 0.06 * length * np.sin(heading)),
+            arrowprops={'arrowstyle': '->', 'color': 'tab:red', 'linewidth': 1.5},
+        )  # fmt: skip
+        panel.set_xlabel('x (m)')
+    panels[0].set_ylabel('y (m)')
+    figure.suptitle(f'{terrain.name} ({terrain.type})')
+    figure.colorbar(image, ax=list(panels), label='z (m)')
+
+
+def height_map(
+    environment: composer.Environment, path: Path | None = None, reach: float = 1.0
+) -> np.ndarray:
+    """Draws the 32 x 32 heights that a character observes, from above.
+
+    Ahead is up, the character's left is left; a dark square is where it stands. Ground as high as
+    that under the character is light; brown is higher, blue lower. What a task mirrors is shown
+    mirrored.
+
+    Args:
+      environment: one whose task observes such a map (`terrain_observation='height'`), after `reset`.
+      path: where to write it as .png; not written if None.
+      reach: height, up or down, of the full colour, m.
+
+    Returns:
+      The picture, shape (256, 256, 3), uint8.
+
+    Raises:
+      ValueError: the task observes no such map, reach is not positive, or another suffix.
+      ImportError: a path is given and the extra 'video' is not installed.
+      OSError: the file cannot be written.
+    """
+    task: Any = environment.task
+    part = getattr(task, 'blocks', {}).get('terrain', slice(0, 0))
+    if part.stop - part.start != SAMPLES**2:
+        raise ValueError(
+            f'the task {type(task).__name__}, which observes no map of {SAMPLES} x {SAMPLES} heights, has '
+            "none to draw; 3D imitation and footsteps observe one with the option terrain_observation='height'"
+        )
+    if not 0 < reach < np.inf:
+        raise ValueError(f'reach is {reach}; expected a positive number of metres')
+    # Lines from the left, each from behind.
+    heights = task.observation[0, part].reshape(SAMPLES, SAMPLES).T[::-1]
+    share = np.clip(heights / reach, -1, 1)[..., None]
+    full = np.where(share < 0, np.array(LOWER, float), np.array(HIGHER, float))
+    colours = np.array(LEVEL) + np.abs(share) * (full - np.array(LEVEL))
+    image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
+    # The middle of a sample's square is where it was taken.
+    behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
+    env_id = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
+    column = round(0.5 * SAMPLES * MAP_PIXELS)
+    mark = MAP_PIXELS // 2
+    image[env_id - mark : env_id + mark, column - mark : column + mark] = ROOT_COLOUR
+    if path is not None:
+        imageio = _optional('imageio.v3')
+        with replacing(check_path(path, IMAGE_SUFFIXES)) as file:
+            imageio.imwrite(file, image)
+    return image
+
+
+def _image(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise ValueError(
+            f'a frame has shape {image.shape} and type {image.dtype}; expected (h, w, 3) of uint8'
+        )
+    return image
+
+
+def _optional(name: str) -> Any:
+    """Imports a module of the extra 'video'."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition('.')[0]
+        raise ImportError(
+            f"{package} is needed for this and missing; pip install 'trl_suite[video]'"
+        ) from error

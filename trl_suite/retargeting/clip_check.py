@@ -1,0 +1,168 @@
+"""What is wrong with a clip on a character, frame by frame: limits, ground, feet.
+
+from trl_suite import motion
+from trl_suite.retargeting import clip_check
+
+report = clip_check.check(motion.load('biped2d_walk'), 'biped2d')
+print(report)
+for fault in report.faults:
+    print(fault.frame, fault.kind, fault.name, fault.amount, fault.unit)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from trl_suite import characters
+from trl_suite.motion import Clip, quaternion
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.util import tables
+
+# What is a fault. Our own clips have none of these, see mocap/README.md.
+EXCESS = 1e-3  # rad beyond a joint's limits (m of a slide)
+DEPTH = 0.01  # m below the ground
+SLIDE = 0.02  # m that a corner of a foot travels in one contact
+NEAR = 0.005  # m; a corner of a foot lower than this is in contact
+KINDS = ('joint limit', 'penetration', 'foot slide')
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong in one frame.
+
+    Attributes:
+      frame: from 0 on.
+      time: of the frame, s.
+      kind: one of `KINDS`.
+      name: of the joint or link.
+      amount: by how much a limit is passed, how deep it is, or how far it has slid.
+      unit: of the amount.
+    """
+
+    frame: int
+    time: float
+    kind: str
+    name: str
+    amount: float
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """What was measured in n frames.
+
+    Attributes:
+      name: of the clip.
+      times: of the frames, s, (n,).
+      excess: by joint, rad beyond the limits (m of a slide), 0 within them, (n,).
+      units: of every joint's excess, 'rad' or 'm'.
+      depth: by link, m of its lowest corner below the ground, 0 above it, (n,).
+      slide: by foot, m that a corner in contact is away from where its contact began, the most of
+        all its corners, 0 without contact, (n,).
+    """
+
+    name: str
+    times: np.ndarray
+    excess: dict[str, np.ndarray]
+    units: dict[str, str]
+    depth: dict[str, np.ndarray]
+    slide: dict[str, np.ndarray]
+
+    @functools.cached_property
+    def faults(self) -> tuple[Fault, ...]:
+        """All faults, frame by frame."""
+        parts = (self.excess, EXCESS), (self.depth, DEPTH), (self.slide, SLIDE)
+        found = [
+            Fault(
+                int(i), float(self.times[i]), kind, name, float(values[i]),
+                self.units[name] if measured is self.excess else 'm',
+            )
+            for kind, (measured, most) in zip(KINDS, parts, strict=True)
+            for name, values in measured.items()
+            for i in np.flatnonzero(values > most)
+        ]  # fmt: skip
+        return tuple(sorted(found, key=lambda fault: fault.frame))
+
+    def __str__(self) -> str:
+        """A table: a line for every kind and joint or link, with the worst frame."""
+        groups: dict[tuple[str, str], list[Fault]] = {}
+        for fault in self.faults:
+            groups.setdefault((fault.kind, fault.name), []).append(fault)
+        title = f'{self.name}: {len(self.times)} frames, {self.times[-1]:.3g} s'
+        if not groups:
+            return f'{title}, no faults'
+        rows = []
+        for (kind, name), found in sorted(groups.items()):
+            worst = max(found, key=lambda fault: fault.amount)
+            rows.append(
+                (kind, name, len(found), found[0].frame, found[-1].frame,
+                 f'{worst.amount:.3g}', worst.unit, worst.frame)
+            )  # fmt: skip
+        header = ('fault', 'where', 'frames', 'first', 'last', 'worst', '', 'in frame')
+        return f'{title}\n{tables.table(header, rows)}'
+
+
+def check(clip: Clip, character: str | characters.CharacterSpec, near: float = NEAR) -> Report:
+    """Measures a clip on level ground at height 0, at its own frames.
+
+    Args:
+      clip: whose joints are those of the character.
+      character: name or row.
+      near: height under which a corner of a foot is in contact, m. Feet are the end effectors.
+
+    Raises:
+      ValueError: an unknown character, or a clip of other joints.
+    """
+    figure = KinematicViewer(character)
+    layout, own = figure.layout, clip.layout
+    if (own.root, own.joints, own.sizes) != (layout.root, layout.joints, layout.sizes):
+        raise ValueError(
+            f'clip {clip.name!r} (root {own.root}, joints {", ".join(own.joints)}) is none of '
+            f'{figure.character.spec.name!r} (root {layout.root}, joints {", ".join(layout.joints)})'
+        )
+    corners = np.empty((len(clip.times), len(figure.links), 8, 3))
+    for i, pose in enumerate(clip.poses):
+        figure.put(pose)
+        corners[i] = figure.corners()
+    deep = np.maximum(0.0, -corners[..., 2].min(2))
+    depth: dict[str, np.ndarray] = {}
+    for name, values in zip(figure.links, deep.T, strict=True):
+        depth[name] = np.maximum(values, depth.get(name, 0.0))
+    slide = {
+        foot: _slide(corners[:, [name == foot for name in figure.links]], near)
+        for foot in figure.character.spec.end_effectors
+    }
+    units = dict(
+        zip(layout.joints, np.where(figure.character.prismatic, 'm', 'rad').tolist(), strict=True)
+    )
+    return Report(clip.name, clip.times, _excess(clip, figure), units, depth, slide)
+
+
+def _excess(clip: Clip, figure: KinematicViewer) -> dict[str, np.ndarray]:
+    found = {}
+    for joint, size, (low, high) in zip(
+        clip.joints, clip.sizes, figure.character.joint_ranges, strict=True
+    ):
+        column, _ = clip.layout.starts(joint)
+        values = clip.poses[:, column]
+        if size == 4:  # one cone about the zero pose
+            turns = quaternion.rotation_vector(clip.poses[:, column : column + 4])
+            values, low = np.linalg.norm(turns, axis=1), -np.inf
+        found[joint] = np.maximum(0.0, np.maximum(low - values, values - high))
+    return found
+
+
+def _slide(corners: np.ndarray, near: float) -> np.ndarray:
+    """Returns how far corners (n, ..., 3) are from where their contacts began, the most, (n,)."""
+    points = corners.reshape(len(corners), -1, 3)
+    low = points[..., 2] < near
+    begin, result = points[0, :, :2].copy(), np.zeros(len(points))
+    for i in range(len(points)):
+        fresh = low[i] & ~low[i - 1] if i else low[i]
+        begin[fresh] = points[i, fresh, :2]
+        away = np.linalg.norm(points[i, :, :2] - begin, axis=1)
+        result[i] = away[low[i]].max(initial=0.0)
+    return result

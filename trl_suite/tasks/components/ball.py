@@ -1,0 +1,262 @@
+"""A ball to dribble to a goal: the body, where it is put, what is seen of it, what it is worth.
+
+Source: the soccer scenario of the original; 'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import SpatialArena
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
+from trl_suite.tasks.components.goals import GOAL_COLOUR
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
+from trl_suite.tasks.task import Marker, drawn_way
+from trl_suite.terrain import PRESETS3D
+from trl_suite.util.compiled import compiled, compiled_inline
+
+LEVEL = ('plane', 'var3d_flat')  # types of ground on which a ball may lie
+RADIUS, MASS = 0.2, 0.1  # m, kg
+FRICTION = (0.45, 0.005, 0.0001)  # 0.5 * 0.9, wherever it lies
+SOLREF = (0.01, 1)  # soft enough for a tenth of a kilogram
+DRAG = 0.5  # share of its velocity that is left after a second
+BALL_AWAY = (0.7, 10.0)  # m from the walker, where it is put
+BALL_LASTS = (100.0, 200.0)  # s until it is put elsewhere
+GOAL_AWAY = (0.0, 10.0)  # m from the ball
+AT_GOAL, NEAR = 0.5, 2.0  # m; ball from goal and from walker, for full reward
+SPEED = 1.0  # m/s, of walker and ball
+SPEED_SHARPNESS, BALL_SHARPNESS, GOAL_SHARPNESS = 1.5, 0.5, 0.5
+# Walker towards the ball, walker near it, ball towards the goal, ball near it.
+SOCCER_TERMS = {
+    'approach': (0.2 / 1.2, SPEED_SHARPNESS), 'near': (0.2 / 1.2, BALL_SHARPNESS),
+    'dribble': (0.4 / 1.2, SPEED_SHARPNESS), 'goal': (0.4 / 1.2, GOAL_SHARPNESS),
+}  # fmt: skip
+MIRRORED = (-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # signs of what is seen, in a mirror
+_WEIGHTS = np.array([weight for weight, _ in SOCCER_TERMS.values()])
+_APPROACH, _NEAR, _DRIBBLE, _GOAL = range(len(SOCCER_TERMS))
+
+
+class BallState(NamedTuple):
+    """What a task knows of each ball, (n, ...).
+
+    Attributes:
+      due: control step of the episode at which it is put elsewhere.
+      begin: where it was at the beginning of the step, (n, 3) m.
+      walker: where the walker's centre of mass was then, (n, 3) m.
+      at_goal: whether it is at the goal.
+      wanted: whether it is to be put elsewhere now.
+    """
+
+    due: np.ndarray
+    begin: np.ndarray
+    walker: np.ndarray
+    at_goal: np.ndarray
+    wanted: np.ndarray
+
+
+class BallRules(NamedTuple):
+    """Balls for compiled functions.
+
+    Attributes:
+      qpos, dof: where the columns of positions (7) and of velocities (6) begin; -1: there is none.
+      body: its body.
+      column: where the block ball begins in the observation.
+      target_speed: m/s of walker and ball from which on the reward is full.
+      goal_radius: m; nearer to the goal, with the walker near, the reward is full.
+    """
+
+    qpos: int
+    dof: int
+    body: int
+    column: int
+    target_speed: float
+    goal_radius: float
+    state: BallState
+
+
+def ball_state(n: int) -> BallState:
+    """Makes room for what is known of n balls."""
+    return BallState(
+        np.zeros(n, int), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool), np.zeros(n, bool)
+    )
+
+
+def no_ball(n: int) -> BallRules:
+    """What stands for the balls of a task without."""
+    return BallRules(-1, -1, -1, -1, 0.0, 0.0, ball_state(n))
+
+
+# Of simulation i.
+
+
+@compiled
+def remember(i: int, physics: SpatialState, found: SpatialMeasurement, ball: BallRules) -> None:
+    """Notes where ball and walker are at the beginning of a step."""
+    for k in range(3):
+        ball.state.begin[i, k] = physics.qpos[i, ball.qpos + k]
+        ball.state.walker[i, k] = found.com[i, k]
+
+
+@compiled
+def dribble(
+    i: int, first: int, share: float, seconds: float, goal: np.ndarray, physics: SpatialState,
+    found: SpatialMeasurement, ball: BallRules, terms: np.ndarray,
+) -> float:  # fmt: skip
+    """Writes what a step was worth, and whether the ball is at its goal.
+
+    Args:
+      i: which simulation.
+      first: column of the first of the terms of `SOCCER_TERMS`.
+      share: of these terms in the reward.
+      seconds: duration of the step.
+      goal: of the balls, (n, 3) m.
+      physics, found: of all simulations, at the end of the step.
+      ball: where it and the walker were at the beginning.
+      terms: of the reward, (n, k).
+
+    Returns:
+      The ball's speed towards the goal, m/s.
+    """
+    walker, begin = ball.state.walker, ball.state.begin
+    x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
+    z = physics.qpos[i, ball.qpos + 2]
+    gap_x, gap_y = x - walker[i, 0], y - walker[i, 1]
+    towards_ball = _speed_along(
+        found.com[i, 0] - walker[i, 0], found.com[i, 1] - walker[i, 1], gap_x, gap_y, seconds
+    )
+    towards_goal = _speed_along(
+        x - begin[i, 0], y - begin[i, 1], goal[i, 0] - begin[i, 0], goal[i, 1] - begin[i, 1],
+        seconds,
+    )  # fmt: skip
+    gap = gap_x * gap_x + gap_y * gap_y
+    left_x, left_y, left_z = goal[i, 0] - x, goal[i, 1] - y, goal[i, 2] - z
+    left = math.sqrt(left_x * left_x + left_y * left_y + left_z * left_z)
+    arrived = left < ball.goal_radius
+    ball.state.at_goal[i] = arrived
+    lack = min(towards_ball - ball.target_speed, 0.0)
+    terms[i, first + _APPROACH] = math.exp(-SPEED_SHARPNESS * (lack * lack))
+    terms[i, first + _NEAR] = math.exp(-BALL_SHARPNESS * gap)
+    lack = min(towards_goal - ball.target_speed, 0.0)
+    worth = math.exp(-SPEED_SHARPNESS * (lack * lack)) if towards_goal > 0.0 else 0.0
+    terms[i, first + _DRIBBLE] = worth
+    terms[i, first + _GOAL] = math.exp(-GOAL_SHARPNESS * left)
+    for k in range(len(_WEIGHTS)):
+        if arrived and gap < NEAR * NEAR:
+            terms[i, first + k] = 1.0
+        terms[i, first + k] = terms[i, first + k] * _WEIGHTS[k] * share
+    return towards_goal
+
+
+@compiled_inline
+def _speed_along(
+    moved_x: float, moved_y: float, way_x: float, way_y: float, seconds: float
+) -> float:
+    """Speed of a displacement along a direction on the ground, m/s."""
+    length = max(math.sqrt(way_x * way_x + way_y * way_y), 1e-9)
+    return (moved_x * way_x + moved_y * way_y) / length / seconds
+
+
+@compiled
+def observe_ball(
+    i: int, column: int, goal: np.ndarray, physics: SpatialState, found: SpatialMeasurement,
+    ball: BallRules, observation: np.ndarray,
+) -> None:  # fmt: skip
+    """Writes the goal as seen from the ball, and the block ball, in the heading frame.
+
+    Of the goal (n, 3) bearing and distance, rad and m, in `column` and the next. Of the ball
+    bearing, distance and height, rad, m and m; velocity, m/s; angular velocity, rad/s.
+    """
+    x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
+    bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, found)
+    observation[i, column], observation[i, column + 1] = bearing, distance
+    bearing, distance = polar(i, x - found.root[i, 0], y - found.root[i, 1], found)
+    column = ball.column
+    observation[i, column], observation[i, column + 1] = bearing, distance
+    observation[i, column + 2] = physics.qpos[i, ball.qpos + 2]
+    ahead, left = ahead_and_left(i, physics.qvel[i, ball.dof], physics.qvel[i, ball.dof + 1], found)
+    observation[i, column + 3], observation[i, column + 4] = ahead, left
+    observation[i, column + 5] = physics.qvel[i, ball.dof + 2]
+    spin = physics.cvel[i, ball.body]
+    ahead, left = ahead_and_left(i, spin[0], spin[1], found)
+    observation[i, column + 6], observation[i, column + 7] = ahead, left
+    observation[i, column + 8] = spin[2]
+
+
+class Ball:
+    """One ball in every simulation of a world.
+
+    Attributes:
+      qpos, dof: its columns of positions (7) and of velocities (6).
+    """
+
+    def __init__(self, arena: SpatialArena) -> None:
+        """Adds it to an arena; `bind` ties it to the compiled world.
+
+        Raises:
+          ValueError: the ground of the arena is not level.
+        """
+        ground = arena.terrain
+        if ground.type not in LEVEL:
+            level = ', '.join(name for name, each in PRESETS3D.items() if each.type in LEVEL)
+            raise ValueError(
+                f'a ball needs level ground, and terrain {ground.name!r} ({ground.type}) is not; '
+                f'presets that are: {level}'
+            )
+        root = arena.mjcf_model
+        body = root.worldbody.add('body', name='ball', pos=(0, 0, RADIUS))
+        body.add('freejoint', name='ball')
+        root.asset.add(
+            'texture', name='ball', type='cube', builtin='checker', width=64, height=64,
+            rgb1=(0.95, 0.95, 0.95), rgb2=(0.15, 0.15, 0.15),
+        )  # fmt: skip
+        root.asset.add('material', name='ball', texture='ball')
+        body.add(
+            'geom', name='ball', type='sphere', size=(RADIUS,), mass=MASS, material='ball', condim=3,
+            friction=FRICTION, priority=1, solref=SOLREF, contype=0, conaffinity=7,
+        )  # fmt: skip
+
+    def bind(self, world: World) -> None:
+        self.world = world
+        (qpos,), (dof,) = world.joint_addresses(['ball'])
+        self.qpos, self.dof = qpos + np.arange(7), dof + np.arange(6)
+        (self._body,) = world.body_ids(['ball'])
+        inertia = 0.4 * MASS * RADIUS**2
+        rate = -np.log(DRAG)
+        for env_id, model in enumerate(world.models):
+            model.dof_damping[self.dof] = np.repeat([MASS * rate, inertia * rate], 3)
+            world.set_const(env_id)
+
+        self.state = ball_state(world.n)
+
+    def rules(self, column: int, target_speed: float, goal_radius: float) -> BallRules:
+        """Returns the balls for compiled functions; see `BallRules`."""
+        qpos, dof = int(self.qpos[0]), int(self.dof[0])
+        return BallRules(qpos, dof, int(self._body), column, target_speed, goal_radius, self.state)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where the balls are, (n, 3) m; a copy."""
+        return self.world.qpos[:, self.qpos[:3]]
+
+    def put(self, env_id: int, place: np.ndarray, count: int, random: np.random.Generator) -> None:
+        """Puts one ball, at rest, about a place (x, y) on level ground, at a control step."""
+        x, y = place + drawn_way(random, *BALL_AWAY)
+        self.world.qpos[env_id, self.qpos] = x, y, RADIUS, 1, 0, 0, 0
+        self.world.qvel[env_id, self.dof] = 0.0
+        lasts = random.uniform(*BALL_LASTS)
+        self.state.due[env_id] = count + round(lasts / CONTROL_TIMESTEP)
+
+    def goal(
+        self, env_id: int, random: np.random.Generator, away: tuple[float, float] = GOAL_AWAY
+    ) -> np.ndarray:
+        """Draws a goal about one ball, between two distances (m) from it, (3,) m."""
+        return np.append(self.world.qpos[env_id, self.qpos[:2]] + drawn_way(random, *away), 0.0)
+
+
+def goal_disc(goal: np.ndarray, radius: float) -> Marker:
+    """Returns what lies at the goal (3,) m of a ball."""
+    return Marker('cylinder', goal, (radius, 0.005, 0.0), GOAL_COLOUR)

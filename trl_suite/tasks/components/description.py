@@ -1,0 +1,190 @@
+"""Sections on tasks that several task types have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite.tasks.components import rewards
+from trl_suite.util.tables import Section, Table, section
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
+
+Meanings = dict[str, tuple[str, str]]  # unit and meaning of observation blocks
+REWARD_WEIGHT = 'reward weight'  # title of a column of links
+REWARD = 'Reward: sum of weight * exp(-scale * error), at most 1; 0 after a fall'
+PLAN_BLOCKS: Meanings = {
+    'contact': ('1', 'whether the right and the left foot touch the ground'),
+    'plan': ('m, rad', 'see below'),
+}
+# What terms of a reward compare with the clip, or the step.
+_ERRORS = {
+    'pose': 'angles of joints and root, mean weighted as in Links; rad^2',
+    'velocity': 'their rates, mean weighted alike; rad^2/s^2',
+    'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
+    'root': 'height of the root above the ground; m^2',
+    'heading': '-',
+}
+_ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
+
+# Size, unit and meaning of the parts of a plan.
+_PLAN = (
+    (3, 'm', 'first landing place from the right foot; 0 while that one stands'),
+    (3, 'm', 'first landing place from the left foot; 0 while that one stands'),
+    (3, 'm', 'second landing place from the right foot; 0 unless that one stands'),
+    (3, 'm', 'second landing place from the left foot; 0 unless that one stands'),
+    (1, 'rad', 'planned heading, to the left of the present one'),
+)
+_MIRRORED_PLAN = (
+    (1, 'rad', 'planned heading, to the swing side of the present one'),
+    (3, 'm', 'first landing place from the swing foot'),
+    (3, 'm', 'second landing place from the stance foot'),
+)
+
+
+def reward_weights(task: Any) -> tuple[str, Iterable[object]]:
+    """Returns the title of a column of links, and the reward weight of each joint."""
+    return REWARD_WEIGHT, [joint.weight for joint in task.character.spec.joints.values()]
+
+
+def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
+    """Returns the terms of a reward for tracking.
+
+    Args:
+      task: it has them.
+      steps: whether footsteps are tracked, not a clip.
+      more: meanings of terms that only this task has; terms without a meaning are left out.
+    """
+    average = 'sum' if steps else 'mean'
+    errors = {
+        **_ERRORS,
+        'end_effector': f'joints of the end effectors, their way from {_ABOUT[task.ABOUT]} and their '
+        f'height above the ground, {average} over them; m^2',
+        **more,
+    }
+    return Table(
+        ('term', 'weight', 'scale', 'error: squared difference of'),
+        [
+            (name, weight, '' if name == 'heading' else scale, errors[name])
+            for name, (weight, scale) in task.TERMS.items()
+            if name in errors
+        ],
+    )
+
+
+def action(environment: Environment) -> Section:
+    """Returns what the actions drive."""
+    action_map = environment.action_map
+    title, limits = _limits(environment)
+    unit = '' if action_map.unit == '1' else f' in {action_map.unit}'
+    columns = (np.round(action_map.action_offset, 9) + 0.0, action_map.action_scale, limits)
+    return section(
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity}{unit} = action_offset + '
+        'action_scale * action',
+        Table(
+            ('drives', 'action_offset', 'action_scale', title),
+            list(zip(action_map.names, *map(floats, columns), strict=True)),
+            numbered=True,
+        ),
+    )
+
+
+def _limits(environment: Environment) -> tuple[str, Any]:
+    """Returns what limits each action's effect, and how much."""
+    task: Any = environment.task
+    actuators = environment.physics.bind(task.root_entity.mjcf_model.find_all('actuator'))
+    if environment.action_map.quantity == 'excitation':
+        return 'peak force (N)', np.asarray(actuators.gainprm)[:, 2]
+    ball, limits = task.character.spherical, task.character.torque_limits
+    names = environment.action_map.names
+    if not ball.any():
+        return 'torque limit (N m)', limits
+    if task.actuation_model == 'velocity':
+        limits = np.where(ball, limits / np.sqrt(3), limits)
+    # Every ball joint takes as many numbers.
+    each = (len(names) - np.count_nonzero(~ball)) // np.count_nonzero(ball)
+    norm = '' if task.actuation_model == 'velocity' else ', norm'
+    return f'torque limit (N m{norm})', np.repeat(limits, np.where(ball, each, 1))
+
+
+def time(spec: EnvSpec, task: Any) -> Section:
+    """Returns rates, and how long an episode is."""
+    control, physics = 1 / task.control_timestep, 1 / task.physics_timestep
+    return section(
+        'Time',
+        f'control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut (discount 1) after '
+        f'{spec.step_limit} steps, {spec.step_limit * task.control_timestep:.3g} s',
+    )
+
+
+def floats(values: Any) -> list[float]:
+    """Returns plain numbers."""
+    return [float(value) for value in values]
+
+
+def plan(task: Any, mirrored: bool = False) -> Section:
+    """Returns where the parts of a plan are in the observation."""
+    parts = _MIRRORED_PLAN if mirrored else _PLAN
+    starts = task.blocks['plan'].start + np.cumsum([0, *(size for size, _, _ in parts)])
+    return section(
+        'Plan in the observation (x, y, and z above the ground at the root)',
+        Table(
+            ('from', 'to', 'size', 'unit', 'meaning'),
+            [
+                (int(start), int(start) + size, size, unit, text)
+                for start, (size, unit, text) in zip(starts[:-1], parts, strict=True)
+            ],
+        ),
+        *([] if task.character.spec.spatial else ['in the plane y and the heading are 0']),
+    )
+
+
+def span(values: tuple[float, float]) -> str:
+    """Returns a range of lengths in m."""
+    low, high = values
+    return f'{low:g} m' if low == high else f'{low:g} to {high:g} m'
+
+
+def clip(task: Any) -> Section:
+    """Returns the clip that is tracked."""
+    clip = task.clip
+    return section(
+        f'Clip: {clip.name}',
+        f'{clip.description}; period {clip.duration:.4g} s, {clip.speed:.3g} m/s',
+    )
+
+
+def fall(task: Any, missed: str = '') -> Section:
+    """Returns when an episode fails; `missed` is a further reason."""
+    return section(
+        'Termination (discount 0)',
+        f'a fall: one of {", ".join(task.character.spec.fall_links)} touches the ground at the end of a step; '
+        f'{missed}or the physics diverges',
+    )
+
+
+def missed(task: Any) -> str:
+    """Returns that a landing error ends an episode, where it does."""
+    if task.max_landing_error is None:
+        return ''
+    return f'a foot lands more than {task.max_landing_error:g} m from its place; '
+
+
+def contact_share(threshold: float, decay: float, gain: float) -> str:
+    """Returns when the running share of contacts `d` is too large."""
+    return (
+        f'd > {threshold:g}: at every sample d becomes {decay:g} d, and 1/{1 / gain:.0f} more if one '
+        'touches'
+    )
+
+
+def samples_until_fall(threshold: float, decay: float, gain: float) -> int:
+    """Returns how many samples with a contact in a row make a fall."""
+    share, count = 0.0, 0
+    while share <= threshold:
+        share, count = decay * share + gain, count + 1
+    return count

@@ -1,0 +1,124 @@
+"""A plan of two footsteps and a heading, as a component of tasks: state, switches, what is seen."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.characters import CharacterSpec
+from trl_suite.kinematics.spatial import SpatialMeasurement, ahead_and_left
+from trl_suite.tasks.components.rewards import wrapped
+from trl_suite.tasks.task import Marker
+from trl_suite.util.compiled import compiled
+
+RIGHT, LEFT = 0, 1  # of the end effectors, in link order
+SIDE = np.array([-1.0, 1.0])  # of each foot: to the right, to the left
+CONTACT_SIZE, PLAN_SIZE = 2, 13
+SOLE, SOLE_AHEAD = (0.0885, 0.045, 0.004), 0.052  # m; of the markers, and how far before the ankle
+SWING_COLOUR, STANCE_COLOUR = (0.95, 0.55, 0.1, 0.9), (0.15, 0.45, 0.9, 0.9)  # who lands there
+
+
+class FootstepPlan(NamedTuple):
+    """The plan of each simulation.
+
+    Attributes:
+      stance: foot that stands, (n,).
+      landing: where the swing foot lands, then the stance foot, (n, 2, 3) m.
+      heading: planned, (n,) rad.
+      landing_error: of the last foot that landed, horizontal, (n,) m; 0 before any landing.
+      heading_error: at that moment, (n,) rad.
+      landed: whether a foot landed in the last step, (n,).
+    """
+
+    stance: np.ndarray
+    landing: np.ndarray
+    heading: np.ndarray
+    landing_error: np.ndarray
+    heading_error: np.ndarray
+    landed: np.ndarray
+
+
+def footstep_plan(n: int) -> FootstepPlan:
+    """Makes room for the plans of n simulations."""
+    return FootstepPlan(
+        np.zeros(n, int),
+        np.zeros((n, 2, 3)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n, bool),
+    )
+
+
+@compiled
+def update_stance(i: int, phase: float, found: SpatialMeasurement, plan: FootstepPlan) -> bool:
+    """Switches the stance foot if the phase says so, and records how well the other has landed.
+
+    Returns:
+      Whether it switched.
+    """
+    stance = 1 if phase >= 0.5 else 0
+    if stance == plan.stance[i]:
+        return False
+    plan.stance[i] = stance  # the foot that has just landed
+    x = found.feet[i, stance, 0] - plan.landing[i, 0, 0]
+    y = found.feet[i, stance, 1] - plan.landing[i, 0, 1]
+    plan.landing_error[i] = math.hypot(x, y)
+    plan.heading_error[i] = abs(wrapped(plan.heading[i] - found.heading[i]))
+    return True
+
+
+@compiled
+def observe_plan(
+    i: int, contact: int, column: int, found: SpatialMeasurement, plan: FootstepPlan,
+    observation: np.ndarray,
+) -> None:  # fmt: skip
+    """Writes the blocks contact and plan at these columns; see `SpatialFootsteps`."""
+    for foot in range(2):
+        observation[i, contact + foot] = found.contact[i, foot]
+    for k in range(PLAN_SIZE - 1):
+        observation[i, column + k] = 0.0
+    for which in range(2):
+        foot = plan.stance[i] if which else 1 - plan.stance[i]
+        ahead, left = ahead_and_left(
+            i, plan.landing[i, which, 0] - found.feet[i, foot, 0],
+            plan.landing[i, which, 1] - found.feet[i, foot, 1], found,
+        )  # fmt: skip
+        slot = column + 6 * which + 3 * foot
+        observation[i, slot], observation[i, slot + 1] = ahead, left
+        observation[i, slot + 2] = plan.landing[i, which, 2] - found.under[i]
+    off = wrapped(plan.heading[i] - found.heading[i])
+    observation[i, column + PLAN_SIZE - 1] = off
+
+
+def plan_mirror(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how the blocks contact and plan are reflected: index and sign."""
+    if name == 'contact':
+        return np.array([1, 0]), np.ones(CONTACT_SIZE)
+    index = np.arange(PLAN_SIZE)
+    index[:12] = np.arange(12).reshape(2, 2, 3)[:, ::-1].ravel()
+    return index, np.append(np.tile([1.0, -1.0, 1.0], 4), -1.0)
+
+
+def plan_markers(env_id: int, root: np.ndarray, plan: FootstepPlan) -> list[Marker]:
+    """Where the feet are to land, and which way the body at `root` (3,) m is to head."""
+    yaw = float(plan.heading[env_id])
+    ahead = SOLE_AHEAD * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    colours = SWING_COLOUR, STANCE_COLOUR
+    soles = [
+        Marker('box', place + ahead + (0, 0, SOLE[2]), SOLE, colour, yaw)
+        for place, colour in zip(plan.landing[env_id], colours, strict=True)
+    ]
+    return [*soles, Marker('arrow', root, (0.012, 0.012, 0.5), SWING_COLOUR, yaw)]
+
+
+def check_two_feet(spec: CharacterSpec) -> None:
+    """Checks that a character has two feet to place.
+
+    Raises:
+      ValueError: it has not.
+    """
+    if len(spec.end_effectors) != 2:
+        raise ValueError(f'character {spec.name!r} has no two feet to place')

@@ -1,0 +1,168 @@
+"""Sections on tasks of a walker in three dimensions that several task types have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from trl_suite import terrain
+from trl_suite.tasks.components import ball, goals
+from trl_suite.tasks.components.description import PLAN_BLOCKS, Meanings, plan, span
+from trl_suite.terrain import SpatialGround
+from trl_suite.terrain.spatial import ground
+from trl_suite.terrain.spatial.layout import Layout
+from trl_suite.util.tables import Section, Table, section
+
+if TYPE_CHECKING:
+    from trl_suite.registry.spec import EnvSpec
+
+BLOCKS: Meanings = {
+    'terrain': (
+        'm',
+        'ground heights above the ground at the root, 32 lines from the left to the right (5.5 m to each '
+        'side), each of 32 from 1 m behind to 10 m ahead',
+    ),
+    'pose': (
+        'm, 1',
+        'root height above ground; then of each link its centre from the root and its orientation (wxyz)',
+    ),
+    'velocity': (
+        'm/s, rad/s',
+        'of each link the velocity of its centre, against the ground under the root, and its angular '
+        'velocity',
+    ),
+    'phase': ('1', 'phase of the cycle in [0, 1); then the one-hot of its quarter'),
+    'reference': (
+        'm, m/s',
+        "the clip's root height; its link centres from its root; their velocities",
+    ),
+    'goal': (
+        'rad, m',
+        'bearing (positive to the left) and distance of the point on the line of the start that is 3 m '
+        'further on',
+    ),
+    **PLAN_BLOCKS,
+}
+# Of a task whose goal moves, or whose ball has one.
+TARGETS = {
+    False: ('rad, m', 'bearing (positive to the left) and distance of the goal'),
+    True: ('rad, m', 'bearing and distance of the goal as seen from the ball'),
+}
+BALL_BLOCK = (
+    'rad, m, m/s, rad/s',
+    'bearing, distance and height of the ball; its velocity (3) and its angular velocity (3)',
+)
+_MIRRORED_BLOCKS = {
+    'phase': ('1', 'phase of the step in [0, 1); then the one-hot of its half'),
+    'contact': ('1', 'whether the stance and the swing foot touch the ground'),
+}
+
+
+def blocks(task: Any) -> Meanings:
+    """Returns units and meanings of the observation blocks."""
+    found = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
+    if hasattr(task, 'goals') or getattr(task, 'hidden_plan', False):
+        found['goal'] = TARGETS['ball' in task.blocks]
+    return found
+
+
+def after(task: Any) -> Iterator[Section]:
+    """Yields where links and parts of a plan are in the observation."""
+    links = list(task.character.spec.links)
+    pose, velocity = task.blocks['pose'].start + 1, task.blocks['velocity'].start
+    if task.mirrored:
+        # In right stance; in left stance links change places.
+        yield section(
+            'Mirrored: while the left foot stands, all is seen in a mirror, and actions are mirrored back',
+            'then what is called right below is the left side',
+        )
+    yield section(
+        'Links in the observation (centre 3 and orientation 4; velocity 3 and angular velocity 3)',
+        Table(
+            ('link', 'pose from', 'to', 'velocity from', 'to'),
+            [
+                (name, *(pose + 7 * i + k for k in (0, 7)), *(velocity + 6 * i + k for k in (0, 6)))
+                for i, name in enumerate(links)
+            ],
+        ),
+    )
+    if 'plan' in task.blocks:
+        yield plan(task, task.mirrored)
+
+
+def start(spec: EnvSpec) -> Section:
+    """Returns where an episode begins."""
+    layout = _layout(spec)
+    where = {
+        'start': 'at the origin, heading along x',
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
+        f'within {ground.START_ROOM:g} m, with any heading',
+        'trail': f'on the middle of the trail and along it, anywhere up to '
+        f'{ground.TRAIL_SPAN - ground.TRAIL_PAD:g} m from the origin along x and along y',
+    }
+    return section('Start', where[layout.place])
+
+
+def goal(spec: EnvSpec, task: Any, rule: str) -> Section:
+    """Returns where the goal is drawn, by a rule of `terrain.ground`, and when it changes."""
+    layout = _layout(spec)
+    segments = '1 to 10 segments'
+    near = f'up to {ground.GOAL_SPREAD:g} m from the walker along x and along y'
+    if rule == 'near':
+        segments = 'one segment'
+        near = f'1 to {ground.GOAL_SPREAD:g} m ahead of the walker along x, where y is 0'
+    where = {
+        'start': near,
+        'clear': f'up to {layout.span:g} m from the origin along x and along y, where nothing stands or moves '
+        f'within {layout.goal_room:g} m',
+        'trail': f'{segments} of the trail (2 m each) beyond the nearest, up to {ground.TRAIL_OFFSET:g} of '
+        'its width beside its middle',
+    }[layout.place]
+    away = getattr(task.config, 'goal_distance', None)
+    if away is not None:
+        where = f'{span(away)} from the walker, in any direction'
+    return section(
+        'Goal',
+        f'drawn {where}; the next one when the walker is within {task.goal_reached:g} m of it, or after '
+        f'{_seconds(goals.GOAL_LASTS)}',
+    )
+
+
+def goal_and_ball(away: tuple[float, float] | None = None) -> Section:
+    """Returns where ball and goal (`away` from it, m) are, and when they change."""
+    return section(
+        'Goal and ball',
+        f'a ball of radius {ball.RADIUS:g} m and {ball.MASS:g} kg is put {span(ball.BALL_AWAY)} from the walker, '
+        f'the goal {span(away or ball.GOAL_AWAY)} from the ball, in any direction; the ball is put elsewhere '
+        f'after {_seconds(ball.BALL_LASTS)}, the next goal is drawn after {_seconds(goals.GOAL_LASTS)}',
+    )
+
+
+def _layout(spec: EnvSpec) -> Layout:
+    """Returns how ground of an environment's terrain is laid out."""
+    return SpatialGround(terrain.load(spec.part('terrain')), 0).layout
+
+
+def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
+    """Returns formulas of the terms that are about a ball, and when they are full.
+
+    Args:
+      speed: of the walker and the ball that is full, m/s.
+      reached: distance of the ball from the goal at which all are full, m.
+    """
+    speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
+    formulas = [
+        f'{speeds}, v: speed of the centre of mass towards the ball, m/s',
+        f'exp(-{ball.BALL_SHARPNESS:g} d^2), d: on the ground from where the centre of mass was when the '
+        'step began to the ball, m',
+        f'{speeds}, v: speed of the ball towards the goal; 0 unless positive',
+        f"exp(-{ball.GOAL_SHARPNESS:g} d), d: from the ball's centre to the goal on the ground, m",
+    ]
+    return formulas, (
+        f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '
+        'the walker'
+    )
+
+
+def _seconds(span: tuple[float, float]) -> str:
+    return f'{span[0]:g} to {span[1]:g} s'

@@ -1,0 +1,229 @@
+"""What the rules of all tasks of a spatial walker share: clock, actions, ground and observation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.actuation.action_map import Drive, drive
+from trl_suite.engine import native
+from trl_suite.kinematics.spatial import (
+    SpatialBody,
+    SpatialMeasurement,
+    SpatialState,
+    write_body,
+    write_terrain,
+)
+from trl_suite.kinematics.spatial import measure as measure_body
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Outcome,
+    too_fast,
+)
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SpatialWindows
+from trl_suite.util.compiled import compiled, compiled_loop
+
+CONTROL_TIMESTEP = 1 / 30  # s
+TERRAIN_MAPS = "maps of the ground around that are observed, of 'height' and 'velocity'"
+SUBSTEPS = 10  # physics at 300 Hz: trained walks score the same there and at 600 Hz, less below 180
+ACTION_SCALE = 1.0  # rad per unit action about the mean pose of the motion
+PHASE_BINS = 4
+MIRRORED_BINS = 2  # of the phase of a single step
+ACTION_OFFSETS = ('clip', 'posture', 'original')  # of position control
+_DIGITS = 1e9  # per cycle, to which the clock is rounded
+
+
+class Clock(NamedTuple):
+    """Where each simulation is in the cycle of its motion, (n,).
+
+    Attributes:
+      start: phase at the start of the episode.
+      steps: control steps since.
+      cycles: time on the motion in periods: the phase, not wrapped.
+      phase: in [0, 1).
+    """
+
+    start: np.ndarray
+    steps: np.ndarray
+    cycles: np.ndarray
+    phase: np.ndarray
+
+
+class Travel(NamedTuple):
+    """Where the walkers come from.
+
+    Attributes:
+      origin: x, y (m) and heading (rad) of the start, (n, 3).
+      distance: of the root from there, (n,) m; in imitation along +x.
+    """
+
+    origin: np.ndarray
+    distance: np.ndarray
+
+
+class View(NamedTuple):
+    """What of the full observation is given to the agent, perhaps in a mirror, and how it acts.
+
+    Attributes:
+      mirrored: whether left stance is seen as right stance.
+      source, sign: a reflected full observation is `full[source] * sign`, (size,).
+      phase: column of the phase in the full observation.
+      kept: columns of the full observation that are given, (k,); all of them if it is empty.
+      given_phase: column of the phase among them.
+      action_index, action_sign: a reflected action is `action[index] * sign`.
+    """
+
+    mirrored: bool
+    source: np.ndarray
+    sign: np.ndarray
+    phase: int
+    kept: np.ndarray
+    given_phase: int
+    action_index: np.ndarray
+    action_sign: np.ndarray
+
+
+class SpatialRules(NamedTuple):
+    """What the rules of all these tasks work on.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      period: of the motion's cycle, s.
+      terrain, pose, velocity, phase: where these blocks begin in the full observation; -1: nowhere.
+      full: the full observation, (n, size).
+      action: what joints are driven by, (n, k); scratch.
+      leaving: whether the window of ground has to be laid anew, (n,).
+    """
+
+    engine: native.Engine
+    body: SpatialBody
+    physics: SpatialState
+    ground: SpatialWindows
+    drive: Drive
+    ctrl: np.ndarray
+    period: float
+    terrain: int
+    pose: int
+    velocity: int
+    phase: int
+    given: View
+    clock: Clock
+    travel: Travel
+    found: SpatialMeasurement
+    full: np.ndarray
+    action: np.ndarray
+    leaving: np.ndarray
+    outcome: Outcome
+
+
+# Parts of a step of simulation i.
+
+
+@compiled
+def act(i: int, action: np.ndarray, rules: SpatialRules) -> bool:
+    """Drives the joints and keeps boxes moving; returns whether a window of ground must be laid.
+
+    Ground is laid before the physics, so that what is rendered afterwards is up to date.
+    """
+    given = rules.given
+    left = given.mirrored and rules.full[i, given.phase] >= 0.5
+    for k in range(rules.action.shape[1]):
+        if left:
+            rules.action[i, k] = action[i, given.action_index[k]] * given.action_sign[k]
+        else:
+            rules.action[i, k] = action[i, k]
+    drive(i, rules.action, rules.drive, rules.ctrl)
+    return prepare_ground(i, rules)
+
+
+@compiled
+def prepare_ground(i: int, rules: SpatialRules) -> bool:
+    """Keeps boxes moving before a control step.
+
+    Returns:
+      Whether the window of ground must be laid anew; who lays it keeps boxes moving as well.
+    """
+    root = rules.body.links[0]
+    x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
+    rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
+    if not rules.leaving[i] and spatial_ground.keep_moving(
+        i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
+    ):
+        native.forward(i, rules.engine)
+    return rules.leaving[i]
+
+
+@compiled
+def tick(i: int, rules: SpatialRules) -> None:
+    """Moves the clock on by a control step."""
+    rules.clock.steps[i] += 1
+    read_clock(i, rules)
+
+
+@compiled
+def read_clock(i: int, rules: SpatialRules) -> None:
+    """Works out the phase."""
+    clock = rules.clock
+    cycles = clock.start[i] + clock.steps[i] * (CONTROL_TIMESTEP / rules.period)
+    # Half a cycle is half a cycle, however it was counted.
+    clock.cycles[i] = np.rint(cycles * _DIGITS) / _DIGITS
+    clock.phase[i] = clock.cycles[i] - np.floor(clock.cycles[i])
+
+
+@compiled
+def breaks_down(i: int, rules: SpatialRules) -> bool:
+    """Whether the physics has diverged; the last finite observation then stands."""
+    diverged = native.diverged(i, rules.engine) or too_fast(
+        i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
+    )
+    rules.outcome.diverged[i] = diverged
+    return diverged
+
+
+@compiled
+def measure(i: int, rules: SpatialRules) -> None:
+    """Measures the body, on the ground as it now is."""
+    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
+    measure_body(i, rules.body, rules.physics, rules.ground, rules.found)
+    x = rules.found.root[i, 0] - rules.travel.origin[i, 0]
+    y = rules.found.root[i, 1] - rules.travel.origin[i, 1]
+    rules.travel.distance[i] = np.sqrt(x * x + y * y)
+
+
+@compiled
+def observe_body(i: int, rules: SpatialRules) -> None:
+    """Writes the blocks terrain, pose, velocity and phase of the full observation."""
+    write_terrain(i, rules.terrain, rules.ground, rules.found, rules.full)
+    write_body(i, rules.pose, rules.velocity, rules.found, rules.full)
+    if rules.phase >= 0:
+        phase = rules.clock.phase[i]
+        rules.full[i, rules.phase] = phase
+        for k in range(PHASE_BINS):
+            rules.full[i, rules.phase + 1 + k] = np.floor(phase * PHASE_BINS) == k
+
+
+@compiled
+def publish(i: int, rules: SpatialRules) -> None:
+    """Gives the agent what it is to see of the full observation."""
+    given, full, observation = rules.given, rules.full, rules.outcome.observation
+    left = given.mirrored and full[i, given.phase] >= 0.5
+    for k in range(len(given.kept)):
+        column = given.kept[k]
+        if left:
+            observation[i, k] = full[i, given.source[column]] * given.sign[column]
+        else:
+            observation[i, k] = full[i, column]
+    if given.mirrored:  # the phase of the single step
+        phase = full[i, given.phase]
+        observation[i, given.given_phase] = 2 * (phase - 0.5 if left else phase)
+
+
+@compiled_loop
+def act_all(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
+    """Takes actions; returns how many windows of ground must be laid. Takes a pack."""
+    leaving = 0
+    for i in env_ids:
+        leaving += act(i, action, rules)
+    return leaving

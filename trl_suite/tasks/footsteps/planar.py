@@ -1,0 +1,387 @@
+"""Walking in the plane along planned footsteps: the footstep controller, straight on.
+
+Source: the step scenario of the original, as a configuration of it has it for the planar biped;
+'DeepLoco' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import PlanarArena
+from trl_suite.characters import Character, CharacterSpec
+from trl_suite.engine import World
+from trl_suite.kinematics.planar import has_fallen, measure, must_wait
+from trl_suite.kinematics.planar_reference import feature
+from trl_suite.motion import Clip
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.footstep_plan import SOLE, SOLE_AHEAD, STANCE_COLOUR, SWING_COLOUR
+from trl_suite.tasks.components.plans import FOOTSTEP_SCALE, MAX_LANDING_ERROR, StraightPlans
+from trl_suite.tasks.components.plans import options as plans_from
+from trl_suite.tasks.imitation import planar_rules as imitation_rules
+from trl_suite.tasks.imitation.planar import PlanarConfig, PlanarImitation
+from trl_suite.tasks.task import Marker, begin, conclude, drawn_seed
+from trl_suite.terrain.planar import windows as planar_ground
+from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
+from trl_suite.util.random import Streams, random, uniform
+
+_DIGITS = 1e9  # of the clock, in cycles: half a cycle is half a cycle, however it was counted
+_END_EFFECTOR = list(rewards.STEP_TERMS).index('end_effector')
+_HEADING = list(rewards.STEP_TERMS).index('heading')
+RIGHT, LEFT = 0, 1
+
+
+class Plan(NamedTuple):
+    """The footsteps planned in each simulation.
+
+    Attributes:
+      stance: foot that stands, 0 the right one, 1 the left one, (n,).
+      landing: where the swing foot lands, then the stance foot: x, 0 and z, (n, 2, 3) m.
+      landing_error: distance between the last foot that landed and its place, along x, (n,) m.
+      landed: whether one landed in this step, (n,) bool.
+      length: of the current steps, (n,) m.
+      begun: time on the clip at the last switch, in periods, and the root's place then, (n, 2).
+      random: the stream that lengths are drawn from, (n, 6); see `util.random`.
+    """
+
+    stance: np.ndarray
+    landing: np.ndarray
+    landing_error: np.ndarray
+    landed: np.ndarray
+    length: np.ndarray
+    begun: np.ndarray
+    random: np.ndarray
+
+
+class Options(NamedTuple):
+    """How plans are drawn and judged, and where blocks begin in an observation.
+
+    Attributes:
+      shortest, longest: of the steps, m.
+      change: probability that a step has another length than the one before.
+      max_landing_error: landing error that ends an episode, m.
+      footstep_scale: times the squared distance between swing foot and landing place.
+      contact_block, plan_block: first columns.
+    """
+
+    shortest: float
+    longest: float
+    change: float
+    max_landing_error: float
+    footstep_scale: float
+    contact_block: int
+    plan_block: int
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+    """Landing, reward, failure and observation, after the physics has advanced."""
+    imitation_rules.advance_clock(i, rules.clip, rules.state)
+    diverged = imitation_rules.breaks_down(i, rules)
+    missed = land(i, diverged, rules, plan, options)
+    if diverged:
+        conclude(i, True, rules.outcome)
+        return
+    measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+    compare(i, rules, plan, options)
+    conclude(i, missed or has_fallen(i, rules.body, rules.physics), rules.outcome)
+    observe(i, rules, plan, options)
+
+
+@compiled
+def read_clock(i: int, rules: imitation_rules.Rules) -> int:
+    """Writes the phase; returns which foot stands by it."""
+    cycles = np.rint(rules.state.cycles[i] * _DIGITS) / _DIGITS
+    rules.state.phase[i] = cycles % 1.0
+    return LEFT if rules.state.phase[i] >= 0.5 else RIGHT
+
+
+@compiled
+def land(
+    i: int, diverged: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> bool:  # fmt: skip
+    """At a switch of stance, looks where the foot has landed and plans on; whether it has missed."""
+    stance = read_clock(i, rules)
+    plan.landed[i] = stance != plan.stance[i] and not diverged  # what breaks down lands nowhere
+    if not plan.landed[i]:
+        return False
+    plan.stance[i] = stance  # the foot that has just landed
+    foot = rules.physics.xpos[i, rules.body.effectors[stance], 0]
+    plan.landing_error[i] = abs(foot - plan.landing[i, 0, 0])
+    for axis in range(3):
+        plan.landing[i, 0, axis] = plan.landing[i, 1, axis]
+    plan.landing[i, 1, 0] += next_length(i, plan, options)
+    put_on_ground(i, rules, plan)
+    return plan.landing_error[i] > options.max_landing_error
+
+
+@compiled
+def next_length(i: int, plan: Plan, options: Options) -> float:
+    """Returns how long the next step of a plan is, which perhaps is drawn anew, m."""
+    if random(i, plan.random) < options.change:
+        plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
+    return plan.length[i]
+
+
+@compiled
+def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
+    """Gives the landing places the heights of the ground; notes where the plan was made."""
+    for which in range(2):
+        x = plan.landing[i, which, 0]
+        plan.landing[i, which, 2] = planar_ground.height(i, x, rules.ground)
+    plan.begun[i, 0] = rules.state.cycles[i]
+    plan.begun[i, 1] = rules.physics.qpos[i, rules.body.qpos[0]]
+
+
+@compiled
+def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+    """Writes the reward terms; in the second half of a step the plan replaces the clip."""
+    imitation_rules.compare(i, rules)
+    layout, found, terms = rules.layout, rules.found, rules.outcome.reward_terms
+    phase, swing = rules.state.phase[i], 1 - plan.stance[i]
+    twice = 2 * phase
+    late = twice - math.floor(twice) > 0.5
+    end_effector = 0.0
+    for k in range(found.effectors.shape[1]):
+        if k == swing and late:
+            continue  # its place is the plan's
+        off = found.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
+        end_effector += off * off
+    if late:
+        foot = rules.body.effectors[swing]
+        raised = feature(phase, layout.effectors + 2 + swing, rules.clip)
+        x = plan.landing[i, 0, 0] - rules.physics.xpos[i, foot, 0]
+        z = plan.landing[i, 0, 2] - rules.physics.xpos[i, foot, 2] + raised
+        end_effector += options.footstep_scale * (x * x + z * z)
+    weights, scales = rules.term_weights, rules.term_scales
+    terms[i, _END_EFFECTOR] = rewards.term(
+        end_effector, weights[_END_EFFECTOR], scales[_END_EFFECTOR]
+    )
+    terms[i, _HEADING] = weights[_HEADING] if found.facing[i] > 0.0 else 0.0
+
+
+@compiled
+def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+    """Writes the blocks behind velocity: muscles, phase, contacts, and the plan."""
+    imitation_rules.observe(i, rules)
+    observation, body, physics = rules.outcome.observation, rules.body, rules.physics
+    for k in range(len(body.contact)):
+        touches = physics.sensordata[i, body.contact[k]] > 0.0
+        observation[i, options.contact_block + k] = 1.0 if touches else 0.0
+    for k in range(12):
+        observation[i, options.plan_block + k] = 0.0
+    for which in range(2):  # first and second step, as seen from the foot that lands there
+        foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
+        x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
+        place = options.plan_block + 6 * which + 3 * foot
+        observation[i, place] = x * rules.found.facing[i]
+        observation[i, place + 2] = plan.landing[i, which, 2] - rules.found.under[i]
+
+
+@compiled
+def draw_plan(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
+    """Draws the first plan of an episode."""
+    plan.stance[i] = read_clock(i, rules)
+    plan.landing_error[i], plan.landed[i] = 0.0, False
+    plan.length[i] = uniform(i, options.shortest, options.longest, plan.random)
+    foot = rules.physics.xpos[i, rules.body.effectors[plan.stance[i]], 0]
+    plan.landing[i, 0, 0] = foot + next_length(i, plan, options)
+    plan.landing[i, 1, 0] = plan.landing[i, 0, 0] + next_length(i, plan, options)
+    put_on_ground(i, rules, plan)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def draw_plans(
+    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> None:
+    """Draws the first plans of some simulations."""
+    for i in env_ids:
+        draw_plan(i, rules, plan, options)
+
+
+@compiled_loop
+def finish_steps(
+    env_ids: np.ndarray, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> int:
+    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+        else:
+            finish_step(i, rules, plan, options)
+    return waiting
+
+
+@compiled_loop
+def observe_all(
+    env_ids: np.ndarray, fresh: bool, rules: imitation_rules.Rules, plan: Plan, options: Options
+) -> int:
+    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+        compare(i, rules, plan, options)
+        observe(i, rules, plan, options)
+        if fresh:
+            begin(i, rules.outcome)
+    return waiting
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarFootstepsConfig(PlanarConfig):
+    """Options of `PlanarFootsteps`."""
+
+    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of StraightPlans')
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    footstep_scale: float = option(1.0, FOOTSTEP_SCALE, at_least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('plans', plans_from(StraightPlans, 'plans', self.plans or {}))
+
+
+class PlanarFootsteps(PlanarImitation):
+    """A planar biped tracks a plan of footsteps; its single steps are the halves of a clip.
+
+    Observation blocks, in this order (N links; heading frame as for `PlanarImitation`), N = 12: 69 numbers:
+      terrain, pose, velocity, phase: as for `PlanarImitation`; the right foot stands while the phase is
+        below 0.5.
+      contact: whether right and left foot touch the ground; 2.
+      plan: as in three dimensions, where (x, y, z) stand for each place and y is 0: where the first
+        step lands as seen from the right foot, zero while that one stands, and from the left foot,
+        zero while that one does; where the second lands as seen from the right foot, zero unless that
+        one stands, and from the left foot; z from the ground under the root; then 0 for the heading;
+        13.
+
+    Attributes:
+      plan: the footsteps; see `Plan`.
+    """
+
+    TERMS = rewards.STEP_TERMS
+    ABOUT = 'root'
+    EXTRAS = MappingProxyType({'contact': 2, 'plan': 13})
+
+    CONFIG: Any = PlanarFootstepsConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena,
+        clip: Clip,
+        config: PlanarFootstepsConfig = PlanarFootstepsConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a planar character with a right and a left foot, without actuators; it is
+            attached to the arena.
+          arena: where it moves.
+          clip: a looping planar clip for this character, of two steps; the right foot stands first.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other, a character without two feet, or a clip that
+            does not fit it; when the world is bound, a clip whose left foot stands first.
+        """
+        check_feet(character.spec)
+        super().__init__(character, arena, clip, config, actuation_model=actuation_model)
+        self.plans: StraightPlans = config.plans
+        self.max_landing_error = config.max_landing_error
+        self._footstep_scale = config.footstep_scale
+
+    def bind(self, world: World) -> None:
+        super().bind(world)
+        n = world.n
+        columns = self.reference.columns['effectors']
+        table = self.reference.features(np.arange(64) / 64)[:, columns]
+        higher = (table[:, 2] - table[:, 3]).reshape(2, -1).mean(1)  # the right foot, by halves
+        if not higher[0] < 0 < higher[1]:
+            raise ValueError(
+                f'clip {self.clip.name!r}: its right foot does not stand in the first half of the '
+                'cycle and its left foot in the second; if the left one stands first, give '
+                'clip.mirrored()'
+            )
+        self._streams = Streams(n)
+        self.plan = Plan(
+            np.zeros(n, int), np.zeros((n, 2, 3)), np.zeros(n), np.zeros(n, bool), np.zeros(n),
+            np.zeros((n, 2)), self._streams.state,
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan)
+        self.info_arrays |= {
+            'landed': self.plan.landed,
+            'landing_error': self.plan.landing_error,
+            'heading_error': np.zeros(n),  # it cannot turn
+        }
+        plans = self.plans
+        options = Options(
+            plans.length[0], plans.length[1], plans.change, np.inf if self.max_landing_error is None else float(self.max_landing_error),
+            float(self._footstep_scale), self.blocks['contact'].start, self.blocks['plan'].start,
+        )  # fmt: skip
+        self._packs = self._pack, packed(self.plan), packed(options)
+
+    def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            self._streams.seed(i, drawn_seed(random_state))
+        draw_plans(env_ids, *self._packs)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if finish_steps(env_ids, *self._packs):
+            finish_steps(self._widened(env_ids), *self._packs)
+
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if observe_all(env_ids, fresh, *self._packs):
+            observe_all(self._widened(env_ids), fresh, *self._packs)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Where the feet are to land."""
+        return [
+            Marker('box', (x + SOLE_AHEAD, y, z + SOLE[2]), SOLE, colour)
+            for (x, y, z), colour in zip(
+                self.plan.landing[env_id].tolist(), (SWING_COLOUR, STANCE_COLOUR), strict=True
+            )
+        ]
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Pose of the reference where the character was at the last switch: x, z, pitch, joints."""
+        begun, x = self.plan.begun[env_id]
+        first, pose = self.clip.pose(
+            np.array([begun, self.state.cycles[env_id]]) * self.reference.period
+        )
+        pose[0] += x - first[0]
+        pose[1] += self.figure.ground_heights(env_id, pose[:1])[0]
+        return pose
+
+
+def check_feet(character: CharacterSpec) -> None:
+    """Checks that a character has a right and a left foot, and no others.
+
+    Raises:
+      ValueError: it has not.
+    """
+    if character.end_effectors not in character.mirror:
+        raise ValueError(
+            f'character {character.name!r} has no right and left foot to place, but '
+            f'{", ".join(character.end_effectors) or "no end effectors"}; biped2d_full has them'
+        )

@@ -1,0 +1,472 @@
+"""Walking where the feet are told to go: the footstep-tracking low-level controllers.
+
+Source: the step scenario of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.arenas import SpatialArena
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import SpatialMeasurement
+from trl_suite.kinematics.spatial_reference import SpatialReference
+from trl_suite.motion import Steps, quaternion, step_features
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.comparison import (
+    comparison,
+)
+from trl_suite.tasks.components.footstep_plan import (
+    CONTACT_SIZE,
+    LEFT,
+    PLAN_SIZE,
+    RIGHT,
+    SIDE,
+    check_two_feet,
+    footstep_plan,
+    plan_markers,
+    plan_mirror,
+)
+from trl_suite.tasks.components.goals import GOAL_COLOUR, flag
+from trl_suite.tasks.components.plans import (
+    FOOTSTEP_SCALE,
+    MAX_LANDING_ERROR,
+    ROOT_TURN_LIMIT,
+    Plans,
+    Pushes,
+    options,
+)
+from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP, act_all
+from trl_suite.tasks.footsteps.spatial_rules import (
+    GOAL_REACHED,
+    HIDDEN,
+    NEAR_GOAL,
+    TYPICAL_POSES,
+    FootstepRules,
+    FootstepState,
+    finish_all,
+    land_all,
+    observe_all,
+)
+from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
+from trl_suite.tasks.task import Marker, consecutive
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialFootstepsConfig(MirroredConfig):
+    """Options of `SpatialFootsteps`."""
+
+    plans: Any = option(None, 'how footstep plans are drawn: a mapping of fields of Plans')
+    goal: bool = option(False, 'plans head for a goal on the terrain, one after the other')
+    pushes: Any = option(
+        None, 'forces on the torso: a mapping of fields of Pushes; by default there are none'
+    )
+    max_landing_error: float | None = option(None, MAX_LANDING_ERROR, unit='m', above=0)
+    grace_period: float = option(
+        0.0, 'time after a push or a sharp turn in which no landing error ends the episode', unit='s',
+        at_least=0,
+    )  # fmt: skip
+    footstep_scale: float | Sequence[float] = option(
+        1.0, f'{FOOTSTEP_SCALE}; of several the mean of their rewards counts', at_least=0
+    )
+    heading_scale: float = option(
+        1.0, 'factor of the squared error of the heading in the reward', at_least=0
+    )
+    hidden_plan: bool = option(
+        False,
+        'observe bearing and distance of a goal that stays where it is instead of contact and plan, '
+        "which the reward is still about, as the original's 'Hard' environments do",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('plans', options(Plans, 'plans', self.plans or {}))
+        if self.pushes is not None:
+            self._set('pushes', options(Pushes, 'pushes', self.pushes))
+        if self.hidden_plan and self.mirrored:
+            raise ValueError('a hidden plan cannot be mirrored: give only one of the options')
+
+
+class SpatialFootsteps(SpatialTask):
+    """A spatial biped tracks a plan of footsteps, two steps per cycle of its clock.
+
+    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
+    left, z up), N = 8: 125 numbers:
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      pose, velocity: as in `SpatialImitation`; 7N + 1 and 6N.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. The right foot stands below 0.5.
+      contact: whether right and left foot touch the ground; 2.
+      plan: where the first step lands as seen from the right foot, zero while that one stands, and
+        from the left foot, zero while that one does; where the second lands as seen from the right
+        foot, zero unless that one stands, and from the left foot; (x, y, z) each, z from the ground
+        under the root; then the planned heading, rad to the left of the present one; 13.
+    Mirrored, 117 numbers: all of it reflected in left stance, actions too; the phase is that of the
+    single step, with the one-hot of its half (3), and the plan (7) has the heading first, then the
+    first landing place as seen from the swing foot, then the second from the stance foot.
+    """
+
+    TERMS = rewards.STEP_TERMS
+    ABOUT = 'root'
+
+    CONFIG: Any = SpatialFootstepsConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        steps: Steps,
+        config: SpatialFootstepsConfig = SpatialFootstepsConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: where it moves.
+          steps: library of single steps of this character; the clock has the period of two.
+          config: the options; the middle of position control is the mean pose of a straight step.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other, or steps that do not fit the character.
+        """
+        check_two_feet(character.spec)
+        self._footstep_scales = np.atleast_1d(config.footstep_scale).astype(float)
+        self._heading_scale = float(config.heading_scale)
+        self.plans: Plans = config.plans
+        self.pushes: Pushes | None = config.pushes
+        self.steps, self.period = steps, 2 * steps.duration
+        self.goal_given, self.hidden_plan = config.goal, config.hidden_plan
+        # The original meant to fail at 1 m and does not.
+        self.max_landing_error = config.max_landing_error
+        self._grace_steps = round(config.grace_period / CONTROL_TIMESTEP)
+        # The straight step of about the planned length, from which episodes start.
+        self._first = straight_step(steps, float(np.mean(self.plans.length)))
+        extras = {'contact': CONTACT_SIZE, 'plan': PLAN_SIZE, 'goal': 2 * config.hidden_plan}
+        super().__init__(
+            character, arena, steps, config, actuation_model=actuation_model, extras=extras
+        )
+        if config.hidden_plan:
+            self._hide_plan()
+
+    def _hide_plan(self) -> None:
+        """Leaves the plan out of what is observed."""
+        names = [name for name in self._full if name not in HIDDEN]
+        self.blocks = consecutive({
+            name: self._full[name].stop - self._full[name].start for name in names
+        })  # fmt: skip
+        kept = self._kept = np.concatenate([np.r_[self._full[name]] for name in names])
+        if self.mirror is None:
+            return
+        place = np.zeros(len(self.mirror.observation_sign), int)
+        place[kept] = np.arange(len(kept))
+        self.mirror = dataclasses.replace(
+            self.mirror,
+            observation_index=place[self.mirror.observation_index[kept]],
+            observation_sign=self.mirror.observation_sign[kept],
+        )
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.reference = SpatialReference.of_steps(self.steps, common.body, world.models[0])
+        self.plan = footstep_plan(n)
+        self.state = FootstepState(
+            np.zeros(n), np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros((n, 2)),
+            np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, int), np.zeros(n, int), np.zeros(n, int),
+            np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.state)
+        self.info_arrays |= {
+            name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
+        }
+        starts = {name: part.start for name, part in self._full.items()}
+        rules = FootstepRules(
+            common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
+            starts['contact'], starts['plan'], starts.get('goal', -1), self._footstep_scales,
+            self._heading_scale,
+            np.inf if self.max_landing_error is None else float(self.max_landing_error),
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._torso = int(world.body_ids([self.character.bodies[1].full_identifier])[0])
+
+    # The plan, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, `RIGHT` or `LEFT`, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, (n, 3) m."""
+        return self.state.goal
+
+    @property
+    def step_phase(self) -> np.ndarray:
+        """Share of the single step that has passed, (n,)."""
+        twice = 2 * self.phase
+        return twice - np.floor(twice)
+
+    # Episodes and plans.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = self._begin_grounds(env_ids, random_states)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        found, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
+        plan.landed[env_ids] = state.missed[env_ids] = False
+        state.push_end[env_ids] = state.excused[env_ids] = 0
+        aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
+        for k, i in enumerate(env_ids.tolist()):
+            if self.pushes:
+                state.push_begin[i] = self._steps_within(i, self.pushes.interval)
+            self._redraw_step(i, always=True)
+            aside[k] = state.width[i]
+            if self.goal_given:
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
+            sizes[k] = self._next_size(i), self._next_size(i)
+        places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
+        plan.heading[env_ids] = angles
+        stance = plan.stance[env_ids]
+        anchors = found.feet[env_ids, stance, :2]
+        if self.goal_given:
+            self._head_for_goals(env_ids, found.root[env_ids, :2])
+        else:
+            # The line of the plan goes through the start, half a width beside each foot.
+            line = quaternion.turned(anchors - places, -angles)
+            line[:, 1] = 0.5 * SIDE[stance] * aside
+            anchors = places + quaternion.turned(line, angles)
+        for which, foot in enumerate((1 - stance, stance)):
+            anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
+        self._put_reference(env_ids, found, np.full(len(env_ids), self._first))
+        if self.hidden_plan:
+            for i in env_ids.tolist():
+                place = self.travel.origin[i, :2]
+                state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
+
+    def _redraw_step(self, i: int, always: bool = False) -> None:
+        """Draws length and width of the steps to come, perhaps."""
+        plans, random = self.plans, self._random[i]
+        if always or random.uniform() < plans.change:
+            self.state.length[i] = random.uniform(*plans.length)
+            self.state.width[i] = random.uniform(*plans.width)
+
+    def _next_size(self, i: int) -> tuple[float, float]:
+        """Returns length and width of the next step, which perhaps are drawn anew, m."""
+        self._redraw_step(i)
+        return float(self.state.length[i]), float(self.state.width[i])
+
+    def _lay(
+        self,
+        env_ids: np.ndarray,
+        which: int,
+        feet: np.ndarray,
+        places: np.ndarray,
+        sizes: np.ndarray,
+    ) -> np.ndarray:
+        """Enters into the plans where feet land while the other ones stand at places, on the ground.
+
+        Args:
+          env_ids: which simulations, (m,).
+          which: of the plan's two steps.
+          feet: which ones step, (m,).
+          places: (m, 2) m.
+          sizes: lengths and widths of the steps, (m, 2) m.
+
+        Returns:
+          The landing places, (m, 2) m.
+        """
+        steps = sizes.copy()
+        steps[:, 1] *= SIDE[feet]
+        places = places + quaternion.turned(steps, self.heading[env_ids])
+        self.landing[env_ids, which, :2] = places
+        heights = self.arena.height(places[:, :1], places[:, 1:], env_ids)
+        self.landing[env_ids, which, 2] = heights[:, 0]
+        return places
+
+    def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
+        """Plans to head from places (m, 2) for the goals, where these are not too near."""
+        way = self.goal[env_ids, :2] - places
+        headings = np.arctan2(way[:, 1], way[:, 0])
+        far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
+        self.heading[env_ids[far]] = headings[far]
+
+    def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
+        return round(self._random[i].uniform(*seconds) / self.control_timestep)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+        if self.pushes:
+            self._push(env_ids, self.pushes)
+
+    def _push(self, env_ids: np.ndarray, pushes: Pushes) -> None:
+        """Applies the forces of pushes, and draws those that begin."""
+        state, count = self.state, self.clock.steps
+        for i in env_ids[count[env_ids] >= state.push_begin[env_ids]].tolist():
+            angle = self._random[i].uniform(-np.pi, np.pi)
+            force = self._random[i].uniform(*pushes.force)
+            state.push[i] = force * np.cos(angle), force * np.sin(angle), 0.0
+            state.push_end[i] = count[i] + self._steps_within(i, pushes.duration)
+            state.push_begin[i] = state.push_end[i] + self._steps_within(i, pushes.interval)
+            state.excused[i] = state.push_end[i] + self._grace_steps
+        pushing = (count[env_ids] < state.push_end[env_ids])[:, None]
+        self.world.xfrc_applied[env_ids, self._torso, :3] = state.push[env_ids] * pushing
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if land_all(env_ids, self._pack):
+            switched = env_ids[self.plan.landed[env_ids]]
+            found = self.figure.found
+            self._replan(switched, found)
+            self._put_reference(switched, found, self._choose(switched, found))
+        finish_all(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def _replan(self, env_ids: np.ndarray, found: SpatialMeasurement) -> None:
+        """Makes the next plans of some simulations, at a switch of stance."""
+        plans, count = self.plans, len(env_ids)
+        by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
+        for k, i in enumerate(env_ids.tolist()):
+            random = self._random[i]
+            if plans.from_root and random.uniform() < plans.from_root:
+                by_root[k] = True
+                turns[k] = random.normal(0, plans.root_turn)
+                for which in (0, 1):
+                    ahead = random.uniform(*plans.root_length)
+                    sizes[k, which] = ahead, random.uniform(*plans.root_width)
+                continue
+            if self.goal_given:
+                root = found.root[i, :2]
+                if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
+                    self.goal[i] = self.arena.goal(i, random, root, 'near')
+            elif plans.sharp and random.uniform() < plans.sharp:
+                turns[k] = random.uniform(-np.pi, np.pi)
+                self.state.excused[i] = self.clock.steps[i] + self._grace_steps
+            elif plans.turn:
+                turns[k] = random.normal(0, plans.turn)
+            sizes[k, 1] = self._next_size(i)
+        stance = self.stance[env_ids]
+        on = ~by_root
+        if on.any():
+            going = env_ids[on]
+            if self.goal_given:
+                self._head_for_goals(going, self.landing[going, :, :2].mean(1))
+            self.heading[going] += turns[on]
+            self.landing[going, 0] = self.landing[going, 1]
+            self._lay(going, 1, stance[on], self.landing[going, 0, :2], sizes[on, 1])
+        if by_root.any():
+            going, foot = env_ids[by_root], stance[by_root]
+            off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
+            self.heading[going] = found.heading[going] + off
+            places = found.feet[going, foot, :2]
+            for which, feet in enumerate((1 - foot, foot)):
+                places = self._lay(going, which, feet, places, sizes[by_root, which])
+
+    def _choose(self, env_ids: np.ndarray, found: SpatialMeasurement) -> np.ndarray:
+        """Returns the steps nearest to the plans of some simulations."""
+        feet = found.feet[env_ids]
+        query = step_features(
+            found.root[env_ids, :2], found.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
+            self.landing[env_ids, 0, :2], self.heading[env_ids], self.stance[env_ids] == RIGHT,
+        )  # fmt: skip
+        return self.steps.select(query)
+
+    def _put_reference(
+        self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
+    ) -> None:
+        """Has the chosen steps begin where the characters are and as they head."""
+        self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
+        columns = self.reference.columns
+        now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
+        turned = found.heading[env_ids] - now[:, columns['heading'].start]
+        self.state.turned[env_ids] = turned
+        self.state.shift[env_ids] = found.root[env_ids, :2] - quaternion.turned(
+            now[:, columns['root']], turned
+        )
+
+    # Left and right, and pictures.
+
+    def _extra_mirror(self, name: str) -> Reflection:
+        return (np.arange(2), np.array([-1.0, 1.0])) if name == 'goal' else plan_mirror(name)
+
+    def _canonical_extras(self, extras: Mapping[str, int]) -> Mapping[str, int]:
+        return {**extras, 'plan': 7}
+
+    def _canonical_extra_columns(self, name: str) -> np.ndarray:
+        columns = super()._canonical_extra_columns(name)
+        if name == 'contact':
+            return columns
+        # Heading; the first step as seen from the left foot, the second from the right one.
+        return columns[[12, 3, 4, 5, 6, 7, 8]]
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Where the feet are to land, which way the body is to head, and the goal."""
+        root = self.world.xpos[env_id, self.figure.links[0]]
+        found = plan_markers(env_id, root, self.plan)
+        if self.goal_given:
+            found.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
+        if self.hidden_plan:
+            found.append(flag(self.goal[env_id]))
+        return found
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Pose of the reference where it was put: root, then joints."""
+        state = self.state
+        mirrored, index = divmod(int(state.track[env_id]), len(self.steps))
+        time = self.step_phase[env_id] * self.steps.duration
+        pose = self.steps.pose(index, time, bool(mirrored))
+        turned = state.turned[env_id]
+        pose[:2] = state.shift[env_id] + quaternion.turned(pose[:2], turned)
+        pose[3:7] = quaternion.multiply(quaternion.about_z(turned), pose[3:7])
+        env_ids = np.array([env_id])
+        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]
+        return pose
+
+
+def straight_step(steps: Steps, length: float) -> int:
+    """Returns the step of a library that is straight on and of about this length, m."""
+    straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
+    return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
+
+
+def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses over the origin, and rates, at phases (m,) of two steps like this one."""
+    times = (2 * phase - np.floor(2 * phase)) * steps.duration
+    poses, rates = (
+        part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)
+    )  # fmt: skip
+    poses[:, :2] = 0.0
+    return poses, rates

@@ -1,0 +1,192 @@
+"""Gait state machines in words and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trl_suite.tasks.components import description
+from trl_suite.tasks.components.description import Meanings, floats
+from trl_suite.tasks.gait import rules as gait_rules
+from trl_suite.tasks.gait import task as gait
+from trl_suite.tasks.task_type import Description
+from trl_suite.util.tables import Section, Table, section
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
+
+_BLOCKS = {
+    'terrain': (
+        'm',
+        'ground heights from 0.5 m behind to 10 m ahead, above the ground at the root',
+    ),
+    'pose': ('m', 'root height above ground; then x, z of each other link centre from the root'),
+    'velocity': ('m/s', 'x, z velocity of each link centre'),
+}
+_STANCE_FIRST = '; the stance leg first, then the swing leg'
+_PITCH_ENDS = {'pose': '; last, pitch of the root (rad)', 'velocity': '; last, its rate (rad/s)'}
+# Units of gait parameters that are no angles, by name without state.
+_UNITS = {
+    'TransTime': 's', 'Cv': 'rad s/m', 'Cd': 'rad/m', 'MagicGain': '1',
+    **dict.fromkeys(
+        ('BackForceX', 'BackForceY', 'FrontForceX', 'FrontForceY', 'ForceX', 'ForceY'), 'N'
+    ),
+}  # fmt: skip
+# What parameters do, by name without state; the others are targets of the joints that they name.
+_EFFECTS = {
+    'TransTime': 'length of the states that end after it',
+    'BackForceX': 'push of the hind foot on the body, ahead, in BackStance and Extend',
+    'BackForceY': 'the same, upwards',
+    'FrontForceX': 'push of the fore foot on the body, ahead, in FrontStance and Gather',
+    'FrontForceY': 'the same, upwards',
+    'SpineCurve': 'target of every joint of the spine',
+    'Cd': 'in Passing and Up, times the way from the stance foot to the centre of mass: added to SwingHip',
+    'RootPitch': 'pitch at which the hip of a stance foot on the ground holds the root',
+    'MagicGain': 'of the torque that keeps the root upright on the ground, by the hip',
+}
+_FROM_SPEED = {  # Cv: times the forward speed of the centre of mass
+    True: 'in Contact and Down, times the forward speed: added to SwingHip',
+    False: 'times the forward speed: added to Hip and Shoulder of a leg in the air',
+}
+
+
+def blocks(task: Any) -> Meanings:
+    """Returns units and meanings of the observation blocks."""
+    spec = task.character.spec
+    ends = _PITCH_ENDS if task.gait.parameters.observe_pitch else {}
+    if spec.mirror:
+        ends = dict.fromkeys(('pose', 'velocity'), _STANCE_FIRST)
+    return {name: (unit, f'{text}{ends.get(name, "")}') for name, (unit, text) in _BLOCKS.items()}
+
+
+def before(task: Any) -> Iterator[Section]:
+    """Yields the machine's states and parameters."""
+    figures = task.gait.parameters
+    yield section(
+        f'Gait: {len(figures.states)} states; joints are driven to targets by stable PD',
+        Table(('state', 'ends'), list(zip(figures.states, task.gait.endings, strict=True))),
+    )
+    chosen = [
+        name
+        for name, values in figures.sets.items()
+        if np.array_equal(values, figures.action_offset)
+    ]
+    same = (figures.base_actions == figures.action_offset).all(1)
+    chosen += [f'base action {i}' for i in np.flatnonzero(same)]
+    blends = [
+        (i, f'{a} {1 - share:g}, {b} {share:g}' if 0 < share < 1 else b if share else a)
+        for i, (a, b, share) in enumerate(figures.blends)
+    ]
+    fixed = [
+        f'{name} {value:g} {_unit(task, name)}' if value else f'{name} 0'
+        for i, (name, value) in enumerate(zip(figures.names, figures.action_offset, strict=True))
+        if i not in figures.actions
+    ]
+    yield section(
+        f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
+        Table(('base action', 'parameter set'), blends),
+        f'action 0 is {" = ".join(chosen)}',
+        f'taken without their sign: {", ".join(figures.names[i] for i in figures.absolute)}',
+        *([f'fixed: {", ".join(fixed)}'] if fixed else []),
+    )
+
+
+def action(environment: Environment) -> Section:
+    """Returns what the actions set."""
+    task: Any = environment.task
+    action_map, count = task.action_map, len(task.action_map)
+    if task.interface == 'base_action':
+        return section(
+            f'Action: {count} numbers in [-1, 1]; the largest chooses the base action',
+            'it begins with the next cycle',
+        )
+    units = [_unit(task, name) for name in action_map.names]
+    effects = [_effect(task, name) for name in action_map.names]
+    columns = (
+        action_map.names, floats(action_map.action_offset), floats(action_map.action_scale), units, effects,
+    )  # fmt: skip
+    return section(
+        f'Action: {count} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
+        Table(
+            ('sets', 'action_offset', 'action_scale', 'unit', 'which is'),
+            list(zip(*columns, strict=True)),
+            numbered=True,
+        ),
+    )
+
+
+def _unit(task: Any, parameter: str) -> str:
+    own = parameter.split('.')[-1]
+    slides = own == 'Knee' and task.character.prismatic.any()
+    return 'm' if slides else _UNITS.get(own, 'rad')
+
+
+def _effect(task: Any, parameter: str) -> str:
+    own = parameter.split('.')[-1]
+    if own == 'Cv':
+        return _FROM_SPEED['Cd' in task.gait.parameters.names]
+    return _EFFECTS.get(own, 'a target')
+
+
+def rules(spec: EnvSpec, task: Any) -> Iterator[Section]:
+    """Yields reward and termination."""
+    figure, parameters = task.character.spec, task.gait.parameters
+    weights = parameters.reward
+    weight = '' if weights['speed'] == 1 else f'{weights["speed"]:g} '
+    lines = [
+        f'{weight}exp(-{gait_rules.SPEED_SHARPNESS:g} (v - {parameters.target_speed:g})^2)',
+        'v: mean forward speed of the centre of mass, m/s',
+    ]
+    if weights['stumble']:
+        lines[0] += f' + {weights["stumble"]:g} / (1 + {gait_rules.STUMBLE_SHARPNESS:g} s)'
+        lines.append(
+            's: share of the time in which a link other than '
+            f'{", ".join(figure.stumble_exempt)} touches the ground'
+        )
+    if not parameters.backward_reward:
+        lines.append('0 if v is negative')
+    yield section('Reward of a cycle, at most 1; 0 after a fall', *lines)
+    links = ', '.join(figure.fall_links)
+    share = gait_rules.FALL_THRESHOLD, gait_rules.CONTACT_DECAY, gait_rules.CONTACT_GAIN
+    ends = [
+        f'{"one of " if len(figure.fall_links) > 1 else ""}{links} touches the ground in '
+        f'{description.samples_until_fall(*share)} samples in a row, or so often that '
+        f'{description.contact_share(*share)}',
+        f'the root is turned by more than {np.degrees(gait_rules.TURNED):.0f} degrees',
+        f'it has moved less than {gait_rules.PROGRESS:g} m in {gait_rules.PATIENCE:g} s',
+        'the physics diverges',
+    ]
+    if parameters.forward_only:
+        ends.insert(2, 'it moves backwards')
+    yield section(
+        f'Termination (discount 0), sampled every {gait_rules.SAMPLE:g} s',
+        '\n'.join(f'- {end}' for end in ends),
+    )
+
+
+def time(spec: EnvSpec, task: Any) -> Section:
+    """Returns rates, and how long a step and an episode are."""
+    control, physics = 1 / gait.CONTROL_TIMESTEP, 1 / task.physics_timestep
+    step = f'one cycle, at most {gait_rules.LONGEST_CYCLE * gait_rules.FRAME:.3g} s'
+    if task.interface == 'base_action':
+        step = f'{gait_rules.FRAME:.3g} s'
+    return section(
+        'Time',
+        f'a step is {step}; control {control:.4g} Hz, physics {physics:.4g} Hz; an episode is cut\n'
+        f'(discount 1) after {spec.step_limit} steps',
+    )
+
+
+def joints(task: Any) -> tuple[str, list[object]]:
+    """Returns what the target of each joint is relative to."""
+    hips = task.gait.hips
+    joints = task.character.spec.joints
+    return 'target is to', ['the world' if joint in hips else 'its parent' for joint in joints]
+
+
+GAIT = Description(
+    blocks=blocks, rules=rules, before=before, action=action, time=time, joints=joints
+)

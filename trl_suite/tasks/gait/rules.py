@@ -1,0 +1,366 @@
+"""The rules of the gait task, as compiled functions of one simulation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.controllers import CONTROL_TIMESTEP, gaits
+from trl_suite.controllers.machine import GaitRules, touches
+from trl_suite.engine import native
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarMeasurement,
+    leaves,
+    measure,
+    must_wait,
+)
+from trl_suite.tasks.task import (
+    Outcome,
+    begin,
+    conclude,
+    too_fast,
+)
+from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.util.compiled import compiled, compiled_loop
+
+SAMPLES, BEHIND, AHEAD = 200, 0.5, 10.0  # ground heights seen, and over which stretch, m
+SUBSTEPS = 2  # physics steps per control step: 1/1200 s
+FRAME = 1 / 30  # s; nominal control step, and the real one with interface 'base_action'
+LONGEST_CYCLE = 50  # frames
+UPSTREAM_CENTRE = 3.0  # m; where the original's first two stretches of ground meet
+INTERFACES = ('parameters', 'base_action')
+
+# Falls, all looked at every SAMPLE.
+SAMPLE = 0.1  # s
+CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
+    0.9,
+    1 / 11,
+    0.25,
+)  # of the running share of samples with a fall link down
+TURNED = 0.8 * np.pi  # rad
+PATIENCE, PROGRESS = 5.0, 0.5  # s, m; who moves less than that in that time is stuck
+MAX_JOINT_SPEED = 1000.0  # rad/s; feet whip: there is no damping in these joints
+
+# Reward of a cycle: weight * exp(-0.5 (v - target)^2) + weight / (1 + 10 share of time stumbling).
+SPEED_SHARPNESS, STUMBLE_SHARPNESS = 0.5, 10.0
+TERMS = ('speed', 'stumble')
+SPEED, STUMBLE = range(len(TERMS))
+
+_FRAME_STEPS = round(FRAME / CONTROL_TIMESTEP)
+_SAMPLE_STEPS = round(SAMPLE / CONTROL_TIMESTEP)
+_PATIENCE_STEPS = round(PATIENCE / CONTROL_TIMESTEP)
+_OVER, _GROUND, _LOOK = range(3)  # why a step is interrupted: not at all, for ground, for `watch`
+
+
+class GaitTaskState(NamedTuple):
+    """What the task remembers of each simulation, (n,); times are in control steps.
+
+    Attributes:
+      action: in [-1, 1], (n, k).
+      going: whether the current step is not over.
+      waiting: whether a gait's cycle is over and wants parameters.
+      lasted, stumbled: time of the last step, and that with a link on the ground that should not be.
+      age: time in the episode.
+      start: where the centre of mass was at the beginning of the step, m.
+      down: running share of samples with a fall link on the ground.
+      milestone: x and z of the root at the last test of progress, (n, 2) m.
+      fell, stuck: how the episode has ended.
+      duration, stumbling: the times in s, of steps that are finished.
+    """
+
+    action: np.ndarray
+    going: np.ndarray
+    waiting: np.ndarray
+    lasted: np.ndarray
+    stumbled: np.ndarray
+    age: np.ndarray
+    start: np.ndarray
+    down: np.ndarray
+    milestone: np.ndarray
+    fell: np.ndarray
+    stuck: np.ndarray
+    duration: np.ndarray
+    stumbling: np.ndarray
+
+
+class Options(NamedTuple):
+    """What tells one task from another.
+
+    Attributes:
+      by_cycle: whether a step is a cycle, not a frame.
+      substeps: physics steps per control step.
+      action_offset: parameters of the gait at action 0, (P,).
+      action_scale: what action 1 adds to those that actions set, (k,).
+      places: which these are, (k,).
+      base_actions: parameters that a preference chooses, (B, P).
+      controls: addresses of the joints' torques in ctrl, (J,).
+      fall, stumble: numbers of links that must not touch the ground, or should not.
+      forward_only: whether moving backwards is a fall.
+      backward_reward: whether a cycle backwards earns anything.
+      target_speed: m/s.
+      weights: of the reward terms, (2,).
+      columns: of the measurement, which make an observation, by stance leg, (2, size).
+      pitch, pitch_rate: columns of the observation that they take, -1 for none.
+    """
+
+    by_cycle: bool
+    substeps: int
+    action_offset: np.ndarray
+    action_scale: np.ndarray
+    places: np.ndarray
+    base_actions: np.ndarray
+    controls: np.ndarray
+    fall: np.ndarray
+    stumble: np.ndarray
+    forward_only: bool
+    backward_reward: bool
+    target_speed: float
+    weights: np.ndarray
+    columns: np.ndarray
+    pitch: int
+    pitch_rate: int
+
+
+class Rules(NamedTuple):
+    """All that the rules of gait tasks work on.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      measured: terrain, pose and velocity as `measure` writes them, (n, ...).
+      interruption: why the step of each was interrupted, (n,).
+    """
+
+    engine: native.Engine
+    body: PlanarBody
+    ground: PlanarWindows
+    gait: GaitRules
+    ctrl: np.ndarray
+    options: Options
+    measured: np.ndarray
+    interruption: np.ndarray
+    found: PlanarMeasurement
+    state: GaitTaskState
+    outcome: Outcome
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def begin_step(i: int, action: np.ndarray, rules: Rules) -> None:
+    """Takes an action; it sets the gait of the cycle that begins."""
+    state = rules.state
+    for k in range(state.action.shape[1]):
+        state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+    state.lasted[i] = state.stumbled[i] = 0
+    state.going[i] = True
+    state.start[i] = rules.gait.physics.subtree_com[i, rules.body.links[0], 0]
+    if rules.options.by_cycle or state.waiting[i]:
+        set_gait(i, rules)
+
+
+@compiled
+def set_gait(i: int, rules: Rules) -> None:
+    """Begins a cycle with the parameters that the action means."""
+    options, action, vector = rules.options, rules.state.action, rules.gait.state.vector
+    rules.state.waiting[i] = False
+    if options.by_cycle:
+        for k in range(len(options.action_offset)):
+            vector[i, k] = options.action_offset[k]
+        for k in range(len(options.places)):
+            vector[i, options.places[k]] += options.action_scale[k] * action[i, k]
+    else:
+        choice = 0
+        for k in range(1, len(options.base_actions)):
+            if action[i, k] > action[i, choice]:
+                choice = k
+        for k in range(len(options.action_offset)):
+            vector[i, k] = options.base_actions[choice, k]
+    gaits.apply(i, rules.gait)
+
+
+@compiled
+def go_on(i: int, watched: bool, rules: Rules) -> int:
+    """Goes on with a step until it is over, or is interrupted; returns why."""
+    state, options = rules.state, rules.options
+    while state.going[i]:
+        if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
+            i, rules.body, rules.gait.physics, rules.ground, rules.found
+        ):
+            return _GROUND
+        gaits.act(i, rules.gait)
+        for k in range(len(options.controls)):
+            rules.ctrl[i, options.controls[k]] = rules.gait.scratch.torque[i, k]
+        native.step(i, options.substeps, rules.engine)
+        ended = gaits.advance(i, rules.gait)
+        account(i, rules)
+        if options.by_cycle:
+            over = ended or state.lasted[i] == LONGEST_CYCLE * _FRAME_STEPS
+        else:
+            over = state.lasted[i] == _FRAME_STEPS
+            if ended:
+                set_gait(i, rules)
+        state.going[i] = not (over or rules.outcome.failed[i])
+        if watched and i == 0 and state.age[i] % _FRAME_STEPS == 0:
+            return _LOOK
+    return _OVER
+
+
+@compiled
+def account(i: int, rules: Rules) -> None:
+    """Time, stumbling and falls after a control step."""
+    state = rules.state
+    state.lasted[i] += 1
+    state.age[i] += 1
+    state.stumbled[i] += any_touches(i, rules.options.stumble, rules.gait)
+    if state.age[i] % _SAMPLE_STEPS == 0:
+        look(i, rules)
+
+
+@compiled
+def any_touches(i: int, links: np.ndarray, gait: GaitRules) -> bool:
+    """Whether any of some links touches the ground."""
+    for link in links:
+        if touches(i, link, gait):
+            return True
+    return False
+
+
+@compiled
+def look(i: int, rules: Rules) -> None:
+    """Looks whether the episode has failed."""
+    state, body, physics = rules.state, rules.body, rules.gait.physics
+    state.down[i] *= CONTACT_DECAY
+    if any_touches(i, rules.options.fall, rules.gait):
+        state.down[i] += CONTACT_GAIN
+    pitch = physics.qpos[i, body.qpos[2]]
+    turn = abs((pitch + np.pi) % (2 * np.pi) - np.pi)
+    backwards = rules.options.forward_only and physics.qvel[i, body.dof[0]] < 0.0
+    state.fell[i] = state.down[i] > FALL_THRESHOLD or turn > TURNED or backwards
+    if state.age[i] % _PATIENCE_STEPS == 0:
+        x, z = physics.qpos[i, body.qpos[0]], physics.qpos[i, body.qpos[1]]
+        moved = math.hypot(x - state.milestone[i, 0], z - state.milestone[i, 1])
+        state.stuck[i] = moved < PROGRESS
+        state.milestone[i, 0], state.milestone[i, 1] = x, z
+    diverged = breaks_down(i, rules)
+    rules.outcome.failed[i] = state.fell[i] or state.stuck[i] or diverged
+
+
+@compiled
+def breaks_down(i: int, rules: Rules) -> bool:
+    """Whether the physics has diverged; the last finite observation then stands."""
+    joints = rules.body.dof[3:]
+    diverged = native.diverged(i, rules.engine) or too_fast(
+        i, joints, MAX_JOINT_SPEED, rules.gait.physics.qvel
+    )
+    rules.outcome.diverged[i] = diverged
+    return diverged
+
+
+@compiled
+def finish_step(i: int, rules: Rules) -> None:
+    """Reward, failure and observation of a step that is over."""
+    state, outcome = rules.state, rules.outcome
+    state.duration[i] = CONTROL_TIMESTEP * state.lasted[i]
+    state.stumbling[i] = CONTROL_TIMESTEP * state.stumbled[i]
+    outcome.diverged[i] |= native.diverged(i, rules.engine)
+    failed = outcome.failed[i] or outcome.diverged[i]
+    if outcome.diverged[i]:
+        state.fell[i] = state.stuck[i] = False
+    else:
+        reward(i, rules)
+        observe(i, rules)
+    conclude(i, failed, outcome)
+
+
+@compiled
+def reward(i: int, rules: Rules) -> None:
+    """Writes the reward terms: speed, and how long it has not stumbled."""
+    state, options, terms = rules.state, rules.options, rules.outcome.reward_terms
+    travelled = rules.gait.physics.subtree_com[i, rules.body.links[0], 0] - state.start[i]
+    speed = travelled / (CONTROL_TIMESTEP * state.lasted[i])
+    off = speed - options.target_speed
+    share = state.stumbled[i] / state.lasted[i]
+    terms[i, SPEED] = options.weights[SPEED] * math.exp(-SPEED_SHARPNESS * (off * off))
+    terms[i, STUMBLE] = options.weights[STUMBLE] / (1 + STUMBLE_SHARPNESS * share)
+    if speed < 0.0 and not options.backward_reward:
+        terms[i, SPEED] = terms[i, STUMBLE] = 0.0
+
+
+@compiled
+def observe(i: int, rules: Rules) -> None:
+    """Writes the observation: the swing leg comes last."""
+    options, body, physics = rules.options, rules.body, rules.gait.physics
+    measured, observation = rules.measured, rules.outcome.observation
+    measure(i, body, physics, rules.ground, measured, rules.found)
+    stance = rules.gait.state.stance[i]
+    for k in range(options.columns.shape[1]):
+        observation[i, k] = measured[i, options.columns[stance, k]]
+    if options.pitch >= 0:
+        observation[i, options.pitch] = physics.qpos[i, body.qpos[2]]
+        observation[i, options.pitch_rate] = physics.qvel[i, body.dof[2]]
+
+
+@compiled
+def begin_episode(i: int, rules: Rules) -> None:
+    """Puts machine, outcome and what the task remembers to their starts."""
+    state, body, physics = rules.state, rules.body, rules.gait.physics
+    gaits.begin(i, rules.options.action_offset, rules.gait)
+    begin(i, rules.outcome)
+    state.going[i], state.waiting[i] = False, True
+    state.lasted[i] = state.stumbled[i] = state.age[i] = 0
+    state.down[i] = state.duration[i] = state.stumbling[i] = 0.0
+    state.fell[i] = state.stuck[i] = False
+    state.milestone[i, 0] = physics.qpos[i, body.qpos[0]]
+    state.milestone[i, 1] = physics.qpos[i, body.qpos[1]]
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def begin_steps(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> None:
+    """Takes actions."""
+    for i in env_ids:
+        begin_step(i, action, rules)
+
+
+@compiled_loop
+def run(env_ids: np.ndarray, watched: bool, rules: Rules) -> int:
+    """Goes on with steps; returns how many were interrupted."""
+    interrupted = 0
+    for i in env_ids:
+        rules.interruption[i] = go_on(i, watched, rules)
+        interrupted += rules.interruption[i] != _OVER
+    return interrupted
+
+
+@compiled_loop
+def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
+    """Finishes the steps of all that can be measured; returns how many have to wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+        else:
+            finish_step(i, rules)
+    return waiting
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
+    """Observes all that can be measured, at their starts if they are; returns how many wait."""
+    waiting = 0
+    for i in env_ids:
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        if fresh:
+            begin_episode(i, rules)
+        observe(i, rules)
+    return waiting

@@ -1,0 +1,315 @@
+"""The TerrainRL family: an agent sets the parameters of a gait once per cycle.
+
+One step of the environment is one gait cycle: it ends with the cycle, with a fall inside it, or after
+`LONGEST_CYCLE`. A user who discounts by time raises gamma to `info['duration']` / their own unit;
+the environment's discount is 0 after a fall and 1 otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite import actuation
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.arenas import PlanarArena
+from trl_suite.characters import Character
+from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
+from trl_suite.controllers.parameters import BASE_ACTIONS
+from trl_suite.engine import World
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarFigure,
+)
+from trl_suite.kinematics.planar_reference import link_extents
+from trl_suite.tasks.gait.rules import (
+    _GROUND,
+    _LOOK,
+    AHEAD,
+    BEHIND,
+    FRAME,
+    INTERFACES,
+    SAMPLES,
+    SUBSTEPS,
+    TERMS,
+    UPSTREAM_CENTRE,
+    GaitTaskState,
+    Options,
+    Rules,
+    begin_steps,
+    finish_steps,
+    observe_all,
+    run,
+)
+from trl_suite.tasks.task import (
+    SPAWNS,
+    TERRAIN_LEVEL,
+    Task,
+    check_simulated,
+    consecutive,
+    drawn_seed,
+    outcome,
+)
+from trl_suite.terrain import PlanarGround
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import Config, option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaitConfig(Config):
+    """Options of `GaitTask`."""
+
+    interface: str = option(
+        'parameters',
+        "'parameters': a step is a cycle, and an action sets the gait's parameters, 0 the default and +-1 "
+        "the largest deviation of any base action; 'base_action': a step is 1/30 s, and an action is one "
+        'preference per base action, of which the largest counts when the next cycle begins',
+        choices=INTERFACES,
+    )
+    base_actions: str = option(
+        'default',
+        "'default', or 'original': those of the papers, where the default ones are our own",
+        choices=BASE_ACTIONS,
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1)
+    spawn: str = option(
+        'intended',
+        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
+        'original builds it',
+        choices=SPAWNS,
+    )
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+    start_noise: float = option(
+        0.0,
+        'standard deviation of what is added to joint angles at the start; ten times that to their rates '
+        'and to the speed (m/s)',
+        unit='rad', at_least=0,
+    )  # fmt: skip
+
+
+class GaitTask(Task):
+    """Travel at the target speed by setting a gait's parameters.
+
+    Observation blocks: 'terrain', 200 ground heights from 0.5 m behind to 10 m ahead of the root,
+    relative to the ground under it; 'pose', height of the root and (x, z) of every other link
+    relative to it; 'velocity', (x, z) of every link. Bipeds show the leg that is to swing last; of
+    the hopper's last link z becomes the root's pitch in pose and its rate in velocity.
+
+    Attributes:
+      gait: the state machines.
+      state: what the task remembers, after `bind`.
+      watch: called at every multiple of 1/30 s of the first simulation's episode, within steps too;
+        for pictures.
+    """
+
+    state: GaitTaskState
+    fields = dynamics.FIELDS
+    watch: Callable[[], None] | None = None
+
+    CONFIG: Any = GaitConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena,
+        config: GaitConfig = GaitConfig(),
+    ) -> None:
+        """Attaches character and gait to an arena.
+
+        Args:
+          character: one with a gait, see `trl_suite.controllers.available`.
+          arena: planar terrain.
+          config: the options.
+
+        Raises:
+          ValueError: no gait drives the character.
+        """
+        self.character, self.arena, self.config = character, arena, config
+        self.interface = interface = config.interface
+        self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
+        parameters = load(character.spec.name, config.base_actions)
+        self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
+        self._control_substeps = int(config.substeps)
+        timestep = CONTROL_TIMESTEP / config.substeps
+        self.set_timesteps(FRAME, timestep)
+        actuation.add(character, 'torque', timestep)
+        for joint in character.joints:  # the gaits were tuned without
+            joint.damping = joint.armature = 0
+        if interface == 'parameters':
+            names = tuple(parameters.names[i] for i in parameters.actions)
+            self.action_map = ActionMap(
+                names, 'gait parameter', 'rad, m, N or 1', parameters.action_offset[parameters.actions],
+                parameters.action_scale[parameters.actions],
+            )  # fmt: skip
+        else:
+            count = len(parameters.base_actions)
+            self.action_map = ActionMap(
+                tuple(f'base_action_{i}' for i in range(count)), 'preference', '1',
+                np.zeros(count), np.ones(count),
+            )  # fmt: skip
+        links = len(character.spec.links)
+        self.blocks = consecutive({
+            'terrain': SAMPLES, 'pose': 2 * links - 1, 'velocity': 2 * links,
+        })  # fmt: skip
+
+    @property
+    def root_entity(self) -> PlanarArena:
+        return self.arena
+
+    @property
+    def signature(self) -> str:
+        parts = self.character.spec.name, self.arena.terrain.name, self.interface
+        return f'{super().signature} of {" / ".join(parts)}'
+
+    def bind(self, world: World) -> None:
+        self.world, n = world, world.n
+        figure, gait = self.figure, self.gait
+        blocks = consecutive(figure.blocks)
+        figure.bind(world, blocks)
+        gait.bind(world)
+        parameters = gait.parameters
+        options = self._options(figure.body)
+        self.state = GaitTaskState(
+            action=np.zeros((n, len(self.action_map))),
+            going=np.zeros(n, bool),
+            waiting=np.zeros(n, bool),
+            lasted=np.zeros(n, int),
+            stumbled=np.zeros(n, int),
+            age=np.zeros(n, int),
+            start=np.zeros(n),
+            down=np.zeros(n),
+            milestone=np.zeros((n, 2)),
+            fell=np.zeros(n, bool),
+            stuck=np.zeros(n, bool),
+            duration=np.zeros(n),
+            stumbling=np.zeros(n),
+        )
+        size = max(part.stop for part in self.blocks.values())
+        self.outcome = outcome(n, size, len(parameters.reward))
+        self.saved = (self.state, gait.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': dict(zip(parameters.reward, self.reward_terms.T, strict=True)),
+            'fell': self.state.fell,
+            'stuck': self.state.stuck,
+            'diverged': self.outcome.diverged,
+            'distance': world.qpos[:, figure.pose_qpos[0]],
+            'duration': self.state.duration,
+            'stumbled': self.state.stumbling,
+        }
+        self.rules = Rules(
+            world.engine, figure.body, figure.ground, gait.rules, world.ctrl, options,
+            np.zeros((n, sum(figure.blocks.values()))), np.zeros(n, int), figure.measurement(),
+            self.state, self.outcome,
+        )  # fmt: skip
+        self._pack = packed(self.rules)
+        self._start = self._start_pose()
+
+    def _options(self, body: PlanarBody) -> Options:
+        parameters, spec = self.gait.parameters, self.character.spec
+        scope = f'{self.character.mjcf_model.model}/'
+        controls = self.world.control_addresses([scope + name for name in spec.joints])
+        fall = [self.gait.link[name] for name in spec.fall_links]
+        stumble = [i for i, name in enumerate(spec.links) if name not in spec.stumble_exempt]
+        pitch = parameters.observe_pitch
+        return Options(
+            by_cycle=self.interface == 'parameters',
+            substeps=self._control_substeps,
+            action_offset=parameters.action_offset.copy(),
+            action_scale=parameters.action_scale[parameters.actions],
+            places=parameters.actions,
+            base_actions=parameters.base_actions,
+            controls=controls,
+            fall=np.array(fall),
+            stumble=np.array(stumble),
+            forward_only=parameters.forward_only,
+            backward_reward=parameters.backward_reward,
+            target_speed=float(parameters.target_speed),
+            weights=np.array([parameters.reward[name] for name in TERMS]),
+            columns=self._columns(body),
+            pitch=self.blocks['pose'].stop - 1 if pitch else -1,
+            pitch_rate=self.blocks['velocity'].stop - 1 if pitch else -1,
+        )
+
+    def _columns(self, body: PlanarBody) -> np.ndarray:
+        """Columns of the measurement that make an observation, by stance leg, (2, size)."""
+        links = self.character.spec.links
+        order = np.arange(len(links))
+        mirrored = order.copy()
+        for right, left in self.character.spec.mirror:
+            i, j = links.index(right), links.index(left)
+            mirrored[i], mirrored[j] = j, i
+        arranged = []
+        for each in (order, mirrored):
+            pairs = 2 * each[:, None] + np.arange(2)
+            arranged.append(np.concatenate([
+                np.arange(SAMPLES) + body.terrain, [body.pose],
+                (pairs[1:] + body.pose + 1).ravel(), (pairs + body.velocity).ravel(),
+            ]))  # fmt: skip
+        return np.array(arranged)
+
+    def _start_pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pose and rates of the first instant, (1, D), and extents of the geoms, (1, 3, G)."""
+        start, figure = self.gait.parameters.start, self.figure
+        pose, rates = np.zeros((2, 1, len(figure.pose_qpos)))
+        pose[0, 1:3], rates[0, :3] = (start['height'], start['pitch']), start['velocity']
+        for name, (angle, rate) in start['joints'].items():
+            pose[0, 3 + self.gait.number[name]] = angle
+            rates[0, 3 + self.gait.number[name]] = rate
+        data = self.world.posed(figure.pose_qpos, pose[0])
+        root = data.xpos[figure.links[0]][::2]
+        extents = link_extents(self.world.models[0], data, figure.geoms, root)
+        return pose, rates, extents[None]
+
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        poses, rates, extents = (np.repeat(part, len(env_ids), axis=0) for part in self._start)
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
+            noise = self.config.start_noise * random_state.standard_normal((2, poses.shape[1] - 3))
+            push = self.config.start_noise * random_state.standard_normal()
+            poses[k, 3:] += noise[0]
+            rates[k, 3:] += 10 * noise[1]
+            rates[k, 0] += 10 * push
+            strip = PlanarGround(
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
+                spawn=self.config.spawn,
+                centre=UPSTREAM_CENTRE,
+            )
+            self.arena.begin_episode(i, strip)
+        self.figure.place(env_ids, poses, rates, extents)
+        self._observe(env_ids, True)
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        begin_steps(env_ids, action, self._pack)
+
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Runs each simulation to the end of its cycle, or for a frame."""
+        interruption = self.rules.interruption
+        while run(env_ids, self.watch is not None, self._pack):
+            leaving = env_ids[interruption[env_ids] == _GROUND]
+            if len(leaving):
+                self.figure.follow(leaving)
+            if self.watch is not None and (interruption[env_ids] == _LOOK).any():
+                self.watch()
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        check_simulated(self.state.lasted[env_ids])
+        if finish_steps(env_ids, self._pack):
+            finish_steps(self._widened(env_ids), self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        self._observe(self.world.all_ids if env_ids is None else env_ids, False)
+
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if observe_all(env_ids, fresh, self._pack):
+            observe_all(self._widened(env_ids), fresh, self._pack)
+
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self.rules.found.waiting[env_ids]]
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting

@@ -1,0 +1,50 @@
+"""Tasks that track a motion clip."""
+
+from trl_suite.motion import Clip
+from trl_suite.tasks.components import differences
+from trl_suite.tasks.components.differences import Difference
+from trl_suite.tasks.imitation import description
+from trl_suite.tasks.imitation.planar import PlanarImitation, PlanarImitationConfig
+from trl_suite.tasks.imitation.spatial import SpatialImitation, SpatialImitationConfig
+from trl_suite.tasks.task_type import TaskType, tracking
+
+TYPES = (
+    TaskType(
+        name='planar_imitation',
+        title='imitation',
+        spatial=False,
+        config=PlanarImitationConfig,
+        make=tracking(PlanarImitation),
+        description=description.PLANAR,
+        motion=Clip,
+        differences=(
+            Difference(
+                'MuJoCo at 600 Hz instead of Bullet at 3000 Hz; task option substeps',
+                lambda spec: 'substeps' in spec.options,
+            ),
+            Difference(
+                differences.FROM_3000.text, lambda spec: 'substeps' not in spec.options
+            ),
+            differences.ACTIONS, differences.OWN_CLIP, differences.START_PHASE, differences.FACES,
+            differences.CUT,
+        ),
+    ),
+    TaskType(
+        name='spatial_imitation',
+        title='imitation',
+        spatial=True,
+        config=SpatialImitationConfig,
+        make=tracking(SpatialImitation),
+        description=description.SPATIAL,
+        motion=Clip,
+        differences=(
+            differences.FROM_3000, differences.AXES, differences.ACTIONS, *differences.ROTATIONS,
+            differences.CONES,
+            Difference(
+                'the goal is straight on, 3 m ahead on the line of the start; the original observes where '
+                'the start was'
+            ),
+            differences.START_PHASE, differences.CUT,
+        ),
+    ),
+)  # fmt: skip

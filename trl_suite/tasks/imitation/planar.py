@@ -1,0 +1,349 @@
+"""Tracking a motion clip over planar terrain: the Imitation and PLAiD families.
+
+Source: the imitation scenario of the original; 'Does the choice of action space matter?' (Peng &
+van de Panne 2017) and 'Progressive reinforcement learning with distillation for multi-skilled
+motion control' (Berseth et al. 2018).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from trl_suite import actuation
+from trl_suite.actuation import hill
+from trl_suite.actuation.muscles import PLAIN, Muscle
+from trl_suite.arenas import PlanarArena
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.planar import (
+    PlanarFigure,
+)
+from trl_suite.kinematics.planar_reference import Reference
+from trl_suite.motion import Clip
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.imitation.planar_rules import (
+    _FEATURES,
+    ACTION_OFFSETS,
+    CONTROL_TIMESTEP,
+    PHASE_BINS,
+    SUBSTEPS,
+    VIEW_AHEAD,
+    VIEW_BEHIND,
+    ImitationState,
+    Layout,
+    Rules,
+    apply_actions,
+    finish_steps,
+    observe_all,
+)
+from trl_suite.tasks.task import (
+    SPAWNS,
+    START_PHASE,
+    TERRAIN_LEVEL,
+    Task,
+    check_position_options,
+    consecutive,
+    drawn_seed,
+    outcome,
+    start_phases,
+)
+from trl_suite.terrain import PlanarGround
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import Config, option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarConfig(Config):
+    """Options of tasks that follow a clip in the plane."""
+
+    terrain_observation: int = option(
+        0,
+        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        at_least=0,
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    action_offset: str = option(
+        'clip',
+        "pose at action 0: the mean of the 'clip', the working 'posture', or the 'original' map, whose "
+        '[-1, 1] spans four times the joint range about its middle',
+        choices=ACTION_OFFSETS, actuation='position',
+    )  # fmt: skip
+    action_scale: float | None = option(
+        None,
+        'joint angle per unit action; by default 1.5',
+        unit='rad',
+        above=0,
+        actuation='position',
+    )
+    start_phase: float | Sequence[Sequence[float]] | None = option(None, START_PHASE)
+    spawn: str = option(
+        'intended',
+        "where the flat start lies: 'intended', 1 m to both sides of the root, or 'upstream', where the "
+        'original builds it',
+        choices=SPAWNS,
+    )  # fmt: skip
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.terrain_observation == 1:
+            raise ValueError('terrain_observation is 1; expected 0, or at least 2 heights')
+        start_phases(self.start_phase)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarImitationConfig(PlanarConfig):
+    """Options of `PlanarImitation`."""
+
+    reference_observation: bool = option(
+        False, "observe the reference's state instead of the phase"
+    )
+    muscle_set: str = option(
+        PLAIN, "'plain', or the motion that the muscles were optimised for", actuation='muscle'
+    )
+
+
+class PlanarImitation(Task):
+    """A planar character tracks a looping clip over random terrain.
+
+    Observation blocks, in this order (N links, J joints; heading frame: x is mirrored while the
+    trunk points backwards, heights are relative to the ground under the root):
+      terrain: heights of the ground along the line of samples, m.
+      pose: height of the root, then (x, z) of every link centre relative to the root, m; 2N + 1.
+      velocity: (x, z) velocity of every link centre, m/s; 2N.
+      strain: fibre strain of every muscle, if the character is driven by muscles.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
+      reference: height of the reference's root, then its link positions relative to its root and its
+        link velocities; 4N + 1.
+    """
+
+    TERMS: Mapping[str, tuple[float, float]] = rewards.IMITATION_TERMS  # weight, scale of the error
+    ABOUT = 'com'  # from where end effectors are measured, or 'root'
+    EXTRAS: Mapping[str, int] = MappingProxyType({})  # blocks of a subclass, with their sizes
+
+    CONFIG: Any = PlanarImitationConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena,
+        clip: Clip,
+        config: PlanarConfig = PlanarImitationConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a planar character without actuators; it is attached to the arena.
+          arena: where it moves.
+          clip: a looping planar clip for this character.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
+        """
+        _check(character, clip, actuation_model, config)
+        self.character, self.arena, self.clip, self.config = character, arena, clip, config
+        self.actuation_model = actuation_model
+        self._start_phase = start_phases(config.start_phase)
+        self.figure = PlanarFigure(
+            character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation,
+            'contact' in self.EXTRAS,
+        )  # fmt: skip
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
+
+        options: dict[str, Any] = {}
+        muscles: tuple[Muscle, ...] = ()
+        muscle_set = getattr(config, 'muscle_set', PLAIN)
+        if actuation_model == 'position':
+            options = position_range(character, clip, config.action_offset, config.action_scale)
+        elif actuation_model == 'muscle':
+            options = {'muscle_set': muscle_set}
+            muscles = actuation.character_muscles(character, muscle_set)
+        if muscle_set != PLAIN and not muscles:
+            raise ValueError(f'muscle_set is for muscle control, not for {actuation_model} control')
+        self.action_map = actuation.add(
+            character, actuation_model, self.physics_timestep, **options
+        )
+        reference = 4 * len(character.spec.links) + 1
+        seen = getattr(config, 'reference_observation', False)
+        self.blocks = consecutive({
+            **self.figure.blocks,
+            'strain': len(muscles),
+            'phase': 0 if seen else 1 + PHASE_BINS,
+            'reference': reference if seen else 0,
+            **self.EXTRAS,
+        })  # fmt: skip
+        self._scale = np.array([hill.optimal_length(muscle) for muscle in muscles])
+        self._rest = np.array([hill.rest_length(muscle) for muscle in muscles])
+
+    @property
+    def root_entity(self) -> PlanarArena:
+        return self.arena
+
+    @property
+    def signature(self) -> str:
+        parts = self.character.spec.name, self.arena.terrain.name, self.clip.name
+        return f'{super().signature} of {" / ".join(parts)}'
+
+    def bind(self, world: World) -> None:
+        self.world, n = world, world.n
+        figure, spec = self.figure, self.character.spec
+        figure.bind(world, self.blocks, self.ABOUT)
+        scope = f'{self.character.mjcf_model.model}/'
+        controls = world.control_addresses([scope + name for name in self.action_map.names])
+        # They were added one after the other.
+        by = self.action_map.drive(int(controls[0]))
+        self.reference = Reference(
+            self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
+            figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
+        )  # fmt: skip
+        self.state = ImitationState(*np.zeros((3, n)))
+        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), len(self.TERMS))
+        self.saved = (self.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': dict(zip(self.TERMS, self.reward_terms.T, strict=True)),
+            'fell': self.outcome.fell,
+            'diverged': self.outcome.diverged,
+            'distance': world.qpos[:, figure.pose_qpos[0]],
+        }
+        self._found = figure.measurement()
+        terms = np.array(list(self.TERMS.values()))
+        self.rules = Rules(
+            world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
+            by, world.ctrl, self._layout(), np.asarray(spec.weights), terms[:, 0].copy(), terms[:, 1].copy(),
+            self._rest, self._scale, self._found, self.state, self.outcome,
+        )  # fmt: skip
+        self._pack = packed(self.rules)
+
+    def _layout(self) -> Layout:
+        columns = {name: part.start for name, part in self.reference.columns.items()}
+        starts = {name: part.start for name, part in self.blocks.items()}
+        reference = self.blocks.get('reference', slice(0, 0))
+        return Layout(
+            **{name: columns[name] for name in _FEATURES},
+            strain_block=starts.get('strain', -1),
+            phase_block=starts.get('phase', -1),
+            reference_block=starts.get('reference', -1),
+            reference=reference.stop - reference.start,
+        )
+
+    @property
+    def phase(self) -> np.ndarray:
+        """Phase of the clip in [0, 1), (n,)."""
+        return self.state.phase
+
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        terrain, centre = self.arena.terrain, 0.0
+        phases = np.empty(len(env_ids))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
+            # Drawn even where it is not asked for, so that the terrain does not depend on it.
+            drawn = random_state.random_sample()
+            phases[k] = self._start_phase(drawn)
+            if self.config.spawn == 'upstream':
+                # Where the original's segments meet: it builds them before it moves the root to 0.
+                centre = self.clip.pose(phases[k : k + 1] * self.reference.period)[0, 0] - 0.5
+            seed = drawn_seed(random_state)
+            strip = PlanarGround(
+                terrain,
+                seed,
+                terrain_level=self.config.terrain_level,
+                spawn=self.config.spawn,
+                centre=centre,
+            )
+            self.arena.begin_episode(i, strip)
+        for array in self.state:
+            array[env_ids] = phases
+        self.figure.place(env_ids, *self.reference.state(phases))
+        self._begin(env_ids, random_states)
+        self._observe(env_ids, True)
+
+    def _begin(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        """What a subclass draws at the start, once characters stand."""
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if apply_actions(env_ids, action, self._pack):
+            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
+            self.figure.follow(env_ids[self._found.leaving[env_ids]])
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if finish_steps(env_ids, self._pack):
+            finish_steps(self._widened(env_ids), self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        self._observe(self.world.all_ids if env_ids is None else env_ids, False)
+
+    def _observe(self, env_ids: np.ndarray, fresh: bool) -> None:
+        if observe_all(env_ids, fresh, self._pack):
+            observe_all(self._widened(env_ids), fresh, self._pack)
+
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self._found.waiting[env_ids]]
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting
+
+    def clip_action(self, env_id: int) -> np.ndarray:
+        """Action that drives joints along the clip, without feedback on balance.
+
+        Raises:
+          ValueError: torque and muscle control have no such action.
+        """
+        if self.actuation_model not in ('position', 'velocity'):
+            raise ValueError(
+                f'{self.actuation_model} control cannot follow a clip open loop; position and '
+                'velocity control can'
+            )
+        time = self.phase[env_id : env_id + 1] * self.reference.period
+        sample = self.clip.pose if self.actuation_model == 'position' else self.clip.velocity
+        return self.action_map.action(sample(time)[0, 3:])
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Pose of the reference beside the simulated character: x, z, pitch, joints."""
+        cycles = np.array([self.state.start[env_id], self.state.cycles[env_id]])
+        first, pose = self.clip.pose(cycles * self.reference.period)
+        pose[0] -= first[0]
+        pose[1] += self.figure.ground_heights(env_id, pose[:1])[0]
+        return pose
+
+
+def _check(character: Character, clip: Clip, model: str, config: PlanarConfig) -> None:
+    if tuple(clip.joints) != tuple(character.spec.joints) or clip.root != 'planar':
+        raise ValueError(
+            f'clip {clip.name!r} (root {clip.root}, joints {", ".join(clip.joints)}) does not '
+            f'fit character {character.spec.name!r}, whose root is planar and whose joints are '
+            f'{", ".join(character.spec.joints)}'
+        )
+    if not clip.loop:
+        raise ValueError(f'clip {clip.name!r} does not loop; an imitation task needs a cycle')
+    check_position_options(model, config.action_offset, config.action_scale)
+
+
+def position_range(
+    character: Character, clip: Clip, action_offset: str, action_scale: float | None
+) -> dict[str, Any]:
+    """Centre and half range of position control, rad (see `PlanarImitation`)."""
+    if action_offset == 'original':
+        ranges = np.array([
+            joint.original_range or limits
+            for joint, limits in zip(
+                character.spec.joints.values(), character.joint_ranges.tolist(), strict=True
+            )
+        ])  # fmt: skip
+        free = ~np.isfinite(ranges).all(1)
+        ranges = np.where(free[:, None], (-np.pi, np.pi), ranges)
+        scale = 2 * (ranges[:, 1] - ranges[:, 0]) if action_scale is None else action_scale
+        return {'action_offset': ranges.mean(1), 'action_scale': scale}
+    options: dict[str, Any] = {} if action_scale is None else {'action_scale': action_scale}
+    if action_offset == 'clip':
+        times = np.linspace(0, clip.duration, 256, endpoint=False)
+        options['action_offset'] = clip.pose(times)[:, 3:].mean(0)
+    return options

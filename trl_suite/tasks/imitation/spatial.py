@@ -1,0 +1,316 @@
+"""Tracking a motion clip in three dimensions: the 3D rows of the Imitation family.
+
+Source: the imitation scenario of the original, as for `trl_suite.tasks.imitation.planar.planar`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.arenas import SpatialArena
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial_reference import SpatialReference, feature, moment
+from trl_suite.motion import Clip, quaternion
+from trl_suite.tasks.components import rewards
+from trl_suite.tasks.components.comparison import (
+    Comparison,
+    com_error,
+    comparison,
+    effector_error,
+    height_error,
+    pose_error,
+    rate_error,
+    term,
+)
+from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.spatial_rules import (
+    SpatialRules,
+    act_all,
+    breaks_down,
+    measure,
+    observe_body,
+    publish,
+    tick,
+)
+from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
+from trl_suite.tasks.task import conclude, drawn_seed
+from trl_suite.terrain import SpatialGround
+from trl_suite.util.compiled import compiled, compiled_loop, packed
+from trl_suite.util.options import option
+
+GOAL_AHEAD = 3.0  # m along x; where the goal on the line through the start lies
+TYPICAL_POSES = 256  # of a cycle, whose mean is the middle of position control
+
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
+
+
+class ImitationRules(NamedTuple):
+    """All that the rules of imitation work on.
+
+    Attributes:
+      reference: where the reference block begins in the full observation; -1: not observed.
+      goal: where the goal block begins.
+      links: number of links.
+    """
+
+    common: SpatialRules
+    comparison: Comparison
+    reference: int
+    goal: int
+    links: int
+
+
+# A step of simulation i, in order.
+
+
+@compiled
+def finish_step(i: int, rules: ImitationRules) -> None:
+    """Reward, failure and observation, after the physics has advanced."""
+    common = rules.common
+    tick(i, common)
+    if breaks_down(i, common):
+        conclude(i, True, common.outcome)
+        return
+    look(i, rules)
+    compare(i, rules)
+    conclude(i, common.found.fallen[i], common.outcome)
+    observe(i, rules)
+
+
+@compiled
+def look(i: int, rules: ImitationRules) -> None:
+    """Measures the body; what was travelled counts along +x."""
+    common = rules.common
+    measure(i, common)
+    common.travel.distance[i] = common.found.root[i, 0] - common.travel.origin[i, 0]
+
+
+@compiled
+def compare(i: int, rules: ImitationRules) -> None:
+    """Writes the reward terms: how near pose, velocities and feet are to those of the clip."""
+    by, found = rules.comparison, rules.common.found
+    row, rest = moment(rules.common.clock.phase[i], 0, by.tracks)
+    terms = rules.common.outcome.reward_terms
+    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
+    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    terms[i, END_EFFECTOR] = term(END_EFFECTOR, effector_error(i, row, rest, by, found), by)
+    terms[i, COM] = term(COM, com_error(i, row, rest, 0.0, by, found), by)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+
+
+@compiled
+def observe(i: int, rules: ImitationRules) -> None:
+    """Writes the observation."""
+    common, by = rules.common, rules.comparison
+    observe_body(i, common)
+    if rules.reference >= 0:
+        row, rest = moment(common.clock.phase[i], 0, by.tracks)
+        common.full[i, rules.reference] = feature(row, rest, by.height, by.tracks)
+        for k in range(6 * rules.links):  # positions and velocities of the links
+            value = feature(row, rest, by.positions + k, by.tracks)
+            common.full[i, rules.reference + 1 + k] = value
+    aside = common.travel.origin[i, 1] - common.found.root[i, 1]
+    bearing, distance = polar(i, GOAL_AHEAD, aside, common.found)
+    common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
+    publish(i, common)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def finish_steps(env_ids: np.ndarray, rules: ImitationRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish_step(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: ImitationRules) -> None:
+    """Observes, and compares as if a step had been taken."""
+    for i in env_ids:
+        look(i, rules)
+        compare(i, rules)
+        observe(i, rules)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialImitationConfig(MirroredConfig):
+    """Options of `SpatialImitation`."""
+
+    reference_observation: bool = option(
+        False, "observe the reference's state instead of the phase"
+    )
+
+
+class SpatialImitation(SpatialTask):
+    """A spatial character tracks a looping clip along +x, over random terrain.
+
+    Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
+    left, z up; heights are relative to the ground under the root):
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if asked for.
+      pose: height of the root, then of every link the position of its centre relative to the root
+        (3), m, and its orientation (4) as a quaternion wxyz with w not negative; 7N + 1.
+      velocity: of every link the velocity of its centre (3), m/s, against the ground under the
+        root, and its angular velocity (3), rad/s; 6N.
+      phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
+      reference: height of the reference's root, then its link positions relative to its root, then
+        its link velocities, in the reference's heading frame; 6N + 1.
+      goal: bearing (rad, positive to the left) and distance (m) of the point on the line through
+        the start along +x that is 3 m further along than the root: which way is straight on. The
+        original has bearing and distance of the start there, of no use to anybody, and its walkers
+        cannot tell where +x is.
+    Mirrored observations are reflected while the phase is 0.5 or more, and so are their actions; of
+    the phase they keep that of the single step and the one-hot of its half.
+    """
+
+    TERMS = rewards.IMITATION_TERMS
+
+    CONFIG: Any = SpatialImitationConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        clip: Clip,
+        config: SpatialImitationConfig = SpatialImitationConfig(),
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial character without actuators; it is attached to the arena.
+          arena: where it moves.
+          clip: a looping clip for this character, with a free root.
+          config: the options.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
+        """
+        check_cycle(clip)
+        self.clip, self.period = clip, clip.duration
+        seen = config.reference_observation
+        extras = {'reference': 1 + 6 * len(character.spec.links) if seen else 0, 'goal': 2}
+        super().__init__(
+            character, arena, clip, config, actuation_model=actuation_model, phase=not seen,
+            extras=extras,
+        )  # fmt: skip
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
+
+    def _extra_mirror(self, name: str) -> Reflection:
+        assert name == 'goal', name  # mirrored observations have no reference
+        return np.arange(2), np.array([-1.0, 1.0])
+
+    def bind(self, world: World) -> None:
+        common = self._bind_rules(world)
+        self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
+        starts = {name: part.start for name, part in self._full.items()}
+        rules = ImitationRules(
+            common, comparison(self.character, self.reference, self.TERMS),
+            starts.get('reference', -1), starts['goal'], len(self.character.spec.links),
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        for i, random_state in zip(env_ids.tolist(), random_states, strict=True):
+            # Drawn even where it is not asked for, so that the terrain does not depend on it.
+            drawn = random_state.random_sample()
+            self.clock.start[i] = self._start_phase(drawn)
+            ground = SpatialGround(
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
+            )
+            self.arena.begin_episode(i, ground)
+        self._begin_clocks(env_ids)
+        return *pose_of_clip(self.clip, self.clock.start[env_ids]), np.zeros((len(env_ids), 3))
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        finish_steps(env_ids, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def clip_action(self, env_id: int) -> np.ndarray:
+        """Action that drives joints along the clip, without feedback on balance.
+
+        Raises:
+          ValueError: torque control has no such action.
+        """
+        action = clip_action(self, self.clip, env_id)
+        if self.mirrored and self.phase[env_id] >= 0.5:
+            assert self._reflection is not None
+            action = self._reflection.action(action[None])[0]
+        return action
+
+    def reference_pose(self, env_id: int) -> np.ndarray:
+        """Pose of the reference beside the simulated character: root, then joints."""
+        cycles = np.array([self.clock.start[env_id], self.cycles[env_id]])
+        first, pose = self.clip.pose(cycles * self.period)
+        pose[:2] += self.travel.origin[env_id, :2] - first[:2]
+        env_ids = np.array([env_id])
+        pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]
+        return pose
+
+
+def check_cycle(clip: Clip) -> None:
+    """Checks that a clip can be tracked for ever in three dimensions.
+
+    Raises:
+      ValueError: it cannot.
+    """
+    if clip.root != 'free' or not clip.loop:
+        raise ValueError(
+            f'clip {clip.name!r} (root {clip.root}, {"looping" if clip.loop else "not looping"})'
+            ' does not serve a spatial imitation task: it needs a free root and a cycle'
+        )
+
+
+def pose_of_clip(clip: Clip, cycles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses over the origin, and rates, where a clip is after some cycles (m,)."""
+    poses, rates = clip.state(cycles * clip.duration)
+    poses[:, :2] = 0.0
+    return poses, rates
+
+
+def clip_action(task: SpatialTask, clip: Clip, env_id: int) -> np.ndarray:
+    """Returns the action that drives joints along a clip, without feedback on balance.
+
+    Raises:
+      ValueError: torque control has no such action.
+    """
+    if task.actuation_model not in ('position', 'velocity'):
+        raise ValueError(
+            f'{task.actuation_model} control cannot follow a clip open loop; position and '
+            'velocity control can'
+        )
+    time = task.phase[env_id : env_id + 1] * task.period
+    if task.actuation_model == 'velocity':
+        return task.action_map.action(clip.velocity(time)[0, 6:])
+    return task.action_map.action(joint_targets(clip, clip.pose(time)[0]))
+
+
+def joint_targets(clip: Clip, pose: np.ndarray) -> np.ndarray:
+    """Returns targets of position control that hold a pose (columns,): rotation vectors, angles."""
+    parts, column = [], 7
+    for size in clip.sizes:
+        value = pose[column : column + size]
+        parts.append(quaternion.rotation_vector(value) if size == 4 else value)
+        column += size
+    return np.concatenate(parts)

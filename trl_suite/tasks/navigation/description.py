@@ -1,0 +1,164 @@
+"""Navigation in words and tables: joints driven directly, or by plans of footsteps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from trl_suite.tasks.components import ball, description, spatial_description
+from trl_suite.tasks.components.description import REWARD, Meanings, floats, tracking_terms
+from trl_suite.tasks.footsteps.description import LEGEND, spatial_rules
+from trl_suite.tasks.navigation import direct, direct_rules, hierarchical_rules
+from trl_suite.tasks.task_type import Description
+from trl_suite.util.tables import Section, Table, section
+
+if TYPE_CHECKING:
+    from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
+
+_BEADS = ' Beads: where the centre of mass has been; red: the goal.'
+_BLOCKS: Meanings = {
+    'surface': (
+        'm/s',
+        'velocities of the ground against that under the root, at 32 lines from the left to the right (5.5 m '
+        'to each side), each of 32 from 1 m behind to 10 m ahead: all ahead, then all to the right',
+    ),
+    'ball': spatial_description.BALL_BLOCK,
+    'low_level': ('', 'what the footstep controller observes'),
+}
+_MEANINGS = {
+    'first_x': 'm; where the foot that swings lands, ahead of the root',
+    'first_y': 'm; the same, to the left of the root',
+    'second_x': 'm; where the other foot lands after it, ahead of the root',
+    'second_y': 'm; the same, to the left of the root',
+    'turn': 'rad; heading to have, to the left of the present one',
+}
+
+
+def blocks(task: Any) -> Meanings:
+    """Returns units and meanings of the observation blocks."""
+    return {
+        **spatial_description.BLOCKS,
+        **_BLOCKS,
+        'goal': spatial_description.TARGETS['ball' in task.blocks],
+    }
+
+
+def action(environment: Environment) -> Section:
+    """Returns what the actions plan."""
+    action_map = environment.action_map
+    cells = [
+        (name, action_offset, action_scale, _MEANINGS.get(name, 'of the footstep controller'))
+        for name, action_offset, action_scale in zip(
+            action_map.names,
+            floats(action_map.action_offset),
+            floats(action_map.action_scale),
+            strict=True,
+        )
+    ]
+    return section(
+        f'Action: {len(action_map)} numbers in [-1, 1]; {action_map.quantity} = action_offset + action_scale * action',
+        Table(('sets', 'action_offset', 'action_scale', 'unit and meaning'), cells, numbered=True),
+    )
+
+
+def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
+    """Yields controller, goal, reward and termination."""
+    yield section(
+        'Footstep controller',
+        f'{task.controller.name}; the plan is laid out from the root and its heading when a footstep begins',
+    )
+    yield spatial_description.start(spec)
+    if task.ball:
+        yield spatial_description.goal_and_ball(task.config.goal_distance)
+        formulas, full = spatial_description.ball_terms(task.config.target_speed, task.goal_reached)
+    else:
+        yield spatial_description.goal(spec, task, 'far')
+        formulas = [
+            f'exp(-{hierarchical_rules.SPEED_SHARPNESS:g} min(0, v - {task.config.target_speed:g})^2), v: speed of the '
+            'centre of mass towards the goal, m/s',
+            '1',
+        ]
+        full = f'speed is full where a step begins within {task.goal_reached:g} m of the goal'
+    yield section(
+        'Reward of a step: sum of weight * term, at most 1; 0 after a fall',
+        Table(
+            ('name', 'weight', 'term'),
+            [
+                (name, weight, formula)
+                for (name, (weight, _)), formula in zip(task.TERMS.items(), formulas, strict=True)
+            ],
+        ),
+        full,
+    )
+    every = hierarchical_rules.SAMPLE_FRAMES / 30
+    share = (
+        hierarchical_rules.FALL_THRESHOLD,
+        hierarchical_rules.CONTACT_DECAY,
+        hierarchical_rules.CONTACT_GAIN,
+    )
+    yield section(
+        f'Termination (discount 0), sampled every {every:g} s',
+        f'one of {", ".join(task.character.spec.fall_links)} touches the ground in '
+        f'{description.samples_until_fall(*share)} samples in a row, or so often that {description.contact_share(*share)}; '
+        'or the physics diverges',
+    )
+
+
+def time(spec: EnvSpec, task: Any) -> Section:
+    """Returns rates, and how long a step and an episode are."""
+    duration, physics = task.control_timestep, 1 / task.physics_timestep
+    return section(
+        'Time',
+        f'a step is {duration:.3g} s, the first of an episode may be shorter; footstep controller 30 Hz, '
+        f'physics\n{physics:.4g} Hz; an episode is cut (discount 1) after {spec.step_limit} steps, '
+        f'{spec.step_limit * duration:.3g} s',
+    )
+
+
+def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
+    """Yields clip, start, goal, reward and termination."""
+    if not isinstance(task, direct.DirectNavigation):  # the original's reward, of a hidden plan
+        yield from spatial_rules(spec, task)
+        return
+    of_ball = 'ball' in task.blocks
+    yield description.clip(task)
+    yield spatial_description.start(spec)
+    if of_ball:
+        yield spatial_description.goal_and_ball()
+    else:
+        yield spatial_description.goal(spec, task, 'near')
+    yield section(REWARD, *_direct_reward(task, 'ball' if of_ball else 'goal'))
+    yield description.fall(task)
+
+
+def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
+    near = f'{direct_rules.NEAR:g} m'
+    yield tracking_terms(task, False, proximity=f'distance to the {where} over {near}')
+    yield (
+        'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and the direction of '
+        f'the {where}'
+    )
+    yield (
+        f"com: the clip's velocity is turned towards the {where}; nearer than {near} com and heading are "
+        'worth their whole weight'
+    )
+    if where == 'ball':
+        formulas, full = spatial_description.ball_terms(ball.SPEED, task.goal_reached)
+        weights = [task.TERMS[name][0] for name in task.TERMS if name in ball.SOCCER_TERMS]
+        yield Table(
+            ('term', 'weight', 'times'),
+            list(zip(ball.SOCCER_TERMS, weights, formulas, strict=True)),
+        )
+        yield full
+
+
+DIRECT = Description(
+    blocks=spatial_description.blocks, rules=about_joints, after=spatial_description.after,
+    legend=_BEADS,
+)  # fmt: skip
+HIERARCHICAL = Description(
+    blocks=blocks, rules=about_plans, after=spatial_description.after, action=action,
+    time=time, joints=lambda task: ('', [''] * len(task.character.spec.joints)),
+    legend=LEGEND + _BEADS,
+)  # fmt: skip

@@ -1,0 +1,241 @@
+"""Going from goal to goal without hierarchy: joints are driven 30 times a second, by one policy.
+
+Source: the 'Hard' environments of the original, and its imitation scenario with a goal, which they
+were meant to have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.arenas import SpatialArena
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.spatial_reference import SpatialReference
+from trl_suite.motion import Clip, Steps
+from trl_suite.tasks.components import ball, rewards
+from trl_suite.tasks.components.ball import MIRRORED as MIRRORED_BALL
+from trl_suite.tasks.components.ball import Ball
+from trl_suite.tasks.components.comparison import (
+    comparison,
+)
+from trl_suite.tasks.components.goals import flag, goals, set_goal
+from trl_suite.tasks.components.reflection import Reflection
+from trl_suite.tasks.components.spatial_rules import TERRAIN_MAPS, act_all
+from trl_suite.tasks.components.trace import trace, trace_markers
+from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
+from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
+from trl_suite.tasks.navigation.direct_rules import (
+    BALL_TERMS,
+    GOAL_REACHED,
+    HIDDEN_LENGTH,
+    REWARDS,
+    DirectRules,
+    Progress,
+    finish_all,
+    observe_all,
+    travel_all,
+)
+from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask
+from trl_suite.tasks.task import Marker
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DirectConfig(SpatialConfig):
+    """Options of `DirectNavigation`."""
+
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=('height',))
+    goal_reached: float | None = option(
+        None,
+        f'distance at which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',
+        unit='m', above=0,
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DirectNavigationConfig(DirectConfig):
+    """Options of direct navigation without a ball, for either of its rewards."""
+
+    reward: str = option(
+        'goal',
+        f"'goal', or 'original': that of following a hidden plan of footsteps {HIDDEN_LENGTH:g} m long "
+        'towards a goal that stays where it is',
+        choices=REWARDS,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reward == 'original' and self.goal_reached is not None:
+            raise ValueError("goal_reached is an option of the reward 'goal', not of 'original'")
+
+
+class DirectNavigation(SpatialTask):
+    """A spatial character imitates a clip on its way from goal to goal, or dribbles a ball to them.
+
+    The reward is that of imitation, but that the clip's velocity is turned towards the goal, and
+    heading for the goal and nearness are rewarded too (`rewards.DIRECT_TERMS`). With a ball, half of
+    it is that of a journey to the ball, half that of dribbling (`ball.SOCCER_TERMS`).
+
+    Observation blocks, in this order: terrain, pose, velocity, phase as in `SpatialImitation`, and
+      goal: bearing of the goal, rad to the left of the heading, and its distance, m; with a ball, as
+        seen from the ball.
+      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+    """
+
+    CONFIG: Any = DirectConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        clip: Clip,
+        config: DirectConfig = DirectConfig(),
+        ball: Ball | None = None,
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial character without actuators; it is attached to the arena.
+          arena: where it moves.
+          clip: a looping clip for this character, with a free root.
+          config: the options.
+          ball: a ball of the arena that is to be dribbled.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other, or a clip that does not fit the character.
+        """
+        check_cycle(clip)
+        self.clip, self.period, self.ball = clip, clip.duration, ball
+        self.TERMS = BALL_TERMS if ball else rewards.DIRECT_TERMS
+        reached = config.goal_reached
+        self.goal_reached = GOAL_REACHED if reached is None else float(reached)
+        super().__init__(
+            character, arena, clip, config, actuation_model=actuation_model,
+            extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
+        )  # fmt: skip
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.clip.pose(np.linspace(0, self.period, TYPICAL_POSES, endpoint=False))
+
+    def _extra_mirror(self, name: str) -> Reflection:
+        signs = MIRRORED_BALL if name == 'ball' else (-1.0, 1.0)
+        return np.arange(len(signs)), np.array(signs)
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.reference = SpatialReference.of_clip(self.clip, common.body, world.models[0])
+        self.goals, self.progress, self.trace = goals(n), Progress(np.zeros(n)), trace(n)
+        self.saved = (*self.saved, self.goals, self.progress, self.trace)
+        self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
+        starts = {name: part.start for name, part in self._full.items()}
+        balls = ball.no_ball(n)
+        if self.ball:
+            self.ball.bind(world)
+            balls = self.ball.rules(starts['ball'], ball.SPEED, self.goal_reached)
+            self.saved = (*self.saved, self.ball.state)
+            self.info_arrays['at_goal'] = self.ball.state.at_goal
+        rules = DirectRules(
+            common, comparison(self.character, self.reference, rewards.DIRECT_TERMS), self.goals,
+            self.progress, self.trace, starts['goal'], self.goal_reached,
+            self.ball is not None, balls,
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, or where the ball is to go, (n, 3) m."""
+        return self.goals.place
+
+    # Episodes.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = self._begin_grounds(env_ids, random_states)
+        return *pose_of_clip(self.clip, self.clock.start[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        self.goals.reached[env_ids] = 0
+        self.trace.places[env_ids] = np.nan
+        for i in env_ids.tolist():
+            place = self.travel.origin[i, :2]
+            if self.ball:
+                self.ball.state.at_goal[i] = False
+                self.ball.put(i, place, 0, self._random[i])
+            self._draw_goal(i, place)
+        if self.ball:
+            self.world.forward(env_ids)
+        observe_all(env_ids, True, self._pack)
+
+    def _draw_goal(self, i: int, place: np.ndarray) -> None:
+        random = self._random[i]
+        if self.ball:
+            drawn = self.ball.goal(i, random)
+        else:
+            drawn = self.arena.goal(i, random, place, 'near')
+        set_goal(i, drawn, self.clock.steps[i], random, self.goals)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if act_all(env_ids, action, self._common_pack):
+            self._lay_ground(env_ids, self._common)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if travel_all(env_ids, self._pack):
+            self._draw(env_ids)
+        finish_all(env_ids, self._pack)
+
+    def _draw(self, env_ids: np.ndarray) -> None:
+        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        root, count = self.figure.found.root, self.clock.steps
+        if self.ball:
+            wanted = env_ids[self.ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self.ball.put(i, root[i, :2], count[i], self._random[i])
+            self.world.forward(wanted)
+        for i in env_ids[self.goals.wanted[env_ids]].tolist():
+            self._draw_goal(i, root[i, :2])
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, False, self._pack)
+
+    def clip_action(self, env_id: int) -> np.ndarray:
+        """Action that drives joints along the clip; see `imitation3d.clip_action`."""
+        return clip_action(self, self.clip, env_id)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """Where the centre of mass has been, and the goal: of a ball as a disc on the ground."""
+        goal = self.goal[env_id]
+        there = ball.goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
+        return [*trace_markers(env_id, self.trace), there]
+
+
+def hidden_plan(
+    character: Character,
+    arena: SpatialArena,
+    steps: Steps,
+    config: DirectConfig,
+    actuation_model: str,
+) -> SpatialFootsteps:
+    """Composes what the reward 'original' is for.
+
+    In the original the hidden plan begins at the world's origin, mostly far away; here at the start.
+    """
+    common = {
+        field.name: getattr(config, field.name) for field in dataclasses.fields(SpatialConfig)
+    }
+    return SpatialFootsteps(
+        character, arena, steps,
+        SpatialFootstepsConfig(plans={'length': (HIDDEN_LENGTH,) * 2}, hidden_plan=True, **common),
+        actuation_model=actuation_model,
+    )  # fmt: skip

@@ -1,0 +1,197 @@
+"""The rules of direct navigation, as compiled functions of one simulation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.kinematics.spatial import polar
+from trl_suite.kinematics.spatial_reference import moment
+from trl_suite.tasks.components import ball, rewards
+from trl_suite.tasks.components.ball import BallRules, dribble, observe_ball, remember
+from trl_suite.tasks.components.comparison import (
+    Comparison,
+    com_error,
+    effector_error,
+    height_error,
+    pose_error,
+    rate_error,
+    term,
+)
+from trl_suite.tasks.components.goals import Goals
+from trl_suite.tasks.components.spatial_rules import (
+    CONTROL_TIMESTEP,
+    SpatialRules,
+    breaks_down,
+    measure,
+    observe_body,
+    publish,
+    tick,
+)
+from trl_suite.tasks.components.trace import Trace, follow
+from trl_suite.tasks.task import conclude
+from trl_suite.util.compiled import compiled, compiled_loop
+
+REWARDS = ('goal', 'original')
+GOAL_REACHED = 0.5  # m; of the root, on the ground
+NEAR = 3.0  # m from the goal, where neither speed nor heading counts any longer
+HIDDEN_LENGTH = 0.4  # m; of the steps of the plan that the original's reward is about
+BALL_SHARE = 0.5  # of the reward, where there is a ball
+BALL_TERMS = {
+    name: (BALL_SHARE * weight, scale)
+    for name, (weight, scale) in {**rewards.DIRECT_TERMS, **ball.SOCCER_TERMS}.items()
+}
+
+TERMS = len(rewards.DIRECT_TERMS)
+POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING, PROXIMITY = range(TERMS)
+
+
+class Progress(NamedTuple):
+    """How fast each walker goes where it is to go, (n,) m/s."""
+
+    speed: np.ndarray
+
+
+class DirectRules(NamedTuple):
+    """All that the rules of a journey work on.
+
+    Attributes:
+      goal: where the goal block begins in the full observation.
+      goal_reached: m; nearer, the root has reached the goal.
+      with_ball: whether the goal is that of a ball.
+    """
+
+    common: SpatialRules
+    comparison: Comparison
+    goals: Goals
+    progress: Progress
+    trace: Trace
+    goal: int
+    goal_reached: float
+    with_ball: bool
+    ball: BallRules
+
+
+# A step of simulation i: `travel`, the next goal where one is wanted, `finish`.
+
+
+@compiled
+def travel(i: int, rules: DirectRules) -> bool:
+    """Measures the body and looks at what was reached; returns whether anything is to be drawn."""
+    common, goals, state = rules.common, rules.goals, rules.ball.state
+    tick(i, common)
+    goals.wanted[i] = state.wanted[i] = False
+    if breaks_down(i, common):
+        return False
+    measure(i, common)
+    count, found = common.clock.steps[i], common.found
+    follow(i, count, found.com, rules.trace)
+    if rules.with_ball:
+        dribble(
+            i, TERMS, BALL_SHARE, CONTROL_TIMESTEP, goals.place, common.physics, found, rules.ball,
+            common.outcome.reward_terms,
+        )  # fmt: skip
+        reached = state.at_goal[i]
+        state.wanted[i] = count >= state.due[i]
+        goals.wanted[i] = count >= goals.due[i]  # reaching it does not end it
+    else:
+        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        reached = x * x + y * y < rules.goal_reached * rules.goal_reached
+        goals.wanted[i] = reached or count >= goals.due[i]
+    goals.reached[i] += reached
+    return goals.wanted[i] or state.wanted[i]
+
+
+@compiled
+def finish(i: int, rules: DirectRules) -> None:
+    """Reward, failure and observation."""
+    common = rules.common
+    if common.outcome.diverged[i]:  # the last finite observation stands
+        conclude(i, True, common.outcome)
+        return
+    if rules.with_ball:
+        remember(i, common.physics, common.found, rules.ball)
+    compare(i, rules)
+    conclude(i, common.found.fallen[i], common.outcome)
+    observe(i, rules)
+
+
+@compiled
+def compare(i: int, rules: DirectRules) -> None:
+    """Writes the reward terms: imitation on the way to the goal, or to the ball."""
+    common, by, found = rules.common, rules.comparison, rules.common.found
+    row, rest = moment(common.clock.phase[i], 0, by.tracks)
+    if rules.with_ball:
+        x, y = common.physics.qpos[i, rules.ball.qpos], common.physics.qpos[i, rules.ball.qpos + 1]
+    else:
+        x, y = rules.goals.place[i, 0], rules.goals.place[i, 1]
+    x, y = x - found.root[i, 0], y - found.root[i, 1]
+    squared = x * x + y * y
+    distance, direction = math.sqrt(squared), math.atan2(y, x)
+    near = distance < NEAR
+    com = 0.0 if near else com_error(i, row, rest, direction, by, found)
+    off = 0.0 if near else rewards.wrapped(direction - found.heading[i])
+
+    terms = common.outcome.reward_terms
+    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
+    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    terms[i, END_EFFECTOR] = term(END_EFFECTOR, effector_error(i, row, rest, by, found), by)
+    terms[i, COM] = term(COM, com, by)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+    terms[i, HEADING] = by.term_weights[HEADING] * rewards.facing(off)
+    terms[i, PROXIMITY] = term(PROXIMITY, squared / (NEAR * NEAR), by)
+    if rules.with_ball:
+        for k in range(TERMS):
+            terms[i, k] *= 1.0 - BALL_SHARE
+    along = found.com_velocity[i, 0] * x + found.com_velocity[i, 1] * y
+    rules.progress.speed[i] = along / max(distance, 1e-9)
+
+
+@compiled
+def observe(i: int, rules: DirectRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observe_body(i, common)
+    if rules.with_ball:
+        place, physics = rules.goals.place, common.physics
+        observe_ball(i, rules.goal, place, physics, found, rules.ball, common.full)
+    else:
+        x, y = (
+            rules.goals.place[i, 0] - found.root[i, 0],
+            rules.goals.place[i, 1] - found.root[i, 1],
+        )
+        bearing, distance = polar(i, x, y, found)
+        common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
+    publish(i, common)
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def travel_all(env_ids: np.ndarray, rules: DirectRules) -> int:
+    """Looks at what was reached; returns for how many anything is to be drawn."""
+    wanted = 0
+    for i in env_ids:
+        wanted += travel(i, rules)
+    return wanted
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: DirectRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, fresh: bool, rules: DirectRules) -> None:
+    """Observes, and compares as if a step had been taken; at their starts if they are fresh."""
+    for i in env_ids:
+        measure(i, rules.common)
+        if fresh and rules.with_ball:
+            remember(i, rules.common.physics, rules.common.found, rules.ball)
+        compare(i, rules)
+        observe(i, rules)

@@ -1,0 +1,447 @@
+"""Walking somewhere by planning footsteps: the high-level tasks above a footstep controller.
+
+Source: the hike scenarios of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.actuation.action_map import ActionMap
+from trl_suite.arenas import SpatialArena
+from trl_suite.characters import Character
+from trl_suite.controllers import footstep_controller
+from trl_suite.engine import World
+from trl_suite.motion import Steps
+from trl_suite.policies.mirror import Mirror
+from trl_suite.tasks.components import reflection as reflection3d
+from trl_suite.tasks.components.ball import (
+    AT_GOAL,
+    GOAL_AWAY,
+    MIRRORED,
+    SOCCER_TERMS,
+    Ball,
+    goal_disc,
+    no_ball,
+)
+from trl_suite.tasks.components.footstep_plan import (
+    CONTACT_SIZE,
+    PLAN_SIZE,
+    check_two_feet,
+    footstep_plan,
+    plan_markers,
+    plan_mirror,
+)
+from trl_suite.tasks.components.goals import flag, goals, set_goal
+from trl_suite.tasks.components.plans import Plans, span
+from trl_suite.tasks.components.spatial_rules import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    TERRAIN_MAPS,
+    act_all,
+)
+from trl_suite.tasks.components.trace import trace, trace_markers
+from trl_suite.tasks.footsteps.spatial import pose_of_step, straight_step
+from trl_suite.tasks.footsteps.spatial_rules import TYPICAL_POSES
+from trl_suite.tasks.navigation.hierarchical_rules import (
+    CONTROLLER,
+    FARTHEST_GOAL,
+    GOAL_REACHED,
+    GOAL_SIGNS,
+    INTERFACES,
+    MAPS,
+    NAVIGATION_TERMS,
+    PLAN_NAMES,
+    PLAN_OFFSET,
+    PLAN_SCALE,
+    PLAN_SIGNS,
+    STEP_LENGTH,
+    PlanningRules,
+    PlanningState,
+    begin_steps,
+    finish_all,
+    finish_control_steps,
+    observe_all,
+    score_all,
+    show_plans,
+    take_all,
+)
+from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask, maps
+from trl_suite.tasks.task import (
+    TERRAIN_LEVEL,
+    Marker,
+    check_simulated,
+    consecutive,
+    drawn_seed,
+    drawn_way,
+)
+from trl_suite.terrain import SpatialGround
+from trl_suite.terrain.spatial.windows import SAMPLES
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import Config, option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HierarchicalConfig(Config):
+    """Options of `HierarchicalNavigation`."""
+
+    controller: Any = option(
+        CONTROLLER,
+        'footstep controller: an id whose policy is shipped, a policy, its file, or a function',
+        policy=True,
+    )
+    interface: str = option(
+        'plan',
+        "'plan': a step is a footstep; 'frame': 1/30 s, and an action has the plan, then the joints' "
+        'targets; a plan takes effect only in a step that begins a footstep',
+        choices=INTERFACES,
+    )
+    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
+    step_length: float = option(
+        STEP_LENGTH, 'length of the steps that action 0 means', unit='m', above=0
+    )
+    target_speed: float = option(
+        1.0,
+        'speed of walker and ball towards the goal from which on the reward is full',
+        unit='m/s',
+        above=0,
+    )
+    goal_reached: float | None = option(
+        None,
+        f'distance at which a goal is reached, by default {GOAL_REACHED:g}, or a ball is at its goal, '
+        f'{AT_GOAL:g}',
+        unit='m', above=0,
+    )  # fmt: skip
+    goal_distance: tuple[float, float] | None = option(
+        None,
+        'least and most distance from the walker, or the ball, at which goals are drawn, in any direction; '
+        'by default goals are where the terrain has them',
+        unit='m',
+    )
+    start_phases: Sequence[float] = option(
+        (0.1, 0.6), 'phases of the clock, one of which an episode starts with', at_least=0, below=1
+    )
+    substeps: int = option(SUBSTEPS, 'physics steps per 1/30 s', at_least=6)
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+        self._set('start_phases', tuple(self.start_phases))
+        if self.goal_distance is not None:
+            self._set('goal_distance', span('goal_distance', self.goal_distance, 'm'))
+            if self.goal_distance[1] > FARTHEST_GOAL:
+                raise ValueError(
+                    f'goal_distance is {self.goal_distance}; expected at most {FARTHEST_GOAL:g} m'
+                )
+
+
+class HierarchicalNavigation(SpatialTask):
+    """A spatial biped goes from goal to goal, or dribbles a ball to them, by planning footsteps.
+
+    An action is a plan of two footsteps and a heading. A step lasts from one switch of stance to the
+    next, half a cycle of the footstep controller that drives the joints inside; the first of an
+    episode may be shorter. The plan is laid out from the root's place on the ground and its heading
+    at the beginning of the step: where the foot that swings lands, where the other one lands after
+    it, and the heading to have.
+
+    Observation blocks, in this order (heading frame: x along the root's heading, y to the left):
+      terrain: the 32 x 32 map of `Surroundings.height_map`, m, if it sees heights.
+      surface: the two 32 x 32 maps of `Surroundings.velocity_map`, m/s, if it sees velocities.
+      pose, velocity: as in `SpatialImitation`.
+      goal: bearing of the goal, rad to the left, and its distance, m; with a ball, as seen from
+        the ball.
+      ball: with a ball, see `trl_suite.tasks.components.ball.observe_ball`; 9.
+      low_level: what the footstep controller observes, with interface 'frame' only; see `SpatialFootsteps`.
+
+    Attributes:
+      watch: called at every 1/30 s of the first simulation, within steps too; for pictures.
+    """
+
+    ABOUT = 'root'
+    watch: Callable[[], None] | None = None
+
+    CONFIG: Any = HierarchicalConfig
+
+    def __init__(
+        self,
+        character: Character,
+        arena: SpatialArena,
+        steps: Steps,
+        config: HierarchicalConfig = HierarchicalConfig(),
+        ball: Ball | None = None,
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: a spatial biped without actuators; it is attached to the arena.
+          arena: where it walks.
+          steps: library of single steps of this character, for the first pose and the clock.
+          config: the options.
+          ball: a ball of the arena that is to be dribbled; its ground must be level.
+
+        Raises:
+          ValueError: parts that do not fit each other.
+        """
+        check_two_feet(character.spec)
+        interface, step_length = config.interface, config.step_length
+        self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
+        self._first = straight_step(steps, float(np.mean(Plans().length)))
+        self.TERMS = SOCCER_TERMS if ball else NAVIGATION_TERMS
+        self._goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        super().__init__(
+            character, arena, steps, SpatialConfig(substeps=config.substeps),
+            extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
+        )  # fmt: skip
+        self.controller = footstep_controller.load(config.controller)
+        self.controller.check(self)
+        # A function of the user's is called by one thread, for all simulations that go on.
+        self.in_parts = self.controller.policy is not None
+        self.config, self.interface, self.step_length = config, interface, step_length
+        reached = config.goal_reached
+        self.goal_reached = (
+            (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
+        )
+        self._frame = config.substeps
+        low = max(part.stop for part in self._full.values())
+        action_offset, action_scale, names = step_length * PLAN_OFFSET, PLAN_SCALE, PLAN_NAMES
+        if interface == 'frame':
+            joints = self.joint_map
+            names = (*names, *joints.names)
+            action_offset = np.concatenate([action_offset, np.zeros(len(joints))])
+            action_scale = np.concatenate([action_scale, np.ones(len(joints))])
+        else:
+            self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
+        self.action_map = ActionMap(
+            names, 'footstep plan', 'm (turn: rad)', action_offset, action_scale
+        )
+        pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
+        self.blocks = consecutive({
+            'terrain': SAMPLES**2 if 'height' in config.terrain_observation else 0,
+            'surface': 2 * SAMPLES**2 if 'velocity' in config.terrain_observation else 0,
+            **pose,
+            **{name: len(signs) for name, signs in self._goal_signs.items()},
+            'low_level': low if interface == 'frame' else 0,
+        })  # fmt: skip
+        mirrors = interface == 'plan' and self.character.spec.mirror
+        self.mirror = self._plan_mirror() if mirrors else None
+
+    def _typical_poses(self) -> np.ndarray:
+        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+
+    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
+        return plan_mirror(name)
+
+    def _plan_mirror(self) -> Mirror:
+        """How observations and plans are reflected."""
+        parts = reflection3d.body(self.character)
+        lines, _ = parts['terrain']
+        ahead = np.ones(len(lines))
+        parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
+        for name, signs in self._goal_signs.items():
+            parts[name] = np.arange(len(signs)), np.array(signs)
+        index, sign = reflection3d.joined(self.blocks, parts)
+        links = list(self.character.spec.links)
+        feet = [links.index(name) for name in self.character.spec.end_effectors]
+        right, left = self.blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
+        return Mirror(
+            index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
+        )
+
+    def bind(self, world: World) -> None:
+        common, n = self._bind_rules(world), world.n
+        self.plan, self.goals, self.trace = footstep_plan(n), goals(n), trace(n)
+        self.state = PlanningState(
+            np.zeros(n, int), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
+            np.zeros((n, len(self.action_map))), np.zeros(n, bool),
+        )  # fmt: skip
+        self.saved = (*self.saved, self.plan, self.goals, self.trace, self.state)
+        self.info_arrays |= {
+            'landed': self.plan.landed,
+            'landing_error': self.plan.landing_error,
+            'heading_error': self.plan.heading_error,
+            'goals_reached': self.goals.reached,
+            'speed': self.state.speed,
+            'duration': self.state.duration,
+        }
+        starts = {name: part.start for name, part in self.blocks.items()}
+        balls = no_ball(n)
+        if self.ball:
+            self.ball.bind(world)
+            balls = self.ball.rules(
+                starts['ball'], float(self.config.target_speed), self.goal_reached
+            )
+            self.saved = (*self.saved, self.ball.state)
+            self.info_arrays['at_goal'] = self.ball.state.at_goal
+        low = self._full
+        names = 'terrain', 'surface', 'pose', 'velocity', 'goal', 'low_level'
+        rules = PlanningRules(
+            common=common, plan=self.plan, goals=self.goals, state=self.state, trace=self.trace,
+            contact=low['contact'].start, plan_block=low['plan'].start,
+            by_plan=self.interface == 'plan', plan_offset=self.action_map.action_offset,
+            plan_scale=self.action_map.action_scale, target_speed=float(self.config.target_speed),
+            goal_reached=self.goal_reached, with_ball=self.ball is not None, ball=balls,
+            **{name: starts.get(name, -1) for name in names},
+        )  # fmt: skip
+        self._common, self._common_pack, self._pack = common, packed(common), packed(rules)
+        self._low_action = np.zeros((n, len(self.joint_map)))
+
+    # What is often asked for, by short names.
+
+    @property
+    def stance(self) -> np.ndarray:
+        """Foot that stands, 0 the right one, (n,)."""
+        return self.plan.stance
+
+    @property
+    def landing(self) -> np.ndarray:
+        """Where the swing foot lands, then the stance foot, (n, 2, 3) m."""
+        return self.plan.landing
+
+    @property
+    def heading(self) -> np.ndarray:
+        """Planned heading, (n,) rad."""
+        return self.plan.heading
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where to go, or where the ball is to go, (n, 3) m."""
+        return self.goals.place
+
+    # Episodes.
+
+    def _start(
+        self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        spawns = np.zeros((len(env_ids), 3))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
+            ground = SpatialGround(
+                self.arena.terrain,
+                drawn_seed(random_state),
+                terrain_level=self.config.terrain_level,
+            )
+            random = self._random[i] = np.random.default_rng(drawn_seed(random_state))
+            self.clock.start[i] = random.choice(self.config.start_phases)
+            spawns[k] = ground.spawn(random)
+            self.arena.begin_episode(i, ground, spawns[k, :2])
+        self._begin_clocks(env_ids)
+        self.plan.stance[env_ids] = self.phase[env_ids] >= 0.5
+        return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
+
+    def _begun_on_ground(self, env_ids: np.ndarray) -> None:
+        plan, state = self.plan, self.state
+        plan.landing_error[env_ids] = plan.heading_error[env_ids] = state.down[env_ids] = 0.0
+        plan.landed[env_ids] = False
+        state.lasted[env_ids] = self.goals.reached[env_ids] = 0
+        state.speed[env_ids] = state.duration[env_ids] = 0.0
+        self.trace.places[env_ids] = np.nan
+        found = self.figure.measure(env_ids)
+        for i in env_ids.tolist():
+            self.begin_goal(i)
+        if self.ball:
+            self.ball.state.at_goal[env_ids] = False
+            self.world.forward(env_ids)
+        # Until the first action there is no plan; the places under the feet stand for it.
+        plan.heading[env_ids] = found.heading[env_ids]
+        stance = plan.stance[env_ids]
+        plan.landing[env_ids, 0] = found.feet[env_ids, 1 - stance]
+        plan.landing[env_ids, 1] = found.feet[env_ids, stance]
+
+    def begin_goal(self, i: int) -> None:
+        """Draws what is to be reached in an episode by a walker where it was last measured."""
+        place = self.figure.found.root[i, :2]
+        if self.ball:
+            self.ball.put(i, place, self.clock.steps[i], self._random[i])
+        self._draw_goal(i, place)
+
+    def _draw_goal(self, i: int, place: np.ndarray) -> None:
+        random, away = self._random[i], self.config.goal_distance
+        if self.ball:
+            goal = self.ball.goal(i, random, away or GOAL_AWAY)
+        elif away is None:
+            goal = self.arena.goal(i, random, place)
+        else:
+            x, y = place + drawn_way(random, *away)
+            height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
+            goal = np.array([x, y, height[0, 0]])
+        set_goal(i, goal, self.clock.steps[i], random, self.goals)
+
+    # A step.
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        take_all(env_ids, action, self._pack)
+
+    def simulate(self, env_ids: np.ndarray) -> None:
+        """Runs each simulation to the next switch of stance, or for a control step."""
+        if not len(env_ids):
+            return
+        by_plan = self.interface == 'plan'
+        begin_steps(env_ids, self._pack)
+        going = env_ids
+        while True:
+            if by_plan:
+                self._low_action[going] = self.controller(self._common.full[going])
+            else:
+                self._low_action[going] = self.state.action[going, len(PLAN_NAMES) :]
+            if act_all(going, self._low_action, self._common_pack):
+                self._lay_ground(going, self._common)
+            self.world.step(self._frame, going)
+            count = finish_control_steps(going, self._pack)
+            if self.watch is not None:
+                self.watch()
+            if not count:
+                return
+            if count < len(going):
+                going = going[~self.state.over[going]]
+
+    def lay(self, action: np.ndarray) -> np.ndarray:
+        """Lays out plans where a footstep begins, as the step to come would with the same actions.
+
+        With the interface 'frame' a footstep controller can so see a plan before it acts by it.
+
+        Args:
+          action: (n, k), in [-1, 1]; what lies behind the plan does not count.
+
+        Returns:
+          What the footstep controller observes now, (n, size); the observation has it as well.
+
+        Raises:
+          ValueError: actions of another shape, or with NaN or infinity.
+        """
+        everyone = self.world.all_ids
+        self.apply_action(self.action_map.checked(action, self.world.n), everyone)
+        show_plans(everyone, self._pack)
+        return self._common.full.copy()
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        check_simulated(self.state.lasted[env_ids])
+        if score_all(env_ids, self._pack):
+            self._draw(env_ids)
+        finish_all(env_ids, self._pack)
+
+    def _draw(self, env_ids: np.ndarray) -> None:
+        """Puts balls elsewhere, and draws goals, where that is wanted."""
+        root, count = self.figure.found.root, self.clock.steps
+        if self.ball:
+            wanted = env_ids[self.ball.state.wanted[env_ids]]
+            for i in wanted.tolist():
+                self.ball.put(i, root[i, :2], count[i], self._random[i])
+            self.world.forward(wanted)
+        for i in env_ids[self.goals.wanted[env_ids]].tolist():
+            self._draw_goal(i, root[i, :2])
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
+
+    def markers(self, env_id: int) -> list[Marker]:
+        """The plan, where the centre of mass has been, and the goal: of a ball as a disc."""
+        root, goal = self.world.xpos[env_id, self.figure.links[0]], self.goal[env_id]
+        there = goal_disc(goal, self.goal_reached) if self.ball else flag(goal)
+        return [
+            *plan_markers(env_id, root, self.plan), *trace_markers(env_id, self.trace), there,
+        ]  # fmt: skip

@@ -1,0 +1,334 @@
+"""The rules of navigation by planned footsteps, as compiled functions of one simulation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.kinematics.spatial import polar, write_body, write_terrain
+from trl_suite.tasks.components.ball import (
+    BallRules,
+    dribble,
+    observe_ball,
+    remember,
+)
+from trl_suite.tasks.components.footstep_plan import (
+    FootstepPlan,
+    observe_plan,
+    update_stance,
+)
+from trl_suite.tasks.components.goals import Goals
+from trl_suite.tasks.components.spatial_rules import (
+    CONTROL_TIMESTEP,
+    SpatialRules,
+    breaks_down,
+    measure,
+    observe_body,
+    tick,
+)
+from trl_suite.tasks.components.trace import Trace, follow
+from trl_suite.tasks.task import (
+    conclude,
+)
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SAMPLES
+from trl_suite.util.compiled import compiled, compiled_loop
+
+CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # whose shipped policy places the feet by default
+INTERFACES = ('plan', 'frame')
+MAPS = ('height', 'velocity')
+# The plan at action 0, in step lengths, and the change per unit action: x and y of both landing places,
+# m, and turn of the heading, rad.
+PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
+PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # in a mirror
+PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
+STEP_LENGTH = 0.5  # m
+PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
+GOAL_REACHED = 1.0  # m; by default
+GOAL_SIGNS = (-1.0, 1.0)  # of bearing and distance, in a mirror
+SPEED_SHARPNESS = 1.5
+UPRIGHT = 0.2  # reward for being on one's feet
+NAVIGATION_TERMS = {'speed': (1 - UPRIGHT, SPEED_SHARPNESS), 'upright': (UPRIGHT, 0.0)}
+CONTACT_DECAY, CONTACT_GAIN, FALL_THRESHOLD = (
+    0.9,
+    1 / 11,
+    0.25,
+)  # of the running share of samples that touch the ground
+SAMPLE_FRAMES = 3  # control steps between two of them: 0.1 s
+FARTHEST_GOAL = 100.0  # m; to which goals may be asked for
+LONGEST = 60  # control steps of a step; the clock switches stance long before
+
+SPEED, ON_FEET = range(len(NAVIGATION_TERMS))
+
+
+class PlanningState(NamedTuple):
+    """What the task knows beside plan and goal, (n, ...).
+
+    Attributes:
+      lasted: control steps of the last step.
+      duration: of the last step, s.
+      begin: centre of mass at its beginning, (n, 3) m.
+      down: running share of samples with a fall link on the ground.
+      speed: towards the goal in the last step, of walker or ball, m/s.
+      action: of the agent, clipped, (n, k).
+      over: whether the step is over.
+    """
+
+    lasted: np.ndarray
+    duration: np.ndarray
+    begin: np.ndarray
+    down: np.ndarray
+    speed: np.ndarray
+    action: np.ndarray
+    over: np.ndarray
+
+
+class PlanningRules(NamedTuple):
+    """All that the rules of planned footsteps work on.
+
+    The full observation of `common` is what the footstep controller observes.
+
+    Attributes:
+      contact, plan_block: where these blocks begin in the full observation.
+      by_plan: whether a step is a footstep, not a control step.
+      terrain, surface, pose, velocity, goal, low_level: where these blocks begin in the
+        observation; -1: not observed.
+      plan_offset, plan_scale: what an action means.
+      target_speed, goal_reached: of the reward, m/s and m.
+      with_ball: whether the goal is that of a ball.
+    """
+
+    common: SpatialRules
+    plan: FootstepPlan
+    goals: Goals
+    state: PlanningState
+    trace: Trace
+    contact: int
+    plan_block: int
+    by_plan: bool
+    terrain: int
+    surface: int
+    pose: int
+    velocity: int
+    goal: int
+    low_level: int
+    plan_offset: np.ndarray
+    plan_scale: np.ndarray
+    target_speed: float
+    goal_reached: float
+    with_ball: bool
+    ball: BallRules
+
+
+# A step of simulation i: `begin_step`, then for every control step inside of it actions of the
+# footstep controller, physics and `finish_control_step`; then `score`, the next goal if one is wanted, `finish`.
+
+
+@compiled
+def begin_step(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan where a footstep begins, and shows it to the footstep controller."""
+    common, state = rules.common, rules.state
+    measure(i, common)
+    lay_plan(i, rules)
+    state.lasted[i] = 0
+    for k in range(3):
+        state.begin[i, k] = common.found.com[i, k]
+    if rules.with_ball:
+        remember(i, common.physics, common.found, rules.ball)
+    rules.plan.landed[i] = False
+    observe_low(i, rules)
+
+
+@compiled
+def lay_plan(i: int, rules: PlanningRules) -> None:
+    """Lays out the plan that the action means, from the root and its heading, if a footstep begins."""
+    plan, found, ground = rules.plan, rules.common.found, rules.common.ground
+    if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
+        return
+    heading = found.heading[i]
+    cosine, sine = math.cos(heading), math.sin(heading)
+    for which in range(2):
+        ahead, left = meant(i, 2 * which, rules), meant(i, 2 * which + 1, rules)
+        x = found.root[i, 0] + (cosine * ahead - sine * left)
+        y = found.root[i, 1] + (sine * ahead + cosine * left)
+        plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
+        plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
+    plan.heading[i] = heading + meant(i, 4, rules)
+
+
+@compiled
+def meant(i: int, k: int, rules: PlanningRules) -> float:
+    """What number k of an action means, m or rad."""
+    return rules.state.action[i, k] * rules.plan_scale[k] + rules.plan_offset[k]
+
+
+@compiled
+def observe_low(i: int, rules: PlanningRules) -> None:
+    """Writes what the footstep controller observes."""
+    common = rules.common
+    observe_body(i, common)
+    observe_plan(i, rules.contact, rules.plan_block, common.found, rules.plan, common.full)
+
+
+@compiled
+def finish_control_step(i: int, rules: PlanningRules) -> bool:
+    """Finishes a control step inside of a step: clock, divergence, measurement, falls, landings.
+
+    What the footstep controller is to see next is written if the step goes on, which is returned.
+    """
+    common, state, outcome = rules.common, rules.state, rules.common.outcome
+    tick(i, common)
+    state.lasted[i] += 1
+    if breaks_down(i, common):
+        outcome.failed[i] = state.over[i] = True
+        return False
+    measure(i, common)
+    count, found = common.clock.steps[i], common.found
+    if count % SAMPLE_FRAMES == 0:
+        state.down[i] *= CONTACT_DECAY
+        state.down[i] += CONTACT_GAIN * found.fallen[i]
+    outcome.failed[i] = state.down[i] > FALL_THRESHOLD
+    if update_stance(i, common.clock.phase[i], found, rules.plan):
+        rules.plan.landed[i] = True
+    follow(i, count, found.com, rules.trace)
+    state.over[i] = (
+        rules.plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST
+        or not rules.by_plan
+    )  # fmt: skip
+    if not state.over[i]:
+        observe_low(i, rules)
+    return not state.over[i]
+
+
+@compiled
+def score(i: int, rules: PlanningRules) -> bool:
+    """Writes the reward terms; returns whether a goal or a place of the ball is to be drawn."""
+    common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
+    found, terms = common.found, common.outcome.reward_terms
+    seconds = CONTROL_TIMESTEP * state.lasted[i]
+    state.duration[i] = seconds
+    goals.wanted[i] = ball.wanted[i] = False
+    if common.outcome.diverged[i]:
+        return False
+    if rules.with_ball:
+        state.speed[i] = dribble(
+            i, 0, 1.0, seconds, goals.place, common.physics, found, rules.ball, terms
+        )
+    else:
+        x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
+        distance = math.hypot(x, y)
+        moved_x, moved_y = found.com[i, 0] - state.begin[i, 0], found.com[i, 1] - state.begin[i, 1]
+        speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
+        lack = min(speed - rules.target_speed, 0.0)
+        full = distance < rules.goal_reached
+        worth = 1.0 if full else math.exp(-SPEED_SHARPNESS * (lack * lack))
+        terms[i, SPEED], terms[i, ON_FEET] = (1 - UPRIGHT) * worth, UPRIGHT
+        state.speed[i] = speed
+    if common.outcome.failed[i]:
+        return False
+    count = common.clock.steps[i]
+    late = count >= goals.due[i]
+    if rules.with_ball:  # reaching it does not end it
+        goals.reached[i] += ball.at_goal[i]
+        ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
+    else:
+        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        reached = math.hypot(x, y) < rules.goal_reached
+        goals.reached[i] += reached
+        goals.wanted[i] = reached or late
+    return goals.wanted[i] or ball.wanted[i]
+
+
+@compiled
+def finish(i: int, rules: PlanningRules) -> None:
+    """Reward and observation."""
+    outcome = rules.common.outcome
+    conclude(i, outcome.failed[i], outcome)
+    if not outcome.diverged[i]:  # else the last finite observation stands
+        observe(i, rules)
+
+
+@compiled
+def observe(i: int, rules: PlanningRules) -> None:
+    """Writes the observation."""
+    common, found = rules.common, rules.common.found
+    observation = common.outcome.observation
+    write_terrain(i, rules.terrain, common.ground, found, observation)
+    if rules.surface >= 0:
+        block = observation[i, rules.surface : rules.surface + 2 * SAMPLES * SAMPLES]
+        x, y = found.root[i, 0], found.root[i, 1]
+        spatial_ground.velocity_map(i, x, y, found.heading[i], common.ground, block)
+    write_body(i, rules.pose, rules.velocity, found, observation)
+    place = rules.goals.place
+    if rules.with_ball:
+        observe_ball(i, rules.goal, place, common.physics, found, rules.ball, observation)
+    else:
+        x, y = place[i, 0] - found.root[i, 0], place[i, 1] - found.root[i, 1]
+        bearing, distance = polar(i, x, y, found)
+        observation[i, rules.goal], observation[i, rules.goal + 1] = bearing, distance
+    if rules.low_level >= 0:
+        observe_low(i, rules)
+        for k in range(common.full.shape[1]):
+            observation[i, rules.low_level + k] = common.full[i, k]
+
+
+# Loops over simulations; they take packs.
+
+
+@compiled_loop
+def take_all(env_ids: np.ndarray, action: np.ndarray, rules: PlanningRules) -> None:
+    """Takes in the actions of the agent, clipped."""
+    for i in env_ids:
+        for k in range(action.shape[1]):
+            rules.state.action[i, k] = min(max(action[i, k], -1.0), 1.0)
+
+
+@compiled_loop
+def begin_steps(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Begins steps."""
+    for i in env_ids:
+        begin_step(i, rules)
+
+
+@compiled_loop
+def show_plans(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Lays out plans as `begin_steps` would, and writes what the footstep controller observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        lay_plan(i, rules)
+        observe(i, rules)
+
+
+@compiled_loop
+def finish_control_steps(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Accounts for a control step; returns how many steps go on."""
+    going = 0
+    for i in env_ids:
+        going += finish_control_step(i, rules)
+    return going
+
+
+@compiled_loop
+def score_all(env_ids: np.ndarray, rules: PlanningRules) -> int:
+    """Writes reward terms; returns for how many anything is to be drawn."""
+    wanted = 0
+    for i in env_ids:
+        wanted += score(i, rules)
+    return wanted
+
+
+@compiled_loop
+def finish_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Finishes steps."""
+    for i in env_ids:
+        finish(i, rules)
+
+
+@compiled_loop
+def observe_all(env_ids: np.ndarray, rules: PlanningRules) -> None:
+    """Observes."""
+    for i in env_ids:
+        measure(i, rules.common)
+        observe(i, rules)

@@ -1,0 +1,194 @@
+"""The rules of walking forward, as compiled functions of one simulation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.actuation.action_map import Drive, drive
+from trl_suite.engine import native
+from trl_suite.kinematics import planar, spatial
+from trl_suite.kinematics.planar import (
+    PlanarBody,
+    PlanarMeasurement,
+    PlanarState,
+    has_fallen,
+    leaves,
+    must_wait,
+)
+from trl_suite.kinematics.spatial import (
+    SpatialBody,
+    SpatialMeasurement,
+    SpatialState,
+    write_body,
+    write_terrain,
+)
+from trl_suite.tasks.task import (
+    MAX_JOINT_SPEED,
+    Outcome,
+    conclude,
+    too_fast,
+)
+from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.windows import SpatialWindows
+from trl_suite.util.compiled import compiled, compiled_loop
+
+SAMPLES = 50  # heights on the line that a planar character sees
+FROUDE = 0.25  # speed^2 / (gravity * height of the root) of a full reward
+GRAVITY = 9.8  # m/s^2
+
+
+class WalkState(NamedTuple):
+    """What the task knows of each walker.
+
+    Attributes:
+      origin: x, y of the start, (n, 2) m.
+      target_heading: direction in which it is to go, rad to the left of +x, (n,).
+      distance: travelled along the target_heading, (n,) m.
+    """
+
+    origin: np.ndarray
+    target_heading: np.ndarray
+    distance: np.ndarray
+
+
+class PlanarRules(NamedTuple):
+    """What the rules of a planar walk work on; `ctrl` are the controls of the physics."""
+
+    engine: native.Engine
+    body: PlanarBody
+    physics: PlanarState
+    ground: PlanarWindows
+    drive: Drive
+    ctrl: np.ndarray
+    found: PlanarMeasurement
+    state: WalkState
+    outcome: Outcome
+
+
+class SpatialRules(NamedTuple):
+    """What the rules of a walk in space work on.
+
+    Attributes:
+      ctrl: controls of the physics, (n, ...).
+      terrain, pose, velocity, target_heading: where these blocks begin; -1: not observed.
+      leaving: whether the window of ground has to be laid anew, (n,).
+    """
+
+    engine: native.Engine
+    body: SpatialBody
+    physics: SpatialState
+    ground: SpatialWindows
+    drive: Drive
+    ctrl: np.ndarray
+    terrain: int
+    pose: int
+    velocity: int
+    target_heading: int
+    found: SpatialMeasurement
+    state: WalkState
+    leaving: np.ndarray
+    outcome: Outcome
+
+
+# In the plane, of simulation i and of all.
+
+
+@compiled
+def look_planar(i: int, rules: PlanarRules) -> None:
+    """Measures and observes."""
+    observation = rules.outcome.observation
+    planar.measure(i, rules.body, rules.physics, rules.ground, observation, rules.found)
+    x = rules.physics.qpos[i, rules.body.qpos[0]]
+    rules.state.distance[i] = x - rules.state.origin[i, 0]
+
+
+@compiled_loop
+def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> int:
+    """Takes actions; returns how many windows of ground must be laid anew."""
+    leaving = 0
+    for i in env_ids:
+        drive(i, action, rules.drive, rules.ctrl)
+        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.found)
+    return leaving
+
+
+@compiled_loop
+def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int:
+    """Finishes steps, or only observes; returns how many have to wait for ground to be drawn."""
+    waiting = 0
+    for i in env_ids:
+        outcome = rules.outcome
+        if stepped:
+            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
+                i, rules.body.dof[3:], MAX_JOINT_SPEED, rules.physics.qvel
+            )
+            if outcome.diverged[i]:  # the last finite observation stands
+                conclude(i, True, outcome)
+                continue
+        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.found.waiting[i]:
+            waiting += 1
+            continue
+        look_planar(i, rules)
+        if stepped:
+            conclude(i, has_fallen(i, rules.body, rules.physics), outcome)
+    return waiting
+
+
+# In space.
+
+
+@compiled
+def look_spatial(i: int, rules: SpatialRules) -> None:
+    """Measures and observes."""
+    found, state, observation = rules.found, rules.state, rules.outcome.observation
+    spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
+    spatial.measure(i, rules.body, rules.physics, rules.ground, found)
+    write_terrain(i, rules.terrain, rules.ground, found, observation)
+    write_body(i, rules.pose, rules.velocity, found, observation)
+    bearing = state.target_heading[i] - found.heading[i]
+    observation[i, rules.target_heading] = math.cos(bearing)
+    observation[i, rules.target_heading + 1] = math.sin(bearing)
+    x, y = found.root[i, 0] - state.origin[i, 0], found.root[i, 1] - state.origin[i, 1]
+    state.distance[i] = (
+        math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
+    )
+
+
+@compiled_loop
+def act_spatial(env_ids: np.ndarray, action: np.ndarray, rules: SpatialRules) -> int:
+    """Takes actions and keeps boxes moving; returns how many windows of ground must be laid."""
+    leaving, root = 0, rules.body.links[0]
+    for i in env_ids:
+        drive(i, action, rules.drive, rules.ctrl)
+        x, y = rules.physics.xpos[i, root, 0], rules.physics.xpos[i, root, 1]
+        rules.leaving[i] = spatial_ground.has_left(i, x, y, rules.ground)
+        if rules.leaving[i]:
+            leaving += 1
+        elif spatial_ground.keep_moving(
+            i, x, y, rules.physics.qpos, rules.physics.qvel, rules.ground
+        ):
+            native.forward(i, rules.engine)
+    return leaving
+
+
+@compiled_loop
+def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> int:
+    """Finishes steps, or only observes; none has to wait."""
+    for i in env_ids:
+        outcome = rules.outcome
+        if stepped:
+            outcome.diverged[i] = native.diverged(i, rules.engine) or too_fast(
+                i, rules.body.joint_dof, MAX_JOINT_SPEED, rules.physics.qvel
+            )
+            if outcome.diverged[i]:  # the last finite observation stands
+                conclude(i, True, outcome)
+                continue
+        look_spatial(i, rules)
+        if stepped:
+            conclude(i, rules.found.fallen[i], outcome)
+    return 0

@@ -1,0 +1,309 @@
+"""Walking forward, with nothing to track: for characters without a clip, and to compose tasks of."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from trl_suite import actuation
+from trl_suite.arenas import PlanarArena, SpatialArena
+from trl_suite.characters import Character
+from trl_suite.engine import World
+from trl_suite.kinematics.planar import (
+    PlanarFigure,
+)
+from trl_suite.kinematics.planar_reference import link_extents
+from trl_suite.kinematics.spatial import (
+    SpatialFigure,
+)
+from trl_suite.motion import quaternion
+from trl_suite.tasks import parts
+from trl_suite.tasks.components.spatial_rules import TERRAIN_MAPS
+from trl_suite.tasks.imitation.planar_rules import (
+    CONTROL_TIMESTEP,
+    SUBSTEPS,
+    VIEW_AHEAD,
+    VIEW_BEHIND,
+)
+from trl_suite.tasks.spatial_task import maps
+from trl_suite.tasks.task import (
+    TERRAIN_LEVEL,
+    Task,
+    check_position_options,
+    consecutive,
+    drawn_seed,
+    outcome,
+)
+from trl_suite.tasks.walk.rules import (
+    FROUDE,
+    GRAVITY,
+    PlanarRules,
+    SpatialRules,
+    WalkState,
+    act_planar,
+    act_spatial,
+    finish_planar,
+    finish_spatial,
+)
+from trl_suite.terrain import PlanarGround, SpatialGround
+from trl_suite.util.compiled import packed
+from trl_suite.util.options import Config, option
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WalkConfig(Config):
+    """Options of `Walk`."""
+
+    substeps: int = option(SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=4)
+    action_scale: float | None = option(
+        None, 'joint angle per unit action about the working posture; by default 1.5',
+        unit='rad', above=0, actuation='position',
+    )  # fmt: skip
+    terrain_level: float = option(0.0, TERRAIN_LEVEL)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanarWalkConfig(WalkConfig):
+    """Options of a planar walk."""
+
+    terrain_observation: int = option(
+        0,
+        'heights observed on the line from 0.5 m behind to 3 m ahead of the root; 0: none',
+        at_least=0,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialWalkConfig(WalkConfig):
+    """Options of a walk in three dimensions."""
+
+    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set('terrain_observation', maps(self.terrain_observation))
+
+
+class Walk(Task):
+    """A character, planar or spatial, stands in its working posture on random terrain.
+
+    It fails when a fall link touches the ground. It has no reward of its own: `suite.build` adds
+    `WALK`, or the user's `rewards`. So may a subclass, after `super().finish_step`.
+
+    Observation blocks, in this order: terrain (if seen), pose and velocity as in `PlanarImitation` and
+    `SpatialImitation`; of a spatial character
+      target_heading: cosine and sine of the bearing of the way it is to go, that of its start; 2.
+
+    Attributes:
+      speed_ratio: speed of a full reward, m/s.
+    """
+
+    CONFIG: Any = MappingProxyType({False: PlanarWalkConfig, True: SpatialWalkConfig})
+
+    def __init__(
+        self,
+        character: Character,
+        arena: PlanarArena | SpatialArena,
+        config: PlanarWalkConfig | SpatialWalkConfig | None = None,
+        *,
+        actuation_model: str = 'position',
+    ) -> None:
+        """Composes the task.
+
+        Args:
+          character: without actuators; it is attached to the arena.
+          arena: where it moves, of as many dimensions.
+          config: the options, planar or spatial as the character is; by default the defaults.
+          actuation_model: one of `trl_suite.actuation.ACTUATIONS`.
+
+        Raises:
+          ValueError: options that do not fit each other.
+        """
+        self._spatial = character.spec.spatial
+        if config is None:
+            config = SpatialWalkConfig() if self._spatial else PlanarWalkConfig()
+        self.character, self.arena, self.config = character, arena, config
+        self.actuation_model = actuation_model
+        self.figure: Any
+        if isinstance(arena, SpatialArena):
+            assert isinstance(config, SpatialWalkConfig)
+            self.figure = SpatialFigure(character, arena, 'height' in config.terrain_observation)
+            self.fields = SpatialFigure.fields
+        else:
+            assert isinstance(config, PlanarWalkConfig)
+            self.figure = PlanarFigure(
+                character, arena, VIEW_BEHIND, VIEW_AHEAD, config.terrain_observation
+            )
+        self.set_timesteps(CONTROL_TIMESTEP, CONTROL_TIMESTEP / config.substeps)
+        check_position_options(actuation_model, 'clip', config.action_scale)
+        scale = config.action_scale
+        self.action_map = actuation.add(
+            character, actuation_model, self.physics_timestep,
+            **({} if scale is None else {'action_scale': scale}),
+        )  # fmt: skip
+        self.blocks = consecutive({**self.figure.blocks, 'target_heading': 2 * self._spatial})
+
+    @property
+    def root_entity(self) -> PlanarArena | SpatialArena:
+        return self.arena
+
+    @property
+    def signature(self) -> str:
+        parts = self.character.spec.name, self.arena.terrain.name
+        return f'{super().signature} of {" / ".join(parts)}'
+
+    def bind(self, world: World) -> None:
+        self.world, n = world, world.n
+        figure = self.figure
+        if isinstance(self.arena, SpatialArena):
+            figure.bind(world)
+        else:
+            figure.bind(world, self.blocks)
+        self._pose, self._extents = self._posture(world)
+        # In m; of the root over the ground, in the working posture.
+        standing = self._pose[2 if self._spatial else 1] = -self._extents[2].min()
+        self.full_speed = float(np.sqrt(FROUDE * GRAVITY * max(standing, 0.01)))
+        self.state = WalkState(np.zeros((n, 2)), np.zeros(n), np.zeros(n))
+        self.outcome = outcome(n, max(part.stop for part in self.blocks.values()), 0)
+        self.saved = (self.state, self.outcome)
+        self.info_arrays = {
+            'reward_terms': {},
+            'fell': self.outcome.fell,
+            'diverged': self.outcome.diverged,
+            'distance': self.state.distance,
+        }
+        scope = f'{self.character.mjcf_model.model}/'
+        # Actuators were added one after the other.
+        first = int(world.control_addresses([scope + self.action_map.actuators[0]])[0])
+        common: Any = (
+            world.engine,
+            figure.body,
+            figure.state,
+            figure.ground,
+            self.action_map.drive(first),
+        )
+        starts = {name: part.start for name, part in self.blocks.items()}
+        rules: SpatialRules | PlanarRules
+        if self._spatial:
+            rules = SpatialRules(  # type: ignore[call-arg]
+                *common, world.ctrl,
+                *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'target_heading')),
+                figure.found, self.state, np.zeros(n, bool), self.outcome,
+            )  # fmt: skip
+            self._leaving, self._waiting = rules.leaving, np.zeros(n, bool)
+            self._act, self._finish = act_spatial, finish_spatial
+        else:
+            found = figure.measurement()
+            rules = PlanarRules(  # type: ignore[call-arg]
+                *common, world.ctrl, found, self.state, self.outcome
+            )
+            self._leaving, self._waiting = found.leaving, found.waiting
+            self._act, self._finish = act_planar, finish_planar
+        self._pack = packed(rules)
+
+    @property
+    def target_heading(self) -> np.ndarray:
+        """Direction in which each walker is to go, rad to the left of +x, (n,)."""
+        return self.state.target_heading
+
+    def _posture(self, world: World) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the pose of the start about the origin, and the extents of its geoms."""
+        figure, spec = self.figure, self.character.spec
+        values: list[float] = [0, 0, 0, 1, 0, 0, 0] if self._spatial else [0, 0, 0]
+        for joint, ball in zip(spec.joints.values(), self.character.spherical, strict=True):
+            if ball:
+                vector = np.broadcast_to(joint.target, 3).astype(float)
+                values += quaternion.from_vector(vector).tolist()
+            else:
+                values.append(float(np.ravel(joint.target)[0]))
+        pose = np.array(values)
+        data = world.posed(figure.pose_qpos, pose)
+        geoms = world.geom_ids([g.full_identifier for g in self.character.collision_geoms])
+        return pose, link_extents(world.models[0], data, geoms, np.zeros(2))
+
+    def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
+        terrain, count = self.arena.terrain, len(env_ids)
+        poses = np.tile(self._pose, (count, 1))
+        rates = np.zeros((count, len(self.figure.pose_dof)))
+        self.world.reset(env_ids)
+        spawns = np.zeros((count, 3))
+        for k, (i, random_state) in enumerate(zip(env_ids.tolist(), random_states, strict=True)):
+            seed = drawn_seed(random_state)
+            if isinstance(self.arena, SpatialArena):
+                ground = SpatialGround(terrain, seed, terrain_level=self.config.terrain_level)
+                spawns[k] = ground.spawn(random_state)
+                self.arena.begin_episode(i, ground, spawns[k, :2])
+            else:
+                self.arena.begin_episode(
+                    i, PlanarGround(terrain, seed, terrain_level=self.config.terrain_level)
+                )
+        if self._spatial:
+            self.figure.place(env_ids, poses, rates, spawns)
+        else:
+            self.figure.place(env_ids, poses, rates, np.tile(self._extents, (count, 1, 1)))
+        self.state.origin[env_ids], self.target_heading[env_ids] = spawns[:, :2], spawns[:, 2]
+        for array in self.outcome[1:]:  # all but the observation
+            array[env_ids] = 0
+        self.observe(env_ids)
+
+    def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        if self._act(env_ids, action, self._pack):
+            # Ground is laid before the physics, so that what is rendered afterwards is up to date.
+            leaving = env_ids[self._leaving[env_ids]]
+            if isinstance(self.arena, SpatialArena):
+                self.arena.follow(self.world.xpos[leaving, self.figure.links[0], :2], leaving)
+            else:
+                self.figure.follow(leaving)
+
+    def finish_step(self, env_ids: np.ndarray) -> None:
+        if self._finish(env_ids, True, self._pack):
+            self._finish(self._widened(env_ids), True, self._pack)
+
+    def observe(self, env_ids: np.ndarray | None = None) -> None:
+        env_ids = self.world.all_ids if env_ids is None else env_ids
+        if self._finish(env_ids, False, self._pack):
+            self._finish(self._widened(env_ids), False, self._pack)
+
+    def _widened(self, env_ids: np.ndarray) -> np.ndarray:
+        """Draws the ground that some simulations look back on; returns which have waited for it."""
+        waiting = env_ids[self._waiting[env_ids]]
+        assert isinstance(self.arena, PlanarArena)
+        for i in waiting.tolist():
+            self.arena.widen(i)
+        return waiting
+
+    def along(self, vectors: np.ndarray) -> np.ndarray:
+        """Returns the parts of horizontal vectors (n, 2) that go along the target_heading, (n,)."""
+        return (
+            np.cos(self.target_heading) * vectors[:, 0]
+            + np.sin(self.target_heading) * vectors[:, 1]
+        )
+
+
+def speed_ratio(task: Any) -> np.ndarray:
+    """Speed along the target_heading in shares of that of a full reward, in [0, 1], (n,)."""
+    velocity = task.world.qvel.take(task.figure.pose_dof[:2], 1)
+    if not task.character.spec.spatial:
+        velocity = velocity * [1.0, 0.0]  # the other one is upward
+    return np.clip(task.along(velocity) / task.full_speed, 0, 1)
+
+
+def upright(task: Any) -> np.ndarray:
+    """How upright the root is, in [0, 1], (n,)."""
+    return np.maximum(parts.upright(task), 0)
+
+
+def low_effort(task: Any) -> np.ndarray:
+    """1 less the mean square of the action, (n,)."""
+    return 1 - parts.effort(task)
+
+
+WALK = {
+    'speed_ratio': (0.7, speed_ratio),
+    'upright': (0.2, upright),
+    'low_effort': (0.1, low_effort),
+}

@@ -1,0 +1,499 @@
+"""The planar terrain generators: random features one after another, and rolling ground under them.
+
+A planar terrain is a polyline with vertices SPACING apart. A generator is a function of
+(parameters, length in m, random generator) that returns a `Profile`: the vertices to append to the
+ground so far, which stands at height 0. It repeats its feature until the length is reached, so it
+overshoots by up to one feature. Two primitives make all features:
+
+* a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
+  flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m at its crest and
+  0.225 m at its foot. The level of the ground is unchanged.
+* a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
+
+The processes are those of the terrain generator of the original (Terrain RL Simulator, 2018);
+equality is in distribution, not draw by draw. New generators join through `register`:
+
+    @register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
+    def saw(parameters, length, rng):
+        cells = math.ceil(parameters['ToothW'] / SPACING)
+        teeth = math.ceil(length / SPACING / cells)
+        rises = rng.uniform(parameters['ToothHMin'], parameters['ToothHMax'], teeth)
+        heights = np.outer(rises, np.arange(1, cells + 1) / cells).ravel()
+        return Profile(heights, np.diff(heights, prepend=0.0) < 0)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import numbers
+import types
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.util import random
+from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.util.errors import unknown
+
+SPACING = 0.025  # m between vertices
+STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
+LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
+LONGEST = 1e6  # m; most ground asked for at once
+
+# Defaults of the parameters, by feature (those of the original).
+GAPS = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
+        'GapHMin': -2, 'GapHMax': -2}  # fmt: skip
+WALLS = {'WallSpacingMin': 6, 'WallSpacingMax': 8, 'WallWMin': 0.2, 'WallWMax': 0.2,
+         'WallHMin': 0.25, 'WallHMax': 0.5}  # fmt: skip
+STEPS = {'StepSpacingMin': 5, 'StepSpacingMax': 7, 'StepH0Min': 0.1, 'StepH0Max': 0.4,
+         'StepH1Min': -0.4, 'StepH1Max': -0.1}  # fmt: skip
+NARROW_GAPS = {'NarrowGapSpacingMin': 3, 'NarrowGapSpacingMax': 6,
+               'NarrowGapDistMin': 0.1, 'NarrowGapDistMax': 0.4,
+               'NarrowGapWMin': 0.15, 'NarrowGapWMax': 0.5,
+               'NarrowGapDepthMin': -2, 'NarrowGapDepthMax': -2,
+               'NarrowGapCountMin': 1, 'NarrowGapCountMax': 4}  # fmt: skip
+CLIFFS = {'CliffSpacingMin': 5, 'CliffSpacingMax': 7, 'CliffH0Min': 0.1, 'CliffH0Max': 0.4,
+          'CliffH1Min': -0.4, 'CliffH1Max': -0.1, 'CliffMiniCountMax': 0}  # fmt: skip
+BUMPS = {'BumpHMin': 0, 'BumpHMax': 0.03}
+SLOPES = {'SlopeDeltaRange': 0.25, 'SlopeDeltaMin': -0.35, 'SlopeDeltaMax': 0.35}
+
+# What values make sense, by name without Min or Max: a length or a count below zero means nothing,
+# and the upper bounds keep a stretch of ground in memory. Names not listed here may be any number.
+_LENGTH, _COUNT, _HEIGHT, _SLOPE = (0.0, 1e3), (0.0, 100.0), (-1e3, 1e3), (-100.0, 100.0)
+LIMITS = {
+    **dict.fromkeys(('GapSpacing', 'WallSpacing', 'StepSpacing', 'CliffSpacing'), _LENGTH),
+    **dict.fromkeys(('NarrowGapSpacing', 'NarrowGapDist'), _LENGTH),
+    **dict.fromkeys(('GapW', 'WallW', 'NarrowGapW'), _LENGTH),
+    **dict.fromkeys(('NarrowGapCount', 'CliffMiniCount'), _COUNT),
+    **dict.fromkeys(('GapH', 'WallH', 'StepH0', 'StepH1', 'BumpH'), _HEIGHT),
+    **dict.fromkeys(('CliffH0', 'CliffH1', 'NarrowGapDepth'), _HEIGHT),
+    **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange'), _SLOPE),
+    # Of three-dimensional ground.
+    **dict.fromkeys(('PathWidth0', 'PathWidth1', 'PathWidthDeltaStdev', 'PathTurnLength'), _LENGTH),
+    **dict.fromkeys(('ConveyorStripLength', 'ConveyorSpacing'), _LENGTH),
+    **dict.fromkeys(('ObstacleWidth0', 'ObstacleWidth1'), (0.0, 40.0)),
+    **dict.fromkeys(('ObstacleHeight0', 'ObstacleHeight1'), (0.0, 1e3)),
+    **dict.fromkeys(('ObstacleSpeed0', 'ObstacleSpeed1'), (1e-6, 100.0)),
+    **dict.fromkeys(('PathHeight0', 'PathHeight1', 'StepHeight'), (-20.0, 20.0)),
+    **dict.fromkeys(('NumObstacles', 'ConveyorNumStrips', 'ConveyorNumSlices'), _COUNT),
+    'PathLength': (0.2, 1e3),
+    'PathMaxTurnDelta': (0.0, 2.0),
+    'TrailStepProb': (0.0, 1.0),
+    'ObstacleDensity': (0.0, 2.0),
+    'ObstacleSpeedLerpPow': (0.0, 100.0),
+    'Slope': (-10.0, 10.0),
+    # Of ground that is a function of the place.
+    'StartSpan': (0.0, 1e5),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Profile:
+    """Vertices to append to a ground whose last vertex is at height 0.
+
+    Attributes:
+      heights: heights of the vertices, SPACING apart, m, shape (k,).
+      vertical: True where the cell between the previous vertex and this one is the vertical face of
+        a feature, shape (k,). The first cell begins at the last vertex of the ground so far.
+    """
+
+    heights: np.ndarray
+    vertical: np.ndarray
+
+
+Parameters = Mapping[str, float]
+_NONE: Parameters = types.MappingProxyType({})
+Function = Callable[[Parameters, float, np.random.Generator], Profile]
+
+
+class Generator(NamedTuple):
+    """A terrain type: its function, and its parameters with their defaults.
+
+    Ground that is the same in every episode has a `line` besides, heights (k,) at x (k,), m; a
+    `PlanarGround` then takes its vertices from there.
+    """
+
+    function: Function
+    defaults: Mapping[str, float]
+    line: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+_generators: dict[str, Generator] = {}
+GENERATORS: Mapping[str, Generator] = types.MappingProxyType(_generators)
+
+
+def check(
+    where: str, values: Mapping[str, object], defaults: Parameters = _NONE
+) -> dict[str, float]:
+    """Returns parameter values as floats.
+
+    Args:
+      where: what the values belong to, for the message.
+      values: name -> number.
+      defaults: values of the parameters that are not given.
+
+    Raises:
+      ValueError: a value is no finite number, is outside LIMITS, or a Min is above its Max.
+    """
+    checked = {}
+    for key, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise ValueError(f'{where}: {key} must be a number, not {value!r}')
+        low, high = LIMITS.get(key.removesuffix('Min').removesuffix('Max'), (-math.inf, math.inf))
+        try:
+            checked[key] = float(value)
+        except OverflowError:
+            checked[key] = math.inf
+        if not math.isfinite(checked[key]):
+            raise ValueError(f'{where}: {key} must be finite, not {value!r}')
+        if not low <= checked[key] <= high:
+            raise ValueError(f'{where}: {key} must be from {low:g} to {high:g}, not {value!r}')
+    complete = {**defaults, **checked}
+    for key in complete:
+        top = key.removesuffix('Min') + 'Max'
+        if key.endswith('Min') and complete[key] > complete.get(top, math.inf):
+            bottom, top = (
+                f'{name} {complete[name]:g}{"" if name in checked else " (the default)"}'
+                for name in (key, top)
+            )
+            raise ValueError(f'{where}: {bottom} is above {top}; a range runs from Min to Max')
+    return checked
+
+
+def register(
+    type_name: str, defaults: Parameters = _NONE, *, replace: bool = False
+) -> Callable[[Function], Function]:
+    """Decorates a function as the generator of a new terrain type.
+
+    Args:
+      type_name: the `Type` in terrain files.
+      defaults: the names of all its parameters, with their defaults.
+      replace: whether an existing type of that name may be replaced.
+
+    Raises:
+      ValueError: the name is taken, or a default makes no sense (see `check`).
+    """
+    if type_name in _generators and not replace:
+        raise ValueError(f'terrain type {type_name!r} exists; pass replace=True to replace it')
+    checked = types.MappingProxyType(check(f'terrain type {type_name!r}', defaults))
+
+    def add(function: Function) -> Function:
+        _generators[type_name] = Generator(function, checked)
+        return function
+
+    return add
+
+
+def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Registers planar ground whose heights are a function of x; replaces what has that name."""
+
+    def ahead(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        heights = line(SPACING * np.arange(cells(length) + 1))
+        rises = np.diff(heights)
+        return Profile(heights[1:] - heights[0], np.abs(rises) > STEEP * SPACING)
+
+    _generators[type_name] = Generator(ahead, types.MappingProxyType({'StartSpan': 0.0}), line)
+
+
+def draw(
+    type_name: str, parameters: Parameters, length: float, rng: np.random.Generator
+) -> Profile:
+    """Draws one stretch of ground, and checks what the generator made of it.
+
+    Args:
+      type_name: a key of GENERATORS.
+      parameters: a value for every parameter of the type, as from `Terrain.parameters`.
+      length: nominal length, m; generators overshoot by up to one feature.
+      rng: source of randomness.
+
+    Raises:
+      ValueError: unknown type, a length that is not positive and below LONGEST, or a generator
+        that returns something else than a finite `Profile` of at least one vertex.
+    """
+    if type_name not in _generators:
+        raise ValueError(unknown('terrain type', type_name, _generators))
+    if not 0 < length <= LONGEST:
+        raise ValueError(f'length must be above 0 and at most {LONGEST:g} m, not {length!r}')
+    profile = _generators[type_name].function(parameters, length, rng)
+    fault = ''
+    if not isinstance(profile, Profile):
+        fault = f'must return a Profile, not {type(profile).__name__}'
+    else:
+        heights, vertical = np.asarray(profile.heights), np.asarray(profile.vertical)
+        if heights.ndim != 1 or not len(heights) or heights.dtype.kind not in 'fiu':
+            fault = f'heights must be numbers of shape (k,), k > 0, not {heights.shape}'
+        elif vertical.shape != heights.shape or vertical.dtype != bool:
+            fault = f'vertical must be bools of shape {heights.shape}, not {vertical.shape}'
+            fault += f' of {vertical.dtype}'
+        elif not np.isfinite(heights).all():
+            fault = f'height of vertex {int(np.argmin(np.isfinite(heights)))} is not finite'
+    if fault:
+        raise ValueError(f'generator of terrain type {type_name!r}: {fault}')
+    return Profile(np.ascontiguousarray(heights, float), np.ascontiguousarray(vertical))
+
+
+def cells(length: float) -> int:
+    """Returns the number of cells a length in m takes: rounded up, but 0.2 m is 8 cells."""
+    return math.ceil(length / SPACING - 1e-9)
+
+
+# Features: each draws one and writes its level runs, number of vertices and height, in order.
+# Heights count from the ground before the feature; the last run is the ground after it.
+
+
+class Runs(NamedTuple):
+    """Room for level runs."""
+
+    counts: np.ndarray
+    levels: np.ndarray
+
+
+# Features, and where their parameters begin among those of the type. A Max follows its Min.
+_GAP, _STEP, _WALL, _MIXED, _NARROW_GAPS, _CLIFF = range(6)
+_MIXTURE: Parameters = {**GAPS, **WALLS, **STEPS}
+_SPACING, _WIDTH, _TOP = (list(GAPS).index(f'Gap{name}Min') for name in ('Spacing', 'W', 'H'))
+_RISES = list(STEPS).index('StepH0Min'), list(STEPS).index('StepH1Min')
+_DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
+    list(NARROW_GAPS).index(f'NarrowGap{name}Min') for name in ('Dist', 'W', 'Depth', 'Count')
+)
+_LEDGES = list(CLIFFS).index('CliffMiniCountMax')
+_FIRST_WALL, _FIRST_STEP = len(GAPS), len(GAPS) + len(WALLS)
+_NAMES = tuple(tuple(names) for names in (GAPS, STEPS, WALLS, _MIXTURE, NARROW_GAPS, CLIFFS))
+_MOST_RUNS = 3 * round(_COUNT[1]) + 3  # of a feature
+
+
+@compiled_inline
+def _cells(length: float) -> int:
+    return math.ceil(length / SPACING - 1e-9)
+
+
+@compiled_inline
+def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
+    """Draws from the range of a parameter."""
+    return parameters[of] + (parameters[of + 1] - parameters[of]) * random.draw(bits)
+
+
+@compiled_inline
+def _integer(low: float, high: float, bits: int) -> int:
+    """Draws an integer, both ends included; blended counts are truncated here, at their use."""
+    first, last = int(low), int(high)
+    return first + int((last - first + 1) * random.draw(bits))
+
+
+@compiled_inline
+def _add(number: int, count: int, level: float, runs: Runs) -> int:
+    """Adds a run to those there are; returns their new number."""
+    runs.counts[number], runs.levels[number] = count, level
+    return number + 1
+
+
+@compiled
+def _box(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    """A gap or a wall, whose parameters begin at the first; returns the new number of runs."""
+    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
+    width = _cells(_uniform(first + _WIDTH, parameters, bits))
+    number = _add(number, spacing, 0.0, runs)
+    number = _add(number, width, _uniform(first + _TOP, parameters, bits), runs)
+    return _add(number, 1, 0.0, runs)
+
+
+@compiled
+def _rise_range(first: int, parameters: np.ndarray, bits: int) -> int:
+    """Returns which of two ranges of a signed rise is drawn from.
+
+    A range whose ends are both 0 is switched off; of two that are on, a coin decides. So direction
+    comes from the numbers alone: with two positive ranges the ground only ascends.
+    """
+    low, high = first + _RISES[0], first + _RISES[1]
+    down = parameters[high] != 0.0 or parameters[high + 1] != 0.0
+    if (parameters[low] != 0.0 or parameters[low + 1] != 0.0) != down:
+        _integer(0.0, 0.0, bits)
+        return high if down else low
+    return high if _integer(0.0, 1.0, bits) else low
+
+
+@compiled
+def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    rise = _rise_range(first, parameters, bits)
+    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
+    number = _add(number, spacing, 0.0, runs)
+    return _add(number, 1, _uniform(rise, parameters, bits), runs)
+
+
+@compiled
+def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    """A cluster of gaps with stepping stones between; all floors count from the same surface."""
+    spacing = first + _SPACING
+    low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
+    for _ in range(_integer(low, high, bits)):
+        number = _add(number, _cells(_uniform(spacing, parameters, bits)), 0.0, runs)
+        width = _cells(_uniform(first + _NARROW_WIDTH, parameters, bits))
+        number = _add(number, width, _uniform(first + _DEPTH, parameters, bits), runs)
+        number = _add(number, 1, 0.0, runs)
+        spacing = first + _DISTANCE
+    return number
+
+
+@compiled
+def _cliff(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    """One tall riser, broken by up to CliffMiniCountMax ledges at random heights."""
+    rise = _rise_range(first, parameters, bits)
+    tread = _uniform(first + _SPACING, parameters, bits)
+    total, level = _uniform(rise, parameters, bits), 0.0
+    for _ in range(_integer(0.0, parameters[first + _LEDGES], bits)):
+        number = _add(number, _cells(tread), level, runs)
+        level += (total - level) * random.draw(bits)
+        number = _add(number, 1, level, runs)
+        tread = LEDGE
+    number = _add(number, _cells(tread), level, runs)
+    return _add(number, 1, total, runs)
+
+
+@compiled
+def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
+    first = 0
+    if kind == _MIXED:
+        kind = _integer(float(_GAP), float(_WALL), bits)
+        first = _FIRST_STEP if kind == _STEP else _FIRST_WALL if kind == _WALL else 0
+    if kind == _STEP:
+        return _step(number, first, parameters, bits, runs)
+    if kind == _NARROW_GAPS:
+        return _narrow_gaps(number, first, parameters, bits, runs)
+    if kind == _CLIFF:
+        return _cliff(number, first, parameters, bits, runs)
+    return _box(number, first, parameters, bits, runs)
+
+
+@compiled
+def _draw_features(
+    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, counts: np.ndarray,
+    levels: np.ndarray,
+) -> tuple[int, int]:  # fmt: skip
+    """Draws features until no vertices are missing, or no room is left.
+
+    Returns:
+      The number of runs there are then, and how many vertices are missing.
+    """
+    runs = Runs(counts, levels)
+    base = levels[number - 1] if number else 0.0
+    while missing > 0 and number + _MOST_RUNS <= len(counts):
+        before, number = number, _draw_feature(kind, number, parameters, bits, runs)
+        for k in range(before, number):
+            levels[k] += base
+            missing -= counts[k]
+        base = levels[number - 1]
+    return number, missing
+
+
+@compiled
+def _spread(
+    number: int, counts: np.ndarray, levels: np.ndarray, heights: np.ndarray, vertical: np.ndarray
+) -> None:
+    """Writes the vertices of runs: their height changes at vertical faces only, where a run begins."""
+    i, before = 0, 0.0
+    for k in range(number):
+        for j in range(i, i + counts[k]):
+            heights[j], vertical[j] = levels[k], False
+        if i < len(vertical):  # a run may have no vertices
+            vertical[i] = levels[k] != before
+        i, before = i + counts[k], levels[k]
+
+
+def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Repeats a feature until the length is reached; every one has at least one vertex."""
+    wanted = missing = cells(length)
+    values = np.array([parameters[name] for name in _NAMES[kind]], float)
+    bits, number = random.address(rng), 0
+    counts, levels = np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing)
+    while True:
+        number, missing = _draw_features(kind, missing, number, values, bits, counts, levels)
+        if missing <= 0:
+            break
+        counts, levels = np.resize(counts, 2 * len(counts)), np.resize(levels, 2 * len(levels))
+    heights, vertical = np.empty(wanted - missing), np.empty(wanted - missing, bool)
+    _spread(number, counts, levels, heights, vertical)
+    return Profile(heights, vertical)
+
+
+# Overlays: added over the vertices of a stretch.
+
+
+def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) -> Profile:
+    """Adds a mean-reverting random walk of the slope, which starts at slope 0 in every stretch.
+
+    Per vertex the slope changes by up to SlopeDeltaRange: down with a probability that grows
+    from 0 to 1 as the slope crosses the band from SlopeDeltaMin to SlopeDeltaMax, else up.
+    A band without width adds nothing.
+    """
+    low, high = parameters['SlopeDeltaMin'], parameters['SlopeDeltaMax']
+    if low == high:
+        return profile
+    count = len(profile.heights)
+    changes, thresholds = rng.random((2, count))
+    changes *= abs(parameters['SlopeDeltaRange'])
+    thresholds = low + (high - low) * thresholds
+    heights = np.empty(count)
+    _walk(profile.heights, changes, thresholds, heights)
+    return Profile(heights, profile.vertical)
+
+
+@compiled
+def _walk(
+    heights: np.ndarray, changes: np.ndarray, thresholds: np.ndarray, sloped: np.ndarray
+) -> None:
+    """Adds a walk of the slope to heights."""
+    slope = offset = 0.0
+    for k in range(len(heights)):
+        slope = slope - changes[k] if slope > thresholds[k] else slope + changes[k]
+        offset += slope
+        sloped[k] = heights[k] + offset * SPACING
+
+
+@register('var2d_flat')
+def flat(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Level ground."""
+    count = cells(length)
+    return Profile(np.zeros(count), np.zeros(count, dtype=bool))
+
+
+@register('var2d_bumps', BUMPS)
+def bumps(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Level ground with white noise: every vertex but the last is moved up or down."""
+    profile = flat(parameters, length, rng)
+    sizes, coins = rng.random((2, len(profile.heights) - 1))
+    low, high = parameters['BumpHMin'], parameters['BumpHMax']
+    profile.heights[:-1] = np.where(coins < 0.5, 1, -1) * (low + (high - low) * sizes)
+    return profile
+
+
+@register('var2d_slopes', SLOPES)
+def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Rolling ground."""
+    return _sloped(flat(parameters, length, rng), parameters, rng)
+
+
+@register('var2d_cliffs', CLIFFS)
+def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+    """Tall risers broken by ledges."""
+    return _repeat(_CLIFF, parameters, length, rng)
+
+
+def _register_feature(name: str, kind: int, defaults: Parameters) -> None:
+    """Registers a feature twice: on level ground and on rolling ground."""
+
+    @register(f'var2d_{name}', defaults)
+    def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        return _repeat(kind, parameters, length, rng)
+
+    @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
+    def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
+        return _sloped(level(parameters, length, rng), parameters, rng)
+
+
+_register_feature('gaps', _GAP, GAPS)
+_register_feature('walls', _WALL, WALLS)
+_register_feature('steps', _STEP, STEPS)
+_register_feature('mixed', _MIXED, _MIXTURE)
+_register_feature('narrow_gaps', _NARROW_GAPS, NARROW_GAPS)

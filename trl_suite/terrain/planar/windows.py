@@ -1,0 +1,110 @@
+"""Windows of the planar grounds of n simulations, as arrays, and functions of one of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.terrain.planar.generators import SPACING
+from trl_suite.util.compiled import compiled_inline
+
+_CELLS_PER_METRE = 1 / SPACING
+
+
+class PlanarWindows(NamedTuple):
+    """Windows of W vertices, SPACING apart, of n grounds. The arrays are never replaced.
+
+    Attributes:
+      start: number of the first vertex of a window, (n,); NaN before the first episode.
+      centre: middle of the stretch that a window is good for, (n,) m.
+      reach: how far from there it is laid anew, m.
+      heights: of the vertices, (n, W) m.
+      rises: from each vertex to the next, (n, W) m; the last is 0.
+      vertical: whether the cell before a vertex is a vertical face, (n, W) bool.
+      wide: heights of the vertices from W before the window on, (n, 3 W + 1) m.
+      is_wide: whether `wide` was drawn for this window, (n,) bool.
+    """
+
+    start: np.ndarray
+    centre: np.ndarray
+    reach: float
+    heights: np.ndarray
+    rises: np.ndarray
+    vertical: np.ndarray
+    wide: np.ndarray
+    is_wide: np.ndarray
+
+
+def empty(n: int, vertices: int, reach: float) -> PlanarWindows:
+    """Returns room for n windows."""
+    heights, rises = np.zeros((2, n, vertices))
+    return PlanarWindows(
+        start=np.full(n, np.nan),
+        centre=np.zeros(n),
+        reach=reach,
+        heights=heights,
+        rises=rises,
+        vertical=np.zeros((n, vertices), bool),
+        wide=np.zeros((n, 3 * vertices + 1)),  # memory is taken where it is written
+        is_wide=np.zeros(n, bool),
+    )
+
+
+@compiled_inline
+def height(i: int, x: float, ground: PlanarWindows) -> float:
+    """Returns the height in m of the ground of simulation i at x, m.
+
+    Beyond the window it has no meaning, but is finite where x is: see `far_height`.
+    """
+    u = x * _CELLS_PER_METRE - ground.start[i]
+    whole = np.floor(u)
+    cell = _within(whole, ground.heights.shape[1])
+    return (u - whole) * ground.rises[i, cell] + ground.heights[i, cell]
+
+
+@compiled_inline
+def slope(i: int, x: float, ground: PlanarWindows) -> float:
+    """Returns the slope dh/dx of the ground of simulation i at x, m."""
+    whole = np.floor(x * _CELLS_PER_METRE - ground.start[i])
+    return ground.rises[i, _within(whole, ground.heights.shape[1])] / SPACING
+
+
+@compiled_inline
+def is_outside(i: int, x: float, ground: PlanarWindows) -> bool:
+    """Returns whether x, m, lies beyond the window of simulation i."""
+    u = x * _CELLS_PER_METRE - ground.start[i]
+    return u < 0.0 or u >= ground.heights.shape[1] - 1
+
+
+@compiled_inline
+def far_height(i: int, x: float, ground: PlanarWindows) -> float:
+    """Returns the height in m at x, m, up to the length of a window beyond the window.
+
+    Only where `is_wide`; further away the ends go on. The last bit is that of `PlanarGround.height`, not of
+    `height`: of a character that looks beyond its window all heights are taken from here.
+    """
+    position = x / SPACING
+    whole = np.floor(position)
+    first, last = ground.start[i] - ground.heights.shape[1], ground.wide.shape[1] - 1
+    if whole < first:
+        return ground.wide[i, 0]
+    if whole >= first + last:
+        return ground.wide[i, last]
+    cell = _within(whole - first, last)
+    left = ground.wide[i, cell]
+    return left + (position - whole) * (ground.wide[i, cell + 1] - left)
+
+
+@compiled_inline
+def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
+    """Returns whether a character at x, m, is so far that its window must be laid anew."""
+    return abs(x - ground.centre[i]) > ground.reach
+
+
+@compiled_inline
+def _within(number: float, count: int) -> int:
+    """The nearest of the numbers 0, 1, ..., count - 1; 0 for what is no number."""
+    if not number > 0.0:
+        return 0
+    return int(number) if number < count - 1 else count - 1

@@ -1,0 +1,304 @@
+"""The three-dimensional ground of one episode: its surface, where to start on it, where to go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.terrain.parameters import Terrain
+from trl_suite.terrain.planar.generators import LONGEST
+from trl_suite.terrain.planar.ground import seed_sequence
+from trl_suite.terrain.spatial.generators import draw3d
+from trl_suite.terrain.spatial.layout import GRID, Boxes, Layout
+
+TRAIL_SPAN = 40.0  # m; a trail starts within a square of this half side about the origin
+TRAIL_PAD = 1.0  # m; and that far inside it
+TRAIL_OFFSET = 0.4  # of the width; how far beside the middle goals lie
+START_ROOM = 1.0  # m; half side of the square that must be clear about a start
+GOAL_SPREAD = 3.0  # m
+TRIES = 1000  # places drawn before the origin is taken
+FAR_APART, AREA = 1e3, 1e5  # m, m^2; points spread more widely are looked at one by one
+RULES = ('far', 'near')
+
+Random = np.random.Generator | np.random.RandomState
+
+
+class SpatialGround:
+    """Ground of one episode, without end.
+
+    What stands where depends on the seed alone. Queries here are exact anywhere, but one ground at
+    a time; `Surroundings` answers for many characters at once.
+
+    Attributes:
+      type: the terrain type.
+      parameters: a value for every parameter of the type.
+      layout: what the generator has drawn.
+    """
+
+    def __init__(
+        self,
+        terrain: Terrain,
+        seed: int | np.random.SeedSequence | np.random.Generator,
+        *,
+        terrain_level: float = 0.0,
+    ) -> None:
+        """Draws the ground.
+
+        Args:
+          terrain: what ground; three-dimensional.
+          seed: a number, a SeedSequence (left as it is: the same one gives the same ground), or a
+            Generator (from which four numbers are drawn).
+          terrain_level: which of the parameter sets, see `Terrain.parameters`.
+
+        Raises:
+          ValueError: planar terrain, or a terrain_level that is no number.
+          TypeError: the seed is something else.
+        """
+        if not terrain.spatial:
+            raise ValueError(
+                f'terrain {terrain.name!r} ({terrain.type}) is planar, a Strip; a Ground is '
+                'three-dimensional'
+            )
+        self._draw(terrain.type, terrain.parameters(terrain_level), seed_sequence(seed))
+
+    def _draw(
+        self, type_: str, parameters: Mapping[str, float], sequence: np.random.SeedSequence
+    ) -> None:
+        self.layout: Layout = draw3d(type_, parameters, np.random.default_rng(sequence))
+        self.type: str = type_
+        self.parameters: dict[str, float] = dict(parameters)
+        self._seed = sequence.entropy, tuple(sequence.spawn_key)
+
+    def state(self) -> dict[str, Any]:
+        """Returns everything `from_state` needs: what was drawn from what."""
+        entropy, spawn_key = self._seed
+        return {
+            'type': self.type,
+            'parameters': dict(self.parameters),
+            'entropy': entropy,
+            'spawn_key': spawn_key,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> SpatialGround:
+        """Returns the same ground again."""
+        ground = cls.__new__(cls)
+        sequence = np.random.SeedSequence(state['entropy'], spawn_key=state['spawn_key'])
+        ground._draw(state['type'], state['parameters'], sequence)
+        return ground
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SpatialGround.from_state, (self.state(),)
+
+    def height(
+        self, x: npt.ArrayLike, y: npt.ArrayLike, movers: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Heights of the surface at points, m.
+
+        Args:
+          x, y: m, of one shape.
+          movers: middles of the moving boxes, (k, 2); where they begin if None.
+
+        Raises:
+          ValueError: a point is not finite, or further than LONGEST from the origin.
+        """
+        return self._look(x, y, movers)[0]
+
+    def velocity(
+        self,
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        movers: np.ndarray | None = None,
+        direction: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Horizontal velocities of the surface at points, m/s, of the shape of x and a 2.
+
+        Args:
+          x, y: m, of one shape.
+          movers: middles of the moving boxes, (k, 2); where they begin if None.
+          direction: of the moving boxes, 1 or -1, (k,); as they begin if None.
+
+        Raises:
+          ValueError: as `height`.
+        """
+        return self._look(x, y, movers, direction)[1]
+
+    def _look(
+        self,
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        centres: np.ndarray | None = None,
+        direction: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Heights and velocities of the highest things at points."""
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        if not (np.abs(x) <= LONGEST).all() or not (np.abs(y) <= LONGEST).all():
+            raise ValueError(f'points must be finite and within {LONGEST:g} m of 0')
+        shape, x, y = x.shape, x.ravel(), y.ravel()
+        spread = [np.ptp(part) for part in (x, y) if x.size > 1]
+        if spread and (max(spread) > FAR_APART or math.prod(spread) > AREA):
+            each = [self._look(*point, centres, direction) for point in zip(x, y, strict=True)]
+            found = [np.stack(part) for part in zip(*each, strict=True)]
+            return found[0].reshape(shape), found[1].reshape(*shape, 2)
+        layout = self.layout
+        height = np.full(len(x), -np.inf if layout.level is None else layout.level)
+        velocity = np.zeros((len(x), 2))
+        if not len(x):
+            return height.reshape(shape), velocity.reshape(*shape, 2)
+
+        def cover(boxes: Boxes, velocities: np.ndarray | float) -> None:
+            tops = boxes.heights(x, y)
+            if tops.size:
+                best = tops.argmax(1)
+                top = tops[np.arange(len(x)), best]
+                above = top > height
+                height[above] = top[above]
+                velocity[above] = np.broadcast_to(velocities, (tops.shape[1], 2))[best[above]]
+
+        if layout.grid is not None:
+            np.maximum(height, self._on_grid(x, y), out=height)
+        points = np.stack([x, y], 1)
+        cover(layout.boxes_in(points.min(0), points.max(0)), 0.0)
+        if layout.belts is not None:
+            cover(*layout.belts)
+        if layout.movers is not None:
+            movers = layout.movers
+            direction = movers.direction if direction is None else direction
+            cover(self.movers(centres), (direction * movers.speed)[:, None] * movers.axis)
+        return height.reshape(shape), velocity.reshape(*shape, 2)
+
+    def movers(self, centres: np.ndarray | None = None) -> Boxes:
+        """The moving boxes as they stand; `centres` as for `height`."""
+        movers, level = self.layout.movers, self.layout.level
+        assert movers is not None and level is not None
+        if centres is None:
+            centres = movers.start + movers.phase[:, None] * (movers.end - movers.start)
+        zeros = np.zeros(len(centres))
+        return Boxes(centres, movers.half_size, zeros, level + movers.height, zeros)
+
+    def _on_grid(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Heights of the grid at points (k,)."""
+        i, j = (np.floor(part / GRID).astype(int) for part in (x, y))
+        u, v = x / GRID - i, y / GRID - j
+        columns, env_ids = (np.arange(part.min(), part.max() + 2) for part in (i, j))
+        heights = self.layout.vertices(columns, env_ids)
+        i, j = i - columns[0], j - env_ids[0]
+        corners = np.empty((len(x), 2, 2))
+        for a in (0, 1):
+            for b in (0, 1):
+                corners[:, a, b] = heights[i + a, j + b]
+        return triangles(corners, u, v)
+
+    def spawn(self, random: Random) -> tuple[float, float, float]:
+        """Draws where a character starts: x, y (m) and its heading (rad).
+
+        By the layout's place: at the origin along x; anywhere in a square (24 m to each side among
+        blocks and pillars, 12 m among moving boxes and belts) where 2 m x 2 m are clear; or on the
+        middle of a trail, along it. The same number of draws is not promised.
+        """
+        layout = self.layout
+        if layout.place == 'trail':
+            trail = layout.trail
+            assert trail is not None
+            count = trail.leave(TRAIL_SPAN)
+            points = np.concatenate([trail.start[:count], trail.end[:count]], 1)
+            inside = np.flatnonzero((np.abs(points) <= TRAIL_SPAN - TRAIL_PAD).all(1))
+            k = inside[int(random.uniform() * len(inside))]
+            x, y = trail.start[k] + random.uniform() * (trail.end[k] - trail.start[k])
+            return float(x), float(y), float(trail.heading[k])
+        if layout.place == 'clear':
+            x, y, _ = self._clear(random, START_ROOM, None)
+            return x, y, random.uniform(-math.pi, math.pi)
+        return 0.0, 0.0, 0.0
+
+    def goal(
+        self,
+        random: Random,
+        root: npt.ArrayLike,
+        rule: str = 'far',
+        *,
+        distance: float = 1.0,
+        movers: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Draws a goal on the ground.
+
+        By the layout's place: about the character (`far`: within 3 m along x and along y; `near`:
+        from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a start; or on the
+        trail, 1 to 10 segments of 2 m beyond the one nearest to the character (`step`: 1).
+
+        Args:
+          random: source of randomness.
+          root: where the character is, (2,) m.
+          rule: one of `RULES`.
+          distance: of the nearest goal of `step`, m.
+          movers: middles of the moving boxes, (k, 2); where they begin if None.
+
+        Returns:
+          The point, (3,) m.
+
+        Raises:
+          ValueError: unknown rule.
+        """
+        if rule not in RULES:
+            raise ValueError(f'rule must be one of {", ".join(RULES)}, not {rule!r}')
+        layout = self.layout
+        root = np.asarray(root, float)
+        if layout.place == 'trail':
+            trail = layout.trail
+            assert trail is not None
+            ahead = 1 + int(random.uniform() * (10 if rule == 'far' else 1))
+            middle = 0.5 * (trail.start + trail.end)
+            nearest = int(np.linalg.norm(middle - root, axis=1).argmin())
+            k = nearest + ahead
+            trail.extend(k + 1)
+            along = random.uniform() * (trail.end[k] - trail.start[k])
+            aside = trail.width[k] * random.uniform(-TRAIL_OFFSET, TRAIL_OFFSET)
+            heading = trail.heading[k]
+            x, y = (
+                trail.start[k] + along + aside * np.array([-math.sin(heading), math.cos(heading)])
+            )
+        elif layout.place == 'clear':
+            x, y, found = self._clear(random, layout.goal_room, movers)
+            if found and layout.grid is None and layout.level is not None:
+                return np.array([x, y, layout.level])
+        elif rule == 'far':
+            x, y = root + [random.uniform(-GOAL_SPREAD, GOAL_SPREAD) for _ in range(2)]
+        else:
+            x, y = root[0] + random.uniform(distance, GOAL_SPREAD), 0.0
+        return np.array([x, y, float(self.height(x, y, movers))])
+
+    def _clear(
+        self, random: Random, room: float, movers: np.ndarray | None
+    ) -> tuple[float, float, bool]:
+        """Draws a place whose surroundings are free of boxes and belts; tells whether it found one."""
+        layout, span = self.layout, self.layout.span
+        others = [] if layout.belts is None else [layout.belts.boxes]
+        if layout.movers is not None:
+            others.append(self.movers(movers))
+        for _ in range(TRIES):
+            x, y = random.uniform(-span, span), random.uniform(-span, span)
+            low, high = (x - room, y - room), (x + room, y + room)
+            if layout.is_clear(low, high) and not any(
+                boxes.touching(low, high).any() for boxes in others
+            ):
+                return x, y, True
+        return 0.0, 0.0, False
+
+
+def triangles(corners: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Heights in cells of a grid: two triangles whose common edge runs from (0, 1) to (1, 0).
+
+    Args:
+      corners: heights at (0, 0), (0, 1), (1, 0), (1, 1) of each cell, (k, 2, 2).
+      u, v: where in the cells the points lie, in [0, 1], (k,).
+    """
+    over = u + v > 1
+    near = np.where(over, corners[:, 1, 1], corners[:, 0, 0])
+    along_u = np.where(over, corners[:, 0, 1], corners[:, 1, 0])
+    along_v = np.where(over, corners[:, 1, 0], corners[:, 0, 1])
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    return near + u * (along_u - near) + v * (along_v - near)

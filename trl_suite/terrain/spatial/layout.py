@@ -1,0 +1,263 @@
+"""What three-dimensional ground is made of: a level, a height grid, boxes, belts, moving boxes, a trail.
+
+World axes: x forward, y to the left, z up; lengths in m. The surface at a point is the highest of
+what lies there. A generator returns a `Layout`; what is endless it gives as functions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.util.compiled import compiled
+
+GRID = 0.2  # m between the vertices of a height grid; vertex i stands at i * GRID
+TURN_DISTANCE = 5.0  # m; only farther than that from the character do moving boxes turn round
+PLACES = ('start', 'clear', 'trail')
+
+
+class Boxes(NamedTuple):
+    """k boxes that do not move, upright but for a slope: then their ends are square to the slope."""
+
+    position: np.ndarray  # (k, 2) middle
+    half_size: np.ndarray  # (k, 2) along the box's own axes
+    yaw: np.ndarray  # (k,) of its x axis against the world's, rad
+    top: np.ndarray  # (k,) height of the upper face at the middle
+    slope: np.ndarray  # (k,) rise of the upper face per m along the box's x axis
+
+    def select(self, chosen: np.ndarray) -> Boxes:
+        """Returns those of a mask, or by number."""
+        return Boxes(*(part[chosen] for part in self))
+
+    def extent(self) -> np.ndarray:
+        """Half sides of the smallest upright rectangles around the boxes, (k, 2)."""
+        cosine, sine = np.abs(np.cos(self.yaw)), np.abs(np.sin(self.yaw))
+        length, width = self.half_size.T
+        return np.stack([cosine * length + sine * width, sine * length + cosine * width], 1)
+
+    def touching(self, low: npt.ArrayLike, high: npt.ArrayLike) -> np.ndarray:
+        """Which boxes touch a rectangle, (k,) bool; turned ones by the rectangle around them."""
+        found = np.empty(len(self.top), bool)
+        position, half_size, yaw = (np.ascontiguousarray(part, float) for part in self[:3])
+        _touching(
+            position, half_size, yaw, *np.broadcast_to(low, 2), *np.broadcast_to(high, 2), found
+        )
+        return found
+
+    def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height of every box's upper face at points (m,), (m, k); -inf beside it."""
+        dx, dy = x[:, None] - self.position[:, 0], y[:, None] - self.position[:, 1]
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
+        inside = (np.abs(along) <= self.half_size[:, 0]) & (np.abs(across) <= self.half_size[:, 1])
+        return np.where(inside, self.top + self.slope * along, -np.inf)
+
+
+def boxes(
+    position: npt.ArrayLike,
+    half_size: npt.ArrayLike,
+    top: npt.ArrayLike,
+    yaw: npt.ArrayLike = 0.0,
+    slope: npt.ArrayLike = 0.0,
+) -> Boxes:
+    """Returns boxes; what all have in common may be given once.
+
+    Args:
+      position: middles, m, (k, 2).
+      half_size: m, (k, 2) or (2,).
+      top: height of the upper faces at their middles, m.
+      yaw: of the box's x axis against the world's, rad.
+      slope: rise of the upper face per m along the box's x axis.
+    """
+    position = np.asarray(position, float).reshape(-1, 2)
+    half_sizes, (yaws, tops, slopes) = np.empty_like(position), np.empty((3, len(position)))
+    half_sizes[...], yaws[:], tops[:], slopes[:] = half_size, yaw, top, slope
+    return Boxes(position, half_sizes, yaws, tops, slopes)
+
+
+@compiled
+def _touching(
+    position: np.ndarray,
+    half_size: np.ndarray,
+    yaw: np.ndarray,
+    low_x: float,
+    low_y: float,
+    high_x: float,
+    high_y: float,
+    found: np.ndarray,
+) -> None:
+    """Finds out which boxes touch a rectangle."""
+    for k in range(len(yaw)):
+        x, y = position[k, 0], position[k, 1]
+        cosine, sine = abs(math.cos(yaw[k])), abs(math.sin(yaw[k]))
+        length, width = half_size[k, 0], half_size[k, 1]
+        along, across = cosine * length + sine * width, sine * length + cosine * width
+        found[k] = (
+            x + along >= low_x and y + across >= low_y
+            and x - along <= high_x and y - across <= high_y
+        )  # fmt: skip
+
+
+NO_BOXES = boxes(np.zeros((0, 2)), (0, 0), 0)
+
+
+class Belts(NamedTuple):
+    """k boxes whose surface runs."""
+
+    boxes: Boxes
+    velocity: np.ndarray  # (k, 2) m/s along the world's axes
+
+
+class Movers(NamedTuple):
+    """k upright boxes that stand on the level and go to and fro between two points each."""
+
+    start: np.ndarray  # (k, 2)
+    end: np.ndarray  # (k, 2)
+    half_size: np.ndarray  # (k, 2)
+    height: np.ndarray  # (k,)
+    speed: np.ndarray  # (k,) m/s
+    phase: np.ndarray  # (k,) share of the way from start to end at which it begins
+    direction: np.ndarray  # (k,) 1 towards the end, -1 towards the start
+
+    @property
+    def length(self) -> np.ndarray:
+        """Of the ways, (k,)."""
+        return np.linalg.norm(self.end - self.start, axis=1)
+
+    @property
+    def axis(self) -> np.ndarray:
+        """Unit vectors from start to end, (k, 2)."""
+        way = self.end - self.start
+        way[self.length < 1e-9] = 1, 0
+        return way / np.linalg.norm(way, axis=1)[:, None]
+
+
+class Trail(Protocol):
+    """A path of straight segments, continued as far as it is asked for."""
+
+    width: np.ndarray  # (k,) of the segments there are
+    start: np.ndarray  # (k, 2)
+    end: np.ndarray  # (k, 2)
+    heading: np.ndarray  # (k,) rad
+
+    def extend(self, count: int) -> None:
+        """Makes sure that there are at least so many segments."""
+
+    def leave(self, half_side: float) -> int:
+        """Number of segments up to the first that ends outside a square about the origin."""
+
+
+class Grid(NamedTuple):
+    """Heights of vertices as data: a finite piece of ground, with its rim going on for ever."""
+
+    first: tuple[int, int]  # numbers of the first vertex along x and y
+    heights: np.ndarray  # (k, m), along x and y
+
+    def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """Heights of the vertices (i, j) * GRID, (len(i), len(j))."""
+        k, m = self.heights.shape
+        env_ids = np.clip(i - self.first[0], 0, k - 1)
+        return self.heights[np.ix_(env_ids, np.clip(j - self.first[1], 0, m - 1))]
+
+
+GridFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
+BoxFunction = Callable[[np.ndarray, np.ndarray], Boxes]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Layout:
+    """The ground of one episode.
+
+    Attributes:
+      level: height of a plane under everything, m; None for none.
+      grid: a `Grid`, or a function from numbers of vertices, (k,) along x and (m,) along y, to
+        their heights, (k, m); linear on two triangles per cell, whose common edge runs from the
+        back left to the front right corner. None for none.
+      boxes: `Boxes`, or a function from two corners of a rectangle, (2,) each, to the boxes that
+        touch it. It must give the same boxes however it is asked. It may have a method `touched` of
+        the same arguments, which tells faster whether there are any.
+      belts: running surfaces.
+      movers: moving boxes; they stand on the level.
+      trail: the path that spawn and goals keep to, if place is 'trail'.
+      place: where characters start and goals lie: 'start' (at the origin; goals about the
+        character), 'clear' (anywhere that is clear of boxes and belts), or 'trail'.
+      span: for 'clear', half side of the square in which they lie, m.
+      goal_room: for 'clear', half side of the square that must be clear about a goal, m.
+    """
+
+    level: float | None = 0.0
+    grid: Grid | GridFunction | None = None
+    boxes: Boxes | BoxFunction = NO_BOXES
+    belts: Belts | None = None
+    movers: Movers | None = None
+    trail: Trail | None = None
+    place: str = 'start'
+    span: float = 12.0
+    goal_room: float = 1.0
+
+    def boxes_in(self, low: np.ndarray, high: np.ndarray) -> Boxes:
+        """The boxes that touch a rectangle.
+
+        Raises:
+          ValueError: a function of the user's that returns something else.
+        """
+        if isinstance(self.boxes, Boxes):
+            return self.boxes.select(self.boxes.touching(low, high))
+        found = self.boxes(low, high)
+        if not isinstance(found, Boxes) or not all(np.isfinite(part).all() for part in found):
+            raise ValueError('the function for boxes of a Layout must return finite Boxes')
+        return found
+
+    def is_clear(self, low: tuple[float, float], high: tuple[float, float]) -> bool:
+        """Whether no box touches a rectangle."""
+        touched = getattr(self.boxes, 'touched', None)
+        if touched is not None:
+            return not touched(low, high)
+        return not self.boxes_in(np.array(low), np.array(high)).touching(low, high).any()
+
+    def vertices(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """Heights of the grid at vertices (i, j) * GRID, (len(i), len(j)).
+
+        Raises:
+          ValueError: a function of the user's that returns something else.
+        """
+        assert self.grid is not None
+        heights = np.asarray(self.grid(i, j))
+        if heights.shape != (len(i), len(j)):
+            raise ValueError(
+                f'the function for a grid of a Layout must return heights of shape '
+                f'{(len(i), len(j))}; it returned an array of shape {heights.shape}'
+            )
+        if not np.isfinite(heights).all():
+            a, b = np.argwhere(~np.isfinite(heights))[0]
+            raise ValueError(
+                f'the function for a grid of a Layout returned {heights[a, b]} at x = {GRID * i[a]:g} m, '
+                f'y = {GRID * j[b]:g} m; expected finite heights'
+            )
+        return heights
+
+    def fault(self) -> str:
+        """What is wrong with it, for the author of a generator; empty if nothing is."""
+        if self.place not in PLACES:
+            return f'place must be one of {", ".join(PLACES)}, not {self.place!r}'
+        if self.place == 'trail' and self.trail is None:
+            return "place is 'trail', but there is no trail"
+        if self.level is None and self.grid is None and self.boxes is NO_BOXES:
+            return 'there must be a level, a grid or boxes'
+        if self.movers is not None and self.level is None:
+            return 'moving boxes need a level to stand on'
+        finite: list[tuple[str, Any]] = [('level', 0.0 if self.level is None else self.level)]
+        if isinstance(self.grid, Grid):
+            finite.append(('grid', self.grid.heights))
+        if isinstance(self.boxes, Boxes):
+            finite += [(f'boxes.{name}', part) for name, part in self.boxes._asdict().items()]
+        if self.belts is not None:
+            finite.append(('belts.velocity', self.belts.velocity))
+        if self.movers is not None:
+            finite += [(f'movers.{name}', part) for name, part in self.movers._asdict().items()]
+        return next((f'{n} is not finite' for n, part in finite if not np.isfinite(part).all()), '')

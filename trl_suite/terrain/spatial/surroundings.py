@@ -1,0 +1,379 @@
+"""What n characters stand on and see: windows of their grounds, queried all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from trl_suite.terrain.parameters import Terrain
+from trl_suite.terrain.spatial import index
+from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.terrain.spatial.ground import SpatialGround
+from trl_suite.terrain.spatial.layout import GRID, NO_BOXES, Boxes
+from trl_suite.terrain.spatial.windows import (
+    HALF,
+    SAMPLES,
+    SHIFT,
+    VERTICES,
+    Capacity,
+    SpatialWindows,
+)
+from trl_suite.util.compiled import compiled
+
+PROBES = 6  # draws by which the number of boxes of a window is foreseen
+SPARE = 1.3  # times the most boxes of any probe
+
+Rows = slice | np.ndarray
+ALL = slice(None)
+
+
+def capacity(terrain: Terrain) -> Capacity:
+    """Foresees what windows of a terrain hold, from a few fixed draws."""
+    found, counts, finite, strips = [], [], True, True
+    for terrain_level in range(max(1, len(terrain.parameter_sets))):
+        for seed in range(PROBES):
+            layout = SpatialGround(terrain, seed, terrain_level=terrain_level).layout
+            finite &= isinstance(layout.boxes, Boxes)
+            for centre in ((0.0, 0.0), (SHIFT * seed, -SHIFT * seed)):
+                low, high = np.array(centre) - HALF, np.array(centre) + HALF
+                boxes = layout.boxes_in(low, high)
+                counts.append(len(boxes.top))
+                beside = np.abs(boxes.position[:, 1] - centre[1]) + HALF - boxes.extent()[:, 1]
+                strips &= layout.belts is None and bool((beside <= 0).all())
+            if isinstance(layout.boxes, Boxes):
+                counts.append(len(layout.boxes.top))
+            found.append(
+                Capacity(
+                    layout.level is not None,
+                    layout.grid is not None,
+                    0,
+                    0 if layout.belts is None else len(layout.belts.velocity),
+                    0 if layout.movers is None else len(layout.movers.speed),
+                    False,
+                )
+            )
+    most, least = max(counts), min(counts)
+    if not finite and most:
+        most = min(round(SPARE * most) + PROBES, most + 3 * (most - least) + 3)
+    largest = Capacity(*(max(part) for part in zip(*found, strict=True)))
+    return largest._replace(boxes=most, strips=strips)
+
+
+class Surroundings:
+    """Windows of n grounds, 32 m x 32 m about each character, for queries over a batch axis.
+
+    A query answers for all characters at once, exactly as `SpatialGround` would, as long as it stays within
+    the window; beyond it, it answers for the rim. `follow` keeps every character so near the middle
+    that all it sees in a map lies inside.
+
+    Attributes:
+      arrays: the windows, for the compiled functions of one simulation in
+        `trl_suite.terrain.spatial.generators.windows`.
+      grounds: of each character.
+      boxes: in each window, in order of x.
+      centre: middles of the windows, m, (n, 2).
+      way: how far moving boxes are from the start of their ways, m, (n, M).
+      direction: 1 where they go towards the end, -1 towards the start, (n, M).
+      start, axis, length, half_size, speed: of their ways and of themselves; see `Movers`.
+    """
+
+    def __init__(self, n: int, capacity: Capacity) -> None:
+        self.n, self.capacity = n, capacity
+        self.grounds: list[SpatialGround | None] = [None] * n
+        self.boxes: list[Boxes] = [NO_BOXES] * n
+        self.arrays: SpatialWindows = spatial_ground.empty(n, capacity)
+        self._numbers = np.arange(n)
+        ground = self.arrays
+        self.centre, self.way, self.direction = (
+            ground.centre, ground.mover_distance, ground.mover_direction,
+        )  # fmt: skip
+        self.start, self.axis, self.length = (
+            ground.mover_start, ground.mover_axis, ground.mover_length,
+        )  # fmt: skip
+        self.half_size, self.speed = ground.mover_half_size, ground.mover_speed
+
+    @property
+    def windowed(self) -> bool:
+        """Whether there is anything that a window must be laid for."""
+        return self.capacity.grid or self.capacity.boxes + self.capacity.belts > 0
+
+    @property
+    def moving(self) -> bool:
+        """Whether any surface may move."""
+        return self.capacity.belts > 0 or self.capacity.movers > 0
+
+    def begin(self, env_id: int, ground: SpatialGround, xy: npt.ArrayLike = (0.0, 0.0)) -> None:
+        """Puts a character on another ground, moving boxes as they begin.
+
+        Args:
+          env_id: which character.
+          ground: of a terrain like the one whose capacity this was made for.
+          xy: where the character is, m.
+
+        Raises:
+          ValueError: the ground is of another kind than the probes led to expect.
+        """
+        layout, capacity = ground.layout, self.capacity
+        belts = 0 if layout.belts is None else len(layout.belts.velocity)
+        movers = 0 if layout.movers is None else len(layout.movers.speed)
+        if (
+            (layout.level is not None) > capacity.level
+            or (layout.grid is not None) > capacity.grid
+            or belts > capacity.belts
+            or movers > capacity.movers
+        ):
+            raise ValueError(
+                f'a ground of type {ground.type!r} holds more than {capacity}, which {PROBES} draws '
+                'led to expect: its generator must make the same kinds of things every time'
+            )
+        arrays = self.arrays
+        self.grounds[env_id] = ground
+        arrays.level[env_id] = -np.inf if layout.level is None else layout.level
+        self.half_size[env_id], self.speed[env_id] = -1.0, 0.0
+        if layout.movers is not None:
+            part = layout.movers
+            self.start[env_id, :movers], self.axis[env_id, :movers] = part.start, part.axis
+            self.length[env_id, :movers], self.speed[env_id, :movers] = part.length, part.speed
+            self.half_size[env_id, :movers] = part.half_size
+            arrays.mover_top[env_id, :movers] = arrays.level[env_id] + part.height
+            self.way[env_id, :movers] = part.phase * part.length
+            self.direction[env_id, :movers] = part.direction
+        self._lay(env_id, np.round(np.asarray(xy, float) / SHIFT) * SHIFT)
+
+    def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> list[int]:
+        """Keeps the windows about the characters.
+
+        Args:
+          xy: where they are, m, (n, 2), or of the given simulations only.
+          env_ids: sorted numbers of characters; None for all.
+
+        Returns:
+          Whose windows were laid anew.
+        """
+        if not self.windowed:
+            return []
+        moved = np.abs(xy - (self.centre if env_ids is None else self.centre[env_ids]))
+        if not moved.max(initial=0.0) > SHIFT:
+            return []
+        far = np.flatnonzero(moved.max(1) > SHIFT)
+        leaving = (far if env_ids is None else env_ids[far]).tolist()
+        for env_id, centre in zip(leaving, np.round(xy[far] / SHIFT) * SHIFT, strict=True):
+            self._lay(env_id, centre)
+        return leaving
+
+    def advance(self, dt: float, xy: np.ndarray, env_ids: Rows = ALL) -> None:
+        """Moves moving boxes, where no physics does.
+
+        Args:
+          dt: s.
+          xy: where the characters of the simulations are, m.
+          env_ids: which ones.
+        """
+        self.way[env_ids] += self.direction[env_ids] * self.speed[env_ids] * dt
+        self.turn(xy, env_ids)
+
+    def turn(self, xy: np.ndarray, env_ids: Rows = ALL) -> None:
+        """Turns moving boxes round that are at an end of their way and far from their character.
+
+        Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
+        """
+        _turn_all(self._numbers[env_ids], np.ascontiguousarray(xy, float), self.arrays)
+
+    def centres(self, env_ids: Rows = ALL) -> np.ndarray:
+        """Middles of the moving boxes, m, (simulations, M, 2)."""
+        return self.start[env_ids] + self.way[env_ids][..., None] * self.axis[env_ids]
+
+    def grid(self, env_id: int) -> np.ndarray:
+        """The height grid of a window, along x, then y, m, (VERTICES, VERTICES)."""
+        return self.arrays.grid[env_id].reshape(VERTICES, VERTICES)
+
+    # Queries.
+
+    def height(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+        """Heights of the surface at points (simulations, k), m."""
+        out = np.empty(np.shape(x))
+        self._points(_heights, x, y, env_ids, out)
+        return out
+
+    def velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+        """Horizontal velocities of the surface at points (simulations, k), m/s, (simulations, k, 2)."""
+        out = np.zeros((*np.shape(x), 2))
+        if self.moving:
+            self._points(_velocities, x, y, env_ids, out)
+        return out
+
+    def height_map(
+        self,
+        xy: np.ndarray,
+        heading: np.ndarray,
+        env_ids: Rows = ALL,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Heights around characters, relative to the surface under them.
+
+        32 x 32 samples in the heading frame: from 1 m behind to 10 m ahead, 5.5 m to each side,
+        0.355 m apart. Sample 32 v + u is the u-th from behind of the v-th line from the left.
+
+        Args:
+          xy: where the characters are, m, (simulations, 2).
+          heading: rad, (simulations,).
+          env_ids: which characters.
+          out: where to write, (simulations, 1024).
+
+        Returns:
+          Heights in m, (simulations, 1024).
+        """
+        out = np.empty((len(xy), SAMPLES**2)) if out is None else out
+        self._maps(_height_maps, xy, heading, env_ids, out)
+        return out
+
+    def velocity_map(
+        self,
+        xy: np.ndarray,
+        heading: np.ndarray,
+        env_ids: Rows = ALL,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Velocities of the surface around characters, relative to the surface under them.
+
+        Arguments are those of `height_map`.
+
+        Returns:
+          Velocities in m/s, (simulations, 2048): along the heading at the samples of a height map, then
+          to the right of it.
+        """
+        out = np.empty((len(xy), 2 * SAMPLES**2)) if out is None else out
+        self._maps(_velocity_maps, xy, heading, env_ids, out)
+        return out
+
+    def _points(
+        self,
+        query: Callable[..., None],
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        env_ids: Rows,
+        out: np.ndarray,
+    ) -> None:
+        """Asks a compiled loop about points."""
+        env_ids = self._numbers[env_ids]
+        x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
+        if x.ndim != 2 or x.shape != y.shape or len(x) != len(env_ids):
+            raise ValueError(
+                f'x and y have shapes {x.shape} and {y.shape}; expected ({len(env_ids)}, k)'
+            )
+        query(env_ids, x, y, self.arrays, out)
+
+    def _maps(
+        self,
+        query: Callable[..., None],
+        xy: npt.ArrayLike,
+        heading: npt.ArrayLike,
+        env_ids: Rows,
+        out: np.ndarray,
+    ) -> None:
+        """Asks a compiled loop for maps."""
+        env_ids = self._numbers[env_ids]
+        xy, heading = np.ascontiguousarray(xy, float), np.ascontiguousarray(heading, float)
+        count = len(env_ids)
+        if xy.shape != (count, 2) or heading.shape != (count,) or len(out) != count:
+            raise ValueError(
+                f'xy, heading and out have shapes {xy.shape}, {heading.shape} and {out.shape}; '
+                f'expected ({count}, 2), ({count},) and ({count}, k)'
+            )
+        query(env_ids, xy, heading, self.arrays, out)
+
+    # State.
+
+    def state(self, env_id: int) -> dict[str, Any]:
+        """What is needed to restore the surroundings of one character exactly."""
+        ground = self.grounds[env_id]
+        if ground is None:
+            return {'ground': None}
+        return {
+            'ground': ground.state(),
+            'centre': self.centre[env_id].tolist(),
+            'way': self.way[env_id].copy(),
+            'direction': self.direction[env_id].copy(),
+        }
+
+    def restore(self, env_id: int, state: Mapping[str, Any]) -> None:
+        """Restores the surroundings of one character."""
+        if state['ground'] is not None:
+            self.begin(env_id, SpatialGround.from_state(state['ground']), state['centre'])
+            self.way[env_id], self.direction[env_id] = state['way'], state['direction']
+
+    def _lay(self, env_id: int, centre: np.ndarray) -> None:
+        """Fills a window."""
+        ground = self.grounds[env_id]
+        assert ground is not None
+        layout = ground.layout
+        arrays = self.arrays
+        arrays.centre[env_id] = centre
+        low, high = centre - HALF, centre + HALF
+        if self.capacity.grid:
+            if layout.grid is None:
+                arrays.grid[env_id] = arrays.level[env_id]
+            else:
+                i, j = (np.arange(VERTICES) + round(edge / GRID) for edge in low.tolist())
+                arrays.grid[env_id] = layout.vertices(i, j).reshape(-1)
+        if not self.capacity.boxes + self.capacity.belts:
+            return
+        boxes = layout.boxes_in(low, high)
+        if len(boxes.top) > self.capacity.boxes:  # those at the rim may be missing
+            gap = np.abs(boxes.position - centre) - boxes.extent()
+            nearest = np.argsort(gap.max(1), kind='stable')[: self.capacity.boxes]
+            boxes = boxes.select(nearest)
+        self.boxes[env_id] = boxes = boxes.select(np.argsort(boxes.position[:, 0], kind='stable'))
+        index.fill(env_id, boxes, layout.belts, arrays)
+
+
+@compiled
+def _turn_all(env_ids: np.ndarray, xy: np.ndarray, ground: SpatialWindows) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.turn_movers(env_ids[k], xy[k, 0], xy[k, 1], ground)
+
+
+@compiled
+def _heights(
+    env_ids: np.ndarray, x: np.ndarray, y: np.ndarray, ground: SpatialWindows, out: np.ndarray
+) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            out[k, p] = spatial_ground.height(env_ids[k], x[k, p], y[k, p], ground)
+
+
+@compiled
+def _velocities(
+    env_ids: np.ndarray, x: np.ndarray, y: np.ndarray, ground: SpatialWindows, out: np.ndarray
+) -> None:
+    for k in range(len(env_ids)):
+        for p in range(x.shape[1]):
+            east, north = spatial_ground.velocity(env_ids[k], x[k, p], y[k, p], ground)
+            out[k, p, 0], out[k, p, 1] = east, north
+
+
+@compiled
+def _height_maps(
+    env_ids: np.ndarray,
+    xy: np.ndarray,
+    heading: np.ndarray,
+    ground: SpatialWindows,
+    out: np.ndarray,
+) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.height_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])
+
+
+@compiled
+def _velocity_maps(
+    env_ids: np.ndarray,
+    xy: np.ndarray,
+    heading: np.ndarray,
+    ground: SpatialWindows,
+    out: np.ndarray,
+) -> None:
+    for k in range(len(env_ids)):
+        spatial_ground.velocity_map(env_ids[k], xy[k, 0], xy[k, 1], heading[k], ground, out[k])

@@ -1,0 +1,415 @@
+"""Windows of the three-dimensional grounds of n simulations, as arrays, and functions of one of them.
+
+The functions answer for a point as `SpatialGround` would, as long as it lies within the window of its
+simulation, 32 m x 32 m; beyond the window they answer for its rim. `Surroundings` fills the arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
+from trl_suite.util.compiled import compiled, compiled_inline
+
+HALF = 16.0  # m; half side of a window
+SHIFT = 4.0  # m; windows are centred on multiples of it, and laid anew beyond it
+VERTICES = round(2 * HALF / GRID) + 1  # of the height grid of a window, along each axis
+SQUARES = (32, 32)  # bins of a window along x and y
+STRIPS = (256, 1)  # where all boxes reach from the right rim to the left one
+ROOM = 8  # times as many entries as there are bins and boxes
+SAMPLES = 32  # of a map, along each axis
+AHEAD = (-1.0, 10.0)  # m; along the heading, from where to where a map reaches
+ASIDE = 5.5  # m; to each side
+SPEED_ERROR = 0.005  # m/s; deviation after which moving boxes are given their speed again
+
+_FORWARD = np.linspace(*AHEAD, SAMPLES)
+_RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
+_BEHIND = AHEAD[0]
+_PER_METRE_AHEAD = (SAMPLES - 1) / (AHEAD[1] - AHEAD[0])  # samples
+_PER_METRE_ASIDE = (SAMPLES - 1) / (2 * ASIDE)
+_PER_METRE = max(_PER_METRE_AHEAD, _PER_METRE_ASIDE)
+_COUNT = SAMPLES * SAMPLES
+_FAR_AWAY = TURN_DISTANCE**2
+_CELLS_PER_METRE = 1 / GRID
+_LAST = VERTICES - 1.0 - 1e-6
+
+# Columns of `SpatialWindows.boxes`: all numbers of a box share a line of the processor's cache.
+X, Y, HALF_X, HALF_Y, COSINE, SINE, TOP, SLOPE = range(8)
+
+
+class Capacity(NamedTuple):
+    """The most that a window of a terrain holds."""
+
+    level: bool  # whether there is a plane
+    grid: bool  # whether there is a height grid
+    boxes: int
+    belts: int
+    movers: int
+    strips: bool  # whether all boxes reach from the right rim to the left one
+
+
+class SpatialWindows(NamedTuple):
+    """Windows of n grounds, with room for B boxes (belts come last) and M moving boxes each.
+
+    An array of what a terrain does not have has length 0 along its second axis. The arrays are
+    changed in place and never replaced.
+
+    Attributes:
+      level: of the plane, (n,) m; -inf if there is none.
+      centre: middles of the windows, (n, 2) m.
+      grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
+      boxes: numbers by the columns above, (n, B, 8); HALF_X is -1 where there is no box.
+      box_velocity: of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
+      bins: which part of bin_boxes is of a bin, begin and end, (n, bins along x, along y, 2) int32.
+      bin_boxes: for every bin the numbers of the boxes that touch it, (n, k) int32.
+      mover_start: where the path of a moving box starts, (n, M, 2) m.
+      mover_axis: unit vector along the path, (n, M, 2).
+      mover_length: of the path, (n, M) m.
+      mover_half_size: (n, M, 2) m; -1 where there is no box.
+      mover_top: (n, M) m.
+      mover_speed: (n, M) m/s.
+      mover_distance: from the start of the path, (n, M) m; changes as boxes move.
+      mover_direction: 1 towards the end of the path, -1 towards its start, (n, M).
+      mover_begin: where on its path a moving box is when its joint is at 0, (n, M) m.
+      mover_qpos, mover_dof: addresses of these joints in the physics, (M,).
+    """
+
+    level: np.ndarray
+    centre: np.ndarray
+    grid: np.ndarray
+    boxes: np.ndarray
+    box_velocity: np.ndarray
+    bins: np.ndarray
+    bin_boxes: np.ndarray
+    mover_start: np.ndarray
+    mover_axis: np.ndarray
+    mover_length: np.ndarray
+    mover_half_size: np.ndarray
+    mover_top: np.ndarray
+    mover_speed: np.ndarray
+    mover_distance: np.ndarray
+    mover_direction: np.ndarray
+    mover_begin: np.ndarray
+    mover_qpos: np.ndarray
+    mover_dof: np.ndarray
+
+
+def empty(n: int, capacity: Capacity) -> SpatialWindows:
+    """Returns room for n windows of a terrain, with nothing in them."""
+    boxes, movers = capacity.boxes + capacity.belts, capacity.movers
+    bins = (STRIPS if capacity.strips else SQUARES) if boxes else (0, 0)
+    ground = SpatialWindows(
+        level=np.full(n, -np.inf),
+        centre=np.zeros((n, 2)),
+        grid=np.zeros((n, VERTICES**2 if capacity.grid else 0), np.float32),
+        boxes=np.zeros((n, boxes, 8)),
+        box_velocity=np.zeros((n, boxes if capacity.belts else 0, 2)),
+        bins=np.zeros((n, *bins, 2), np.int32),
+        bin_boxes=np.zeros((n, ROOM * (bins[0] * bins[1] + boxes)), np.int32),
+        mover_start=np.zeros((n, movers, 2)),
+        mover_axis=np.zeros((n, movers, 2)),
+        mover_length=np.zeros((n, movers)),
+        mover_half_size=np.full((n, movers, 2), -1.0),
+        mover_top=np.zeros((n, movers)),
+        mover_speed=np.zeros((n, movers)),
+        mover_distance=np.zeros((n, movers)),
+        mover_direction=np.ones((n, movers)),
+        mover_begin=np.zeros((n, movers)),
+        mover_qpos=np.zeros(movers, int),
+        mover_dof=np.zeros(movers, int),
+    )
+    ground.boxes[:, :, HALF_X] = -1.0
+    return ground
+
+
+# Queries.
+
+
+@compiled
+def height(i: int, x: float, y: float, ground: SpatialWindows) -> float:
+    """Returns the height in m of the surface of simulation i at a point, m."""
+    return _highest(i, x, y, ground)[0]
+
+
+@compiled
+def velocity(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, float]:
+    """Returns the horizontal velocity in m/s of the surface of simulation i at a point, m."""
+    return _velocity_of(i, _highest(i, x, y, ground)[1], ground)
+
+
+@compiled
+def height_map(
+    i: int, x: float, y: float, heading: float, ground: SpatialWindows, out: np.ndarray
+) -> None:
+    """Writes heights around a character, relative to the surface under it.
+
+    Sample 32 v + u is the u-th from behind of the v-th line from the left; see `Surroundings`.
+
+    Args:
+      i: which simulation.
+      x, y: where the character is, m.
+      heading: rad.
+      ground: of all simulations.
+      out: is given the heights in m, (1024,).
+    """
+    under = height(i, x, y, ground)
+    cosine, sine = math.cos(heading), math.sin(heading)
+    for v in range(SAMPLES):
+        for u in range(SAMPLES):
+            at_x, at_y = _sample(u, v, x, y, cosine, sine)
+            out[SAMPLES * v + u] = _fixed(i, at_x, at_y, ground)[0] - under
+    for k in range(ground.mover_top.shape[1]):
+        begin_u, end_u, begin_v, end_v = _seen_part(i, k, x, y, cosine, sine, ground)
+        for v in range(begin_v, end_v):
+            for u in range(begin_u, end_u):
+                at_x, at_y = _sample(u, v, x, y, cosine, sine)
+                out[SAMPLES * v + u] = height(i, at_x, at_y, ground) - under
+
+
+@compiled
+def velocity_map(
+    i: int, x: float, y: float, heading: float, ground: SpatialWindows, out: np.ndarray
+) -> None:
+    """Writes velocities of the surface around a character, relative to the surface under it.
+
+    Arguments are those of `height_map`; `out` is given velocities in m/s, (2048,): along the
+    heading at the samples of a height map, then to the right of it.
+    """
+    belts, movers = ground.box_velocity.shape[1], ground.mover_top.shape[1]
+    if belts + movers == 0:
+        out[:] = 0.0
+        return
+    under = velocity(i, x, y, ground)
+    cosine, sine = math.cos(heading), math.sin(heading)
+    still = _turned(0.0, 0.0, under, cosine, sine)
+    for v in range(SAMPLES):
+        for u in range(SAMPLES):
+            ahead, aside = still
+            if belts:
+                at_x, at_y = _sample(u, v, x, y, cosine, sine)
+                east, north = _velocity_of(i, _fixed(i, at_x, at_y, ground)[1], ground)
+                ahead, aside = _turned(east, north, under, cosine, sine)
+            out[SAMPLES * v + u], out[_COUNT + SAMPLES * v + u] = ahead, aside
+    for k in range(movers):
+        begin_u, end_u, begin_v, end_v = _seen_part(i, k, x, y, cosine, sine, ground)
+        for v in range(begin_v, end_v):
+            for u in range(begin_u, end_u):
+                at_x, at_y = _sample(u, v, x, y, cosine, sine)
+                east, north = velocity(i, at_x, at_y, ground)
+                ahead, aside = _turned(east, north, under, cosine, sine)
+                out[SAMPLES * v + u], out[_COUNT + SAMPLES * v + u] = ahead, aside
+
+
+@compiled
+def has_left(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
+    """Returns whether a character is so far from the middle that its window must be laid anew."""
+    if ground.grid.shape[1] + ground.boxes.shape[1] == 0:
+        return False
+    return abs(x - ground.centre[i, 0]) > SHIFT or abs(y - ground.centre[i, 1]) > SHIFT
+
+
+@compiled
+def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
+    """Turns moving boxes round that are at an end of their path and far from the character at (x, y).
+
+    Nearer than 5 m they go straight on, beyond the end if need be, until they are not.
+    """
+    for k in range(ground.mover_top.shape[1]):
+        middle_x, middle_y = _mover_middle(i, k, ground)
+        away_x, away_y = middle_x - x, middle_y - y
+        if away_x * away_x + away_y * away_y > _FAR_AWAY:
+            distance = ground.mover_distance[i, k]
+            if distance >= ground.mover_length[i, k]:
+                ground.mover_direction[i, k] = -1.0
+            elif distance <= 0:
+                ground.mover_direction[i, k] = 1.0
+
+
+@compiled
+def see_movers(i: int, qpos: np.ndarray, ground: SpatialWindows) -> None:
+    """Notes where the physics has taken moving boxes; qpos is of all simulations."""
+    for k in range(ground.mover_top.shape[1]):
+        moved = qpos[i, ground.mover_qpos[k]]
+        ground.mover_distance[i, k] = ground.mover_begin[i, k] + moved
+
+
+@compiled
+def keep_moving(
+    i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialWindows
+) -> bool:
+    """Turns moving boxes round, and gives all of a simulation their speed again where one lacks it.
+
+    Args:
+      i: which simulation.
+      x, y: where its character is, m.
+      qpos, qvel: of all simulations; qvel is written.
+      ground: of all simulations.
+
+    Returns:
+      Whether qvel was written; then the physics wants to be forwarded.
+    """
+    see_movers(i, qpos, ground)
+    turn_movers(i, x, y, ground)
+    wrong = False
+    for k in range(ground.mover_top.shape[1]):
+        speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+        wrong |= abs(qvel[i, ground.mover_dof[k]] - speed) > SPEED_ERROR
+    if wrong:
+        for k in range(ground.mover_top.shape[1]):
+            speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+            qvel[i, ground.mover_dof[k]] = speed
+    return wrong
+
+
+# What queries are made of.
+
+
+@compiled_inline
+def _fixed(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
+    """Height of the highest thing at a point that stays where it is, and the number of its box.
+
+    It is -1 if that is no box.
+    """
+    top, box = ground.level[i], -1
+    if ground.grid.shape[1]:
+        on_grid = _on_grid(i, x, y, ground)
+        if not on_grid < top:
+            top = on_grid
+    if ground.boxes.shape[1]:
+        columns, lines = ground.bins.shape[1], ground.bins.shape[2]
+        column = bin_of(x - (ground.centre[i, 0] - HALF), columns)
+        line = bin_of(y - (ground.centre[i, 1] - HALF), lines)
+        begin, end = ground.bins[i, column, line, 0], ground.bins[i, column, line, 1]
+        for entry in range(begin, end):
+            number = ground.bin_boxes[i, entry]
+            east, north = x - ground.boxes[i, number, X], y - ground.boxes[i, number, Y]
+            cosine, sine = ground.boxes[i, number, COSINE], ground.boxes[i, number, SINE]
+            along, across = cosine * east + sine * north, cosine * north - sine * east
+            if (
+                abs(along) <= ground.boxes[i, number, HALF_X]
+                and abs(across) <= ground.boxes[i, number, HALF_Y]
+            ):
+                upper = ground.boxes[i, number, TOP] + ground.boxes[i, number, SLOPE] * along
+                if upper > top:
+                    top, box = upper, number
+    return top, box
+
+
+@compiled_inline
+def _highest(i: int, x: float, y: float, ground: SpatialWindows) -> tuple[float, int]:
+    """As `_fixed`, but with moving boxes, which are numbered on from B."""
+    top, box = _fixed(i, x, y, ground)
+    for k in range(ground.mover_top.shape[1]):
+        middle_x, middle_y = _mover_middle(i, k, ground)
+        if (
+            abs(x - middle_x) <= ground.mover_half_size[i, k, 0]
+            and abs(y - middle_y) <= ground.mover_half_size[i, k, 1]
+            and ground.mover_top[i, k] > top
+        ):
+            top, box = ground.mover_top[i, k], ground.boxes.shape[1] + k
+    return top, box
+
+
+@compiled_inline
+def _velocity_of(i: int, box: int, ground: SpatialWindows) -> tuple[float, float]:
+    """Horizontal velocity of the surface of a box, m/s, by the number that `_highest` gives it."""
+    if box >= ground.boxes.shape[1]:
+        k = box - ground.boxes.shape[1]
+        speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+        return speed * ground.mover_axis[i, k, 0], speed * ground.mover_axis[i, k, 1]
+    if box >= 0 and ground.box_velocity.shape[1]:
+        return ground.box_velocity[i, box, 0], ground.box_velocity[i, box, 1]
+    return 0.0, 0.0
+
+
+@compiled_inline
+def _mover_middle(i: int, k: int, ground: SpatialWindows) -> tuple[float, float]:
+    """Middle of a moving box, m."""
+    distance = ground.mover_distance[i, k]
+    return (
+        ground.mover_start[i, k, 0] + distance * ground.mover_axis[i, k, 0],
+        ground.mover_start[i, k, 1] + distance * ground.mover_axis[i, k, 1],
+    )
+
+
+@compiled_inline
+def _on_grid(i: int, x: float, y: float, ground: SpatialWindows) -> float:
+    """Height of the grid at a point, m; see `ground.triangles`."""
+    u = (x - (ground.centre[i, 0] - HALF)) * _CELLS_PER_METRE
+    v = (y - (ground.centre[i, 1] - HALF)) * _CELLS_PER_METRE
+    column, u = _cell(u)
+    line, v = _cell(v)
+    cell = column * VERTICES + line
+    # Doubles; Numba's `float` leaves single precision as it is.
+    near, left = np.float64(ground.grid[i, cell]), np.float64(ground.grid[i, cell + 1])
+    cell += VERTICES
+    front, far = np.float64(ground.grid[i, cell]), np.float64(ground.grid[i, cell + 1])
+    # A plane through three vertices and, beyond the diagonal, what the fourth is off it.
+    off = far + near - front - left
+    beyond = u + v - 1.0
+    above = near + u * (front - near) + v * (left - near)
+    return above + (beyond * off if beyond > 0.0 else 0.0)
+
+
+@compiled_inline
+def _cell(position: float) -> tuple[int, float]:
+    """Number of a cell of the grid and where in it a position lies, in cells; NaN stays NaN."""
+    if position > _LAST:
+        position = _LAST
+    elif position < 0.0:
+        position = 0.0
+    cell = int(position) if position > 0.0 else 0
+    return cell, position - cell
+
+
+@compiled_inline
+def bin_of(distance: float, count: int) -> int:
+    """Number of the bin at a distance from the rim of a window, m."""
+    position = distance * (count / (2 * HALF))
+    if not position > 0.0:  # nor is it a number
+        return 0
+    return int(position) if position < count else count - 1
+
+
+@compiled_inline
+def _sample(u: int, v: int, x: float, y: float, cosine: float, sine: float) -> tuple[float, float]:
+    """Where a sample of a map lies, m."""
+    return (
+        x + cosine * _FORWARD[u] + sine * _RIGHT[v],
+        y + sine * _FORWARD[u] - cosine * _RIGHT[v],
+    )
+
+
+@compiled
+def _seen_part(
+    i: int, k: int, x: float, y: float, cosine: float, sine: float, ground: SpatialWindows
+) -> tuple[int, int, int, int]:
+    """Which samples of a map may lie on a moving box: begin and end of u, begin and end of v."""
+    half_x, half_y = ground.mover_half_size[i, k, 0], ground.mover_half_size[i, k, 1]
+    if half_x < 0.0:
+        return 0, 0, 0, 0
+    middle_x, middle_y = _mover_middle(i, k, ground)
+    away_x, away_y = middle_x - x, middle_y - y
+    u = (cosine * away_x + sine * away_y - _BEHIND) * _PER_METRE_AHEAD
+    v = (sine * away_x - cosine * away_y + ASIDE) * _PER_METRE_ASIDE
+    reach = math.hypot(half_x, half_y) * _PER_METRE + 1.0
+    if not (-reach < u < SAMPLES + reach and -reach < v < SAMPLES + reach):
+        return 0, 0, 0, 0
+    return (
+        max(int(u - reach), 0),
+        min(int(u + reach) + 1, SAMPLES),
+        max(int(v - reach), 0),
+        min(int(v + reach) + 1, SAMPLES),
+    )
+
+
+@compiled_inline
+def _turned(
+    east: float, north: float, under: tuple[float, float], cosine: float, sine: float
+) -> tuple[float, float]:
+    """A velocity relative to that under the character, along the heading and to the right of it."""
+    east, north = east - under[0], north - under[1]
+    return cosine * east + sine * north, sine * east - cosine * north

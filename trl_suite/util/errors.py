@@ -1,0 +1,85 @@
+"""Sentences for bad input: what it was, what was expected, and the nearest valid choice."""
+
+import collections.abc
+import difflib
+import numbers
+import types
+import typing
+from collections.abc import Iterable
+
+import numpy as np
+
+LIKE, ALIKE = 0.6, 0.4  # shares of two names that must agree, see `difflib`
+FEW = 20  # names that may all be listed where none is like the one given
+MANY = 40  # names; of more only some are listed
+KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # what an annotation takes, in words
+    bool: ((bool, np.bool_), 'True or False', 'bools'),
+    int: ((numbers.Integral,), 'a whole number', 'whole numbers'),
+    float: ((numbers.Real,), 'a number', 'numbers'),
+    str: ((str,), 'a string', 'strings'),
+    types.NoneType: ((types.NoneType,), 'None', 'None'),
+}
+
+
+def unknown(kind: str, name: object, choices: Iterable[str]) -> str:
+    """Returns a message for an unknown name, with its closest matches among `choices`."""
+    known = sorted(choices)
+    cutoff = LIKE if len(known) <= FEW else ALIKE  # few can all be told instead
+    near = difflib.get_close_matches(str(name), known, n=3, cutoff=cutoff)
+    if not near:
+        lowered = {choice.lower(): choice for choice in known}
+        near = [
+            lowered[match]
+            for match in difflib.get_close_matches(str(name).lower(), lowered, n=3, cutoff=cutoff)
+        ]
+    if not near and str(name):
+        near = [choice for choice in known if choice.startswith(str(name))][:3]
+    hint = f'did you mean {" or ".join(map(repr, near))}?' if near else f'known: {_listed(known)}'
+    return f'unknown {kind} {name!r}; {hint}'
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) <= MANY:
+        return ', '.join(names)
+    return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
+
+
+def check_kind(name: str, value: object, hint: object) -> None:
+    """Checks an option by the annotation of what takes it, before that stumbles over it.
+
+    Args:
+      name: of the option.
+      value: what is given; it passes where the annotation says nothing here.
+      hint: the annotation.
+
+    Raises:
+      ValueError: the value is of another kind; the message has the name, and what was expected.
+    """
+    choices = _choices(hint)
+    if not any(_fits(value, choice) for choice in choices):
+        expected = ' or '.join(dict.fromkeys(map(_words, choices)))
+        raise ValueError(f'{name} is {value!r}; expected {expected}')
+
+
+def _choices(hint: object) -> tuple[object, ...]:
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return typing.get_args(hint) if union else (hint,)
+
+
+def _fits(value: object, hint: object) -> bool:
+    if hint in KINDS:
+        if not isinstance(value, KINDS[hint][0]) or value != value:  # NaN
+            return False
+        return hint is bool or not isinstance(value, bool)
+    if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
+        (inner,) = typing.get_args(hint)
+        return isinstance(value, Iterable) and all(_fits(each, inner) for each in value)
+    return True
+
+
+def _words(hint: object, many: bool = False) -> str:
+    if hint in KINDS:
+        _, one, more = KINDS[hint]
+        return more if many else one
+    inner = ''.join(f' of {_words(each, many=True)}' for each in typing.get_args(hint)[:1])
+    return f'lists{inner}' if many else f'a list{inner}'

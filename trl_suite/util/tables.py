@@ -1,0 +1,111 @@
+"""Sections of paragraphs and tables, as text for a terminal or as Markdown."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+WIDTH = 100  # characters of a line of text
+
+
+class Table(NamedTuple):
+    """Cells in rows under a header.
+
+    Attributes:
+      header: title of each column.
+      cells: rows of numbers and texts.
+      numbered: whether rows are entries of a vector, which Markdown numbers.
+    """
+
+    header: Sequence[str]
+    cells: Sequence[Sequence[object]]
+    numbered: bool = False
+
+
+Part = Table | str  # a str is a paragraph, or items '- ...' on lines of their own
+
+
+class Section(NamedTuple):
+    """A title, and what is below it."""
+
+    title: str
+    parts: tuple[Part, ...]
+
+
+def section(title: str, *parts: Part) -> Section:
+    """Returns a section of some parts."""
+    return Section(title, parts)
+
+
+def text(parts: Iterable[Part]) -> str:
+    """Returns parts as lines for a terminal, indented by two spaces."""
+    return '\n'.join(
+        table(part.header, part.cells)
+        if isinstance(part, Table)
+        else '\n'.join(map(_fold, part.split('\n')))
+        for part in parts
+    )
+
+
+def markdown(parts: Iterable[Part]) -> str:
+    """Returns parts as Markdown, with empty lines between them."""
+    return '\n\n'.join(
+        markdown_table(part) if isinstance(part, Table) else escape(part) for part in parts
+    )
+
+
+def table(header: Sequence[str], cells: Iterable[Sequence[object]], indent: str = '  ') -> str:
+    """Aligns cells in columns, numbers to the right."""
+    rows = [[_cell(c) for c in row] for row in cells]
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    right = _numeric(columns)
+    return '\n'.join(
+        indent
+        + '  '.join(
+            cell.rjust(width) if to_right else cell.ljust(width)
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        ).rstrip()
+        for row in (list(header), *rows)
+    )
+
+
+def markdown_table(table: Table, plain: bool = False) -> str:
+    """Returns a table as Markdown.
+
+    Args:
+      table: what to write.
+      plain: whether cells are Markdown already, as links are.
+    """
+    header, rows = list(table.header), [[_cell(c) for c in row] for row in table.cells]
+    if table.numbered:
+        header, rows = (
+            ['index', *header],
+            [[str(i), *row] for i, row in enumerate(rows)],
+        )
+    right = _numeric(list(zip(header, *rows, strict=True)))
+    if not plain:
+        rows = [list(map(escape, row)) for row in rows]
+    lines = [header, ['--:' if to_right else '---' for to_right in right], *rows]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def escape(text: str) -> str:
+    """Returns Markdown that reads as the text does."""
+    return re.sub(r'([*|`\\])', r'\\\1', text).replace('<', '&lt;')
+
+
+def _cell(value: object) -> str:
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
+
+
+def _numeric(columns: Iterable[Sequence[str]]) -> list[bool]:
+    """Returns which columns hold numbers only, below their titles."""
+    number = re.compile(r'([-+]?\d[-+.\de]*)?')
+    return [all(number.fullmatch(cell) for cell in column[1:]) for column in columns]
+
+
+def _fold(line: str) -> str:
+    return textwrap.fill(line, WIDTH, initial_indent='  ', subsequent_indent='  ')

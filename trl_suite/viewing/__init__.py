@@ -1,0 +1,1 @@
+"""What one looks at: frames, videos, film strips, plots, windows."""

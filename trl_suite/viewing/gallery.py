@@ -1,0 +1,365 @@
+"""Re-makes all pictures: environments, terrains, characters, learning curves, and the suite at once.
+
+    trl-suite gallery --output gallery --filter '*Dog2D*'
+
+Files, FOLDER/...: environments/ID.jpg, a film strip; curves/ID.png, of a policy that is shipped;
+terrains/NAME.png, or .jpg in three dimensions; characters/NAME.jpg; families/NAME.jpg; suite.jpg. At
+most about 40 kB each, but for the last one and some maps. What is there stays, unless asked otherwise or the policy
+that it shows has been replaced.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fnmatch
+import functools
+import hashlib
+import io
+import itertools
+import json
+import pathlib
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import tqdm
+
+from trl_suite import characters, motion, policies, rendering, suite
+from trl_suite import terrain as terrains
+from trl_suite.environments import named_policies as acting
+from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
+from trl_suite.registry.build import task_type
+from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.util import files, resources
+
+LARGEST = 40_000  # bytes of a picture
+QUALITIES = (85, 75, 65, 55, 45, 35)  # of JPEG, until it is small enough
+COLOURS = 64  # of a palette
+SEED = 1  # of every environment
+SECONDS, LONGER = 4.0, 12.0  # that a film strip covers; of plans
+# Episodes and times that show what an environment is about, where its first seconds do not: seed,
+# begin and end in s, camera.
+SCENES = {
+    'PD_Biped3D_HLC_Soccer-v0': (8, 6.0, 16.0, 'back'),
+    'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0, 8.5, 'back'),
+    'PD_Biped3D_HLC_Conveyors-v0': (2, 21.5, 31.5, 'back'),
+    'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 9.0, 18.0, 'back'),
+}
+COLUMNS = 6  # pictures of a film strip
+STRIP_SIZE = (180, 240)  # height and width of each, pixels
+CHARACTER_SIZE = (360, 480)
+TERRAIN_LENGTH = {False: 24.0, True: 60.0}  # m; in the plane, in space
+CLOSE_LENGTH = 12.0  # m; of ground whose features are small
+CLOSE = ('var3d_checkers', 'var3d_ramp', 'var3d_stairs')
+TERRAIN_DRAWS = 2
+FRAME = 1 / 30  # s between two moments that could be drawn
+# What a family and the suite look like: id and time, s.
+FAMILIES = {
+    'imitation': ('PD_Raptor2D_LLC_Imitate_Flat-v0', 2.0),
+    'plaid': ('PD_Biped2D_Gaps_Terrain-v0', 2.0),
+    'terrainrl': ('FSM_Dog2D_Terrain_Gaps-v0', 1.6),
+    'deeploco': ('PD_Biped3D_HLC_Soccer-v0', 12.0),
+}
+SUITE = (
+    (('PD_Biped2D_Walls_Terrain-v0', 3.0), ('PD_Dog2D_Slopes_Mixed_Terrain-v0', 0.7),
+     ('FSM_Raptor2D_Terrain_Cliffs-v0', 2.0)),
+    (('FSM_Goat2D_Terrain_Variable_Steps-v0', 1.0), ('PD_Biped3D_HLC_Forest-v0', 5.0),
+     ('PD_Biped3D_HLC_Soccer-v0', 12.0)),
+)  # fmt: skip
+SUITE_SIZE, SUITE_LARGEST = (240, 320), 120_000  # pixels of each picture; bytes
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """One picture that can be made.
+
+    Attributes:
+      path: below the folder, with / between parts.
+      draw: returns it, (h, w, 3) uint8.
+      source: digest of what it shows, '' if that stays the same.
+      largest: how many bytes it may have.
+    """
+
+    path: str
+    draw: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+    source: str = ''
+    largest: int = LARGEST
+
+
+def items() -> Iterator[Item]:
+    """Yields all pictures of the gallery."""
+    yield Item('suite.jpg', together, largest=SUITE_LARGEST)
+    for name, scene in FAMILIES.items():
+        yield Item(f'families/{name}.jpg', functools.partial(moment, *scene))
+    for name in characters.CHARACTERS:
+        yield Item(character_path(name), functools.partial(character, name))
+    for name in (*terrains.PRESETS, *terrains.PRESETS3D):
+        yield Item(terrain_path(name), functools.partial(terrain, name))
+    shipped = policies.available()
+    for id in catalogue.BY_ID:
+        policy = _digest(f'{id}.npz') if id in shipped else ''
+        yield Item(strip_path(id), functools.partial(film_strip, id), policy)
+        if record(id):
+            yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
+
+
+def character_path(name: str) -> str:
+    """Returns where the picture of a character lies, below the folder."""
+    return f'characters/{name}.jpg'
+
+
+def terrain_path(name: str) -> str:
+    """Returns where the picture of a preset lies, below the folder."""
+    suffix = 'jpg' if terrains.load(name).spatial else 'png'
+    return f'terrains/{name.replace("/", "_")}.{suffix}'
+
+
+def strip_path(id: str) -> str:
+    """Returns where the film strip of an environment lies, below the folder."""
+    return f'environments/{id}.jpg'
+
+
+def curve_path(id: str) -> str:
+    """Returns where the learning curve of an environment lies, below the folder."""
+    return f'curves/{id}.png'
+
+
+def record(id: str) -> dict[str, Any] | None:
+    """Returns how the policy of an environment was trained (trained/README.md), if it is shipped."""
+    path = resources.directory('trained') / f'{id}.json'
+    return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
+
+
+def _digest(name: str) -> str:
+    content = (resources.directory('trained') / name).read_bytes()
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def make(
+    folder: files.Path, only: str = '*', again: bool = False, progress: bool = True
+) -> tuple[list[pathlib.Path], dict[str, Exception]]:
+    """Makes the pictures that are missing, or that show a policy that has been replaced.
+
+    Args:
+      folder: where; it is made if need be.
+      only: pattern in the manner of a shell, with or without `*` around it, of paths below the folder.
+      again: also make those that are there.
+      progress: show a bar.
+
+    Returns:
+      What was written; and what failed, by path below the folder. One that fails stops no other.
+
+    Raises:
+      ValueError: the pattern matches nothing.
+      RuntimeError: there is no OpenGL to draw with.
+      ImportError: the extra 'video' is not installed.
+      OSError: the folder cannot be made.
+    """
+    folder = pathlib.Path(folder)
+    chosen = [item for item in items() if fnmatch.fnmatch(item.path, f'*{only}*')]
+    if not chosen:
+        raise ValueError(
+            f'no picture matches {only!r}; expected a part of an id or the name of a character, as '
+            "'Dog2D' or 'characters/raptor'"
+        )
+    written: list[pathlib.Path] = []
+    failed: dict[str, Exception] = {}
+    with tqdm.tqdm(chosen, unit='picture', disable=None if progress else True) as bar:
+        for item in bar:
+            path = folder / item.path
+            if path.exists() and not again and item.source in ('', _source(path)):
+                continue
+            bar.set_description(path.name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                save(item.draw(), path, item.source, item.largest)
+                written.append(path)
+            except (ValueError, OSError) as error:
+                failed[item.path] = error
+    return written, failed
+
+
+def character(name: str) -> np.ndarray:
+    """Draws a character: in the first pose of its clip if it has one, else standing straight."""
+    figure = KinematicViewer(name)
+    clip = characters.CHARACTERS[name].clip
+    if clip is not None:
+        figure.put(motion.load(clip).pose(0.0))
+    height, width = CHARACTER_SIZE
+    return figure.picture(height=height, width=width, camera='front')
+
+
+def terrain(terrain: Any) -> np.ndarray:
+    """Plots a terrain; see `rendering.plot_terrain`."""
+    from PIL import Image
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / 'terrain.png'
+        loaded = terrains.load(terrain)
+        rendering.plot_terrain(loaded, path, TERRAIN_DRAWS, terrain_length(loaded))
+        with Image.open(path) as image:
+            return np.asarray(image.convert('RGB'))
+
+
+def terrain_length(terrain: terrains.Terrain) -> float:
+    """Returns how much of a terrain is plotted, m: ahead, or the side of a map."""
+    return CLOSE_LENGTH if terrain.type in CLOSE else TERRAIN_LENGTH[terrain.spatial]
+
+
+def scene(id: str) -> tuple[int, float, float, str]:
+    """Returns what a film strip shows: seed, begin and end (s), camera.
+
+    Plans are seen from behind, with what is ahead, unless obstacles would stand in between.
+    """
+    spec = suite.find(id)
+    if spec.id in SCENES:
+        return SCENES[spec.id]
+    if 'hierarchical' not in spec.tags:
+        return SEED, 0.0, SECONDS, 'side'
+    hidden = 'obstacles' in terrains.load(spec.terrain).type
+    return SEED, 0.0, LONGER, 'above' if hidden else 'back'
+
+
+def film_strip(id: str) -> np.ndarray:
+    """Draws what `scene` says, or until the episode ends, under the best policy: `acting.best`."""
+    moments: list[int] = []
+    _run(id, lambda environment: moments.append(0))  # how many there are until the episode ends
+    first = min(round(scene(id)[1] / FRAME), len(moments) - 1)
+    spread = rendering.spread(len(moments) - first, COLUMNS)
+    images = _draw(id, {first + number for number in spread}, STRIP_SIZE)
+    return rendering.film_strip(images, columns=COLUMNS)
+
+
+def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarray:
+    """Draws one moment of such an episode.
+
+    Args:
+      id: of the environment.
+      time: since its start, s.
+      size: height and width, pixels.
+    """
+    return _draw(id, {round(time / FRAME)}, size)[-1]
+
+
+def together() -> np.ndarray:
+    """Draws moments of several environments, in rows."""
+    rows = [[moment(*scene, SUITE_SIZE) for scene in row] for row in SUITE]
+    strips = [rendering.film_strip(row, columns=len(row)) for row in rows]
+    margin = np.full((rendering.STRIP_MARGIN, *strips[0].shape[1:]), 255, np.uint8)
+    return np.concatenate([part for strip in strips for part in (margin, strip)][1:])
+
+
+def _draw(id: str, wanted: set[int], size: tuple[int, int]) -> list[np.ndarray]:
+    """Draws chosen moments of an episode, FRAME apart."""
+    camera = scene(id)[-1]
+    images: list[np.ndarray] = []
+    number = itertools.count()
+
+    def look(environment: Environment) -> None:
+        if next(number) in wanted:
+            images.append(rendering.frame(environment, *size, camera))
+
+    _run(id, look)
+    return images
+
+
+def _run(id: str, look: Callable[[Environment], None]) -> None:
+    """Runs an episode to the end of the scene, and has `look` called at every moment."""
+    seed, _, seconds, _ = scene(id)
+    environment = suite.make(id, {'random': seed})
+    _, policy = acting.best(environment, id)
+    count = 0
+
+    def seen() -> None:
+        nonlocal count
+        count += 1
+        look(environment)
+
+    time_step = environment.reset()
+    seen()
+    with rendering.watching(environment, seen) as watched:
+        while count * FRAME < seconds and not time_step.last():
+            time_step = environment.step(policy(time_step))
+            if not watched:
+                seen()
+    environment.close()
+
+
+def curve(id: str) -> np.ndarray:
+    """Plots what the policies of all seeds achieved while they learnt, the shipped one in front.
+
+    Raises:
+      ValueError: no policy is shipped.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    found, spec = record(id), suite.find(id)
+    if found is None:
+        raise ValueError(f'no policy is shipped for {id!r}')
+    type_ = task_type(spec)
+    gait = type_ is not None and type_.score == 'distance'
+    value = 'distance' if gait else 'normalized_return'
+    unit, name = (1e6, 'million control steps')
+    if gait or 'hierarchical' in spec.tags:
+        unit, name = 1e3, f'thousand {"decisions" if gait else "plans"}'
+    figure = Figure(figsize=(4.2, 2.4), layout='constrained')
+    axis = figure.subplots()
+    for run in sorted(found['runs'], key=lambda run: run['seed'] == found['shipped']):
+        front = run['seed'] == found['shipped']
+        axis.plot(
+            [point['samples'] / unit for point in run['curve']],
+            [point[value] for point in run['curve']],
+            color='tab:blue' if front else '0.75', linewidth=1.5 if front else 1, marker='.',
+            markersize=3,
+        )  # fmt: skip
+    axis.set(xlabel=name, ylabel='distance (m)' if gait else 'return / maximum', xlim=(0, None))
+    axis.set_ylim(0, None if gait else 1)
+    axis.grid(alpha=0.3)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
+
+
+def save(image: np.ndarray, path: files.Path, source: str = '', largest: int = LARGEST) -> None:
+    """Writes a picture, made small: a .png with a palette, or a .jpg as good as its size allows.
+
+    Args:
+      image: (h, w, 3) uint8.
+      path: where to.
+      source: digest of what it shows, which is kept in the file.
+      largest: how many bytes a .jpg may have, if a quality is low enough for it.
+
+    Raises:
+      ValueError: another suffix.
+      OSError: the file cannot be written.
+    """
+    from PIL import Image, PngImagePlugin
+
+    path = files.check_path(path, ('.png', '.jpg'))
+    picture, content = Image.fromarray(image), io.BytesIO()
+    if path.suffix == '.png':
+        notes = PngImagePlugin.PngInfo()
+        notes.add_text('comment', source)
+        picture.quantize(COLOURS).save(content, 'png', optimize=True, pnginfo=notes)
+    else:
+        for quality in QUALITIES:
+            content = io.BytesIO()
+            picture.save(content, 'jpeg', quality=quality, optimize=True, comment=source)
+            if content.tell() <= largest:
+                break
+    with files.replacing(path) as part:
+        part.write_bytes(content.getvalue())
+
+
+def _source(path: pathlib.Path) -> str:
+    """Returns the digest that `save` has kept in a file, '' if there is none."""
+    from PIL import Image
+
+    with contextlib.suppress(OSError), Image.open(path) as image:
+        kept = image.info.get('comment', '')
+        return kept.decode() if isinstance(kept, bytes) else kept
+    return ''
