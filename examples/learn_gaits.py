@@ -4,15 +4,15 @@
     python examples/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs
 
 The value of each base action in each state is learnt from a replay of transitions (Mnih et al. 2015)
-with returns of several steps, the smaller of two networks' estimates (Fujimoto et al. 2018) and
-averaged target networks. The networks see the ground through 1-D convolutions, relative to the root,
-as those of Peng, Berseth, van de Panne (2016) do. After a fall most simulations go back a few cycles
+with returns of several steps; one network chooses the action whose value an averaged one tells (van
+Hasselt et al. 2016). The networks see the ground through 1-D convolutions, relative to the root, as
+those of Peng, Berseth, van de Panne (2016) do. After a fall most simulations go back a few cycles
 and try again, so that what decides between falling and not is seen often.
 
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command goes on from it as if it had
 never stopped, and with a larger `--samples` for longer), `curve.json` (settings, learning curve),
-`last.npz` (the averaged network so far), and at the end `policy.npz`, after a last phase in which the
-learning rate falls while nothing new is collected. Needs `pip install 'trl_suite[train]'`.
+`last.npz` (the averaged network so far), and at the end `policy.npz`: a new network that learns from
+all transitions, with a falling learning rate. Needs `pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ class Settings:
     learning_rate: float = 3e-4
     weight_decay: float = 1e-2
     polyak: float = 0.005  # share of the new weights in the targets
-    final_updates: int = 5000  # in which the learning rate falls to `final_rate`
+    final_updates: int = 8000  # in which the learning rate falls to `final_rate`
     final_rate: float = 1e-5
     view: float = 6.5  # m ahead that the network sees
-    relief: float = 0.8  # m above or below the usual height under the root that it tells apart
+    relief: float = 1.5  # m above or below the usual height under the root that it tells apart
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
     ground_units: int = 128  # that the convolutions end in
-    hidden: tuple[int, ...] = (256, 128)
+    hidden: tuple[int, ...] = (512, 256)
     write_every: float = 4096  # cycles
     evaluate_every: float = 16384  # cycles
     evaluation_episodes: int = 32
@@ -82,7 +82,6 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Hopper2D_*': {'relief': 2.0},
     'FSM_Goat2D_*': {'relief': 1.6},
 }
-START_NOISE = 0.05  # standard deviations of a layer's weights
 CHOICE_ERROR = 1e-5  # actions are stored as float32
 CLIP = 5.0  # bound of what the networks see, in standard deviations
 _STATE = (
@@ -93,7 +92,7 @@ _STATE = (
 _CHANGEABLE = (
     'samples', 'final_updates', 'final_rate', 'write_every', 'evaluate_every', 'evaluation_episodes',
 )  # fmt: skip
-_PARTS = 'networks', 'targets', 'optimizer'
+_PARTS = 'network', 'target', 'optimizer'
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
@@ -185,15 +184,8 @@ class Learner:
         self.columns = np.r_[heights.start : heights.start + self.line, heights.stop : size]
         # Heights come relative to the ground under the root, and above a gap that is its floor.
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
-        others = len(self.columns) - self.line
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
-        self.networks = nn.ModuleList(
-            Network(self.line, others, len(self.choices), s) for _ in range(2)
-        )
-        self.targets = copy.deepcopy(self.networks).requires_grad_(False)
-        self.optimizer = torch.optim.AdamW(
-            self.networks.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
-        )
+        self.begin_network()
         self.replay = Replay(int(s.capacity), len(self.columns))
         self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
@@ -213,10 +205,17 @@ class Learner:
         # How often each row went back at this place, and the cycles since.
         self.tried = np.zeros((2, n), int)
 
+    def begin_network(self) -> None:
+        """Makes a new network, its average and its optimizer."""
+        s, others = self.settings, len(self.columns) - self.line
+        self.network = Network(self.line, others, len(self.choices), s)
+        self.target = copy.deepcopy(self.network).requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
+        )
+
     def begin_with(self, policy: policies.Policy) -> None:
         """Takes over the weights and scales of a policy that this program has trained.
-
-        The second network differs by `START_NOISE`, as two that are the same would stay the same.
 
         Raises:
           ValueError: its network or its choices are others.
@@ -229,20 +228,14 @@ class Learner:
         ):
             raise ValueError(f'{policy.id} chooses among other base actions')
         self.mean, self.std = policy.mean.astype(float), policy.std.astype(float)
-        for number, network in enumerate(self.networks):
-            parts = [*network.filters, *network.hidden, network.last]
-            weights = [
-                *(w.transpose(2, 1, 0) for w in line.weights),
-                *(w.T for w in policy.weights),
-            ]
-            biases = [*line.biases, *policy.biases]
-            with torch.no_grad():
-                for part, weight, bias in zip(parts, weights, biases, strict=True):
-                    noise = number * START_NOISE * weight.std()
-                    noisy = weight + noise * self.random.standard_normal(weight.shape)
-                    part.weight.copy_(torch.from_numpy(noisy))
-                    part.bias.copy_(torch.tensor(bias))
-        self.targets.load_state_dict(self.networks.state_dict())
+        parts = [*self.network.filters, *self.network.hidden, self.network.last]
+        weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in policy.weights)]
+        biases = [*line.biases, *policy.biases]
+        with torch.no_grad():
+            for part, weight, bias in zip(parts, weights, biases, strict=True):
+                part.weight.copy_(torch.tensor(weight))
+                part.bias.copy_(torch.tensor(bias))
+        self.target.load_state_dict(self.network.state_dict())
 
     def seen(self, observation: np.ndarray) -> torch.Tensor:
         """What the networks see of columns of observations."""
@@ -272,7 +265,7 @@ class Learner:
             chosen = (away**2).sum(2).argmin(1)
         else:
             with torch.no_grad():
-                values = self.networks[0](self.seen(self.observation[:, self.columns]))
+                values = self.network(self.seen(self.observation[:, self.columns]))
             chosen = values.argmax(1).numpy()
             epsilon[self.greedy] = 0.0
         again = (self.tried[0] > 0) & (self.tried[1] < s.retry_cycles)
@@ -330,28 +323,24 @@ class Learner:
         return True
 
     def learn(self) -> None:
-        """Updates both networks once, and the targets."""
+        """Updates the network once, and its average."""
         s, replay = self.settings, self.replay
         picked = self.random.integers(len(replay), size=s.minibatch)
         before, after = self.seen(replay.before[picked]), self.seen(replay.after[picked])
         action = torch.from_numpy(replay.action[picked])[:, None]
-        scale = 1 - s.gamma  # so that values are of the size of a cycle's reward
-        with torch.no_grad():
-            following = torch.minimum(*(target(after) for target in self.targets)).amax(1)
-            reward, discount = (
-                torch.from_numpy(each[picked]) for each in (replay.reward, replay.discount)
-            )
-            aim = scale * reward + discount * following
-        loss = sum(
-            (network(before).gather(1, action)[:, 0] - aim).square().mean()
-            for network in self.networks
+        reward, discount = (
+            torch.from_numpy(each[picked]) for each in (replay.reward, replay.discount)
         )
+        with torch.no_grad():
+            following = self.network(after).argmax(1, keepdim=True)
+            aim = reward + discount * self.target(after).gather(1, following)[:, 0]
+        loss = (self.network(before).gather(1, action)[:, 0] - aim).square().mean()
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(
-                list(self.targets.parameters()), list(self.networks.parameters()), s.polyak
+                list(self.target.parameters()), list(self.network.parameters()), s.polyak
             )
         self.updates += 1
         self.loss += (float(loss.detach()) - self.loss) / min(self.updates, 1000)
@@ -370,8 +359,12 @@ class Learner:
         self.seconds['learning'] += time.process_time() - middle
 
     def finish(self) -> None:
-        """Updates the networks with a falling learning rate, without collecting."""
+        """Learns with a falling learning rate, without collecting: a new network from the beginning,
+        unless the run began with a policy.
+        """
         s = self.settings
+        if not s.start:
+            self.begin_network()
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
             self.optimizer, s.final_updates, s.final_rate
         )
@@ -390,7 +383,7 @@ class Learner:
                 'biases': tuple(part.bias.numpy().copy() for part in parts),
             }
 
-        environments, network = self.environments, self.targets[0]
+        environments, network = self.environments, self.target
         strides = *(stride for *_, stride in self.settings.convolutions), 1
         return policies.Policy(
             id=environments.spec.id,
