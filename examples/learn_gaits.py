@@ -79,6 +79,7 @@ class Settings:
 
 
 OVERRIDES: dict[str, dict[str, Any]] = {
+    'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 57344},
     'FSM_Hopper2D_*': {'relief': 2.0},
     'FSM_Goat2D_*': {'relief': 1.6},
 }

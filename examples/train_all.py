@@ -88,9 +88,14 @@ def program(id_: str) -> ModuleType:
     return learn_gaits if id_ in LEARNT else search_gaits
 
 
+def start_of(id_: str) -> str | None:
+    """The policy that the training of an environment begins with, if any."""
+    return getattr(program(id_).settings_for(id_), 'start', None)
+
+
 def depth(id_: str) -> int:
     """How many environments a policy has learnt in before it comes to this one."""
-    start = ppo_settings.settings_for(id_).start
+    start = start_of(id_)
     return 1 + depth(start) if start in catalogue.BY_ID else 0
 
 
@@ -198,7 +203,7 @@ def main() -> None:
     ):
         running: dict[concurrent.futures.Future, tuple[str, int]] = {}
         for job in todo:  # each waits only for what was submitted earlier
-            start = ppo_settings.settings_for(job[0]).start
+            start = start_of(job[0])
             before = [future for future, (id_, _) in running.items() if id_ == start]
             running[pool.submit(work, *job, before)] = job
         for done in concurrent.futures.as_completed(running):

@@ -600,7 +600,7 @@ class OptionTest(parameterized.TestCase):
 
     @parameterized.parameters(
         ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
-        ({'base_actions': 'own'}, "unknown base_actions 'own'.*'original'"),
+        ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
         ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
         ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
         ({'start_noise': np.inf}, 'start_noise is inf'), ({'spawn': 'here'}, "'here'"),
