@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import train_all
 
+from trl_suite import policies
 from trl_suite.registry import catalogue, terrainrl
 from trl_suite.util import resources
 
@@ -152,6 +153,21 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
+def shared_rows() -> list[list[str]]:
+    """Policies beyond the terrain that they were trained on."""
+    path = resources.directory('trained') / policies.SHARED
+    rows = []
+    for id_, entry in (json.loads(path.read_text()) if path.exists() else {}).items():
+        own, before = entry['evaluation'], entry['before']
+        low, high = own['distance_interval']
+        rows.append([
+            f'`{id_}`', f'`{entry["policy"]}`', f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
+            f'{own["median_distance"]:.0f}', f'{own["speed"]:.2f}', f'{before["distance"]:.0f}',
+            str(PUBLISHED_DISTANCES.get(id_, '–')), str(own['episodes']),
+        ])  # fmt: skip
+    return rows
+
+
 def footstep_rows() -> list[list[str]]:
     path = resources.directory('trained') / 'footsteps.json'
     if not path.exists():
@@ -207,7 +223,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
         '# What has been learnt',
-        f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is made '
+        f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments. This page is made '
         f'by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
         'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` where a '
         'gait acts, with the settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
@@ -268,6 +284,27 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     '2016',
                     'decisions',
                     'seed',
+                ),
+                rows,
+            ),
+        ]
+    rows = shared_rows()
+    if rows:
+        parts += [
+            '## Gaits on other terrains',
+            'A policy of one terrain on others that training has not seen; before: the mean of the policy '
+            'that there was, or else of the default gait, in the same episodes '
+            '(`examples/share_gaits.py`).',
+            table(
+                (
+                    'environment',
+                    'policy of',
+                    'mean, 95 %',
+                    'median',
+                    'speed',
+                    'before',
+                    '2016',
+                    'episodes',
                 ),
                 rows,
             ),

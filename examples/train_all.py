@@ -34,7 +34,6 @@ from typing import Any
 import learn_gaits
 import numpy as np
 import ppo
-import ppo_settings
 import search_gaits
 import tqdm
 

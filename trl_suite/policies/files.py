@@ -72,6 +72,7 @@ Floats are written as float32, or as float16 where nothing is lost by it.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import io
 import json
@@ -86,6 +87,7 @@ from trl_suite.util import resources
 from trl_suite.util.files import check_path, existing, replacing
 
 FORMAT = 'trl_suite policy'
+SHARED = 'shared.json'  # in trained/; see its README
 VERSION = 1
 # Key in the file -> kinds of dtype, number of axes.
 _FIELDS = {
@@ -233,16 +235,26 @@ def reference(id: str) -> Policy:
             f'no policy is shipped for {id!r}; '
             + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
         )
-    path = resources.directory('trained') / f'{id}.npz'
+    trained_for = _shared().get(id, id)
+    path = resources.directory('trained') / f'{trained_for}.npz'
     policy = load(path)
-    if policy.id != id:
-        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {id!r}")
-    return policy
+    if policy.id != trained_for:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {trained_for!r}")
+    return policy if id == trained_for else dataclasses.replace(policy, id=id)
 
 
 def available() -> tuple[str, ...]:
     """Returns the ids of the environments that have a shipped policy, sorted."""
-    return tuple(sorted(path.stem for path in resources.directory('trained').glob('*.npz')))
+    own = (path.stem for path in resources.directory('trained').glob('*.npz'))
+    return tuple(sorted({*own, *_shared()}))
+
+
+def _shared() -> dict[str, str]:
+    """Returns which environments have the policy of another one, and of which."""
+    path = resources.directory('trained') / SHARED
+    if not path.exists():
+        return {}
+    return {id_: entry['policy'] for id_, entry in json.loads(path.read_text()).items()}
 
 
 def _small(value: Any) -> Any:
