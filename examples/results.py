@@ -228,7 +228,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` where a '
         'gait acts, with the settings in its JSON file; `examples/train_all.py` repeats them. Of several seeds the best one is '
         'shipped: `suite.reference_policy(id)`. What the papers found: [beside the papers](findings.md).',
-        f'Every policy was run without noise for {", ".join(map(str, episodes))} episodes that '
+        f'Every policy was run without noise for {" or ".join(map(str, episodes))} episodes that '
         'neither training nor the choice of a policy along its curve had seen, so that numbers here are not '
         'those of the curves. (The best of several seeds is the best in these same episodes; each of '
         'them is under *Actuation models*.) Return is a fraction of its '

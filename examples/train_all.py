@@ -47,8 +47,7 @@ SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
 GAITS = (  # that are compared with their default gaits
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Gaps-v0',
-    'FSM_Hopper2D_Terrain_Gaps-v0',
+    'FSM_Biped2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Gaps-v0',
 )  # fmt: skip
 
 
