@@ -565,6 +565,7 @@ class ReferenceTest(FolderTest):
         self.assertEqual(policies.available(), (dog, steps))
         own, other = map(policies.reference, (dog, steps))
         self.assertEqual((own.id, other.id), (dog, steps))
+        self.assertEqual([policies.trained_for(id_) for id_ in (dog, steps)], [dog, dog])
         np.testing.assert_array_equal(own.weights[0], other.weights[0])
 
     def test_none_at_all(self):

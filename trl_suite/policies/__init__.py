@@ -1,6 +1,6 @@
 """Trained policies as data: small networks in .npz files, run with NumPy alone."""
 
-from trl_suite.policies.files import SHARED, available, load, reference, save
+from trl_suite.policies.files import SHARED, available, load, reference, save, trained_for
 from trl_suite.policies.network import ACTIVATIONS, Convolution, Policy, placed
 
 __all__ = [
@@ -13,4 +13,5 @@ __all__ = [
     'placed',
     'reference',
     'save',
+    'trained_for',
 ]

@@ -235,18 +235,23 @@ def reference(id: str) -> Policy:
             f'no policy is shipped for {id!r}; '
             + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
         )
-    trained_for = _shared().get(id, id)
-    path = resources.directory('trained') / f'{trained_for}.npz'
+    other = trained_for(id)
+    path = resources.directory('trained') / f'{other}.npz'
     policy = load(path)
-    if policy.id != trained_for:
-        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {trained_for!r}")
-    return policy if id == trained_for else dataclasses.replace(policy, id=id)
+    if policy.id != other:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {other!r}")
+    return policy if id == other else dataclasses.replace(policy, id=id)
 
 
 def available() -> tuple[str, ...]:
     """Returns the ids of the environments that have a shipped policy, sorted."""
     own = (path.stem for path in resources.directory('trained').glob('*.npz'))
     return tuple(sorted({*own, *_shared()}))
+
+
+def trained_for(id: str) -> str:
+    """Returns the environment whose policy an environment is shipped with: mostly itself."""
+    return _shared().get(id, id)
 
 
 def _shared() -> dict[str, str]:

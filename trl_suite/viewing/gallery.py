@@ -100,7 +100,7 @@ def items() -> Iterator[Item]:
         yield Item(terrain_path(name), functools.partial(terrain, name))
     shipped = policies.available()
     for id in catalogue.BY_ID:
-        policy = _digest(f'{id}.npz') if id in shipped else ''
+        policy = _digest(f'{policies.trained_for(id)}.npz') if id in shipped else ''
         yield Item(strip_path(id), functools.partial(film_strip, id), policy)
         if record(id):
             yield Item(curve_path(id), functools.partial(curve, id), _digest(f'{id}.json'))
