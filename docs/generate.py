@@ -230,7 +230,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
-    unit, searched = task_type(spec).samples, task_type(spec).score == 'distance'
+    unit, searched = task_type(spec).samples, 'cycles' in run['settings']
     trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
     if searched:
