@@ -458,9 +458,9 @@ def solved() -> str:
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
-        'Medians over the shipped policies of each family, each evaluated without noise in 50 '
-        'episodes: the return divided by its maximum, the share of episodes that lasted to the end, '
-        'and the mean distance.'
+        'Medians over the trained policies of each family, each evaluated without noise in 50 '
+        'episodes (gaits: 200): the return divided by its maximum, the share of episodes that lasted '
+        'to the end, and the mean distance.'
     )
     header = ('family', 'trained', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'

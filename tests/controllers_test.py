@@ -209,8 +209,8 @@ class ParametersTest(parameterized.TestCase):
             ("unknown parameter 'gain'.*'Gain'", {'absolute': ['gain']}),
             ("unknown kind of gait 'hopp'.*'hop'", {'kind': 'hopp'}),
             ("unknown parameter of a state 'Hp'.*'Hip'", {'targets': {'Hp': ['hip']}}),
-            ('as many joints', {'legs': [['hip'], ['hip', 'leg']], 'feet': ['leg', 'leg']}),
-            ('a foot each', {'feet': []}),
+            ('same number of joints', {'legs': [['hip'], ['hip', 'leg']], 'feet': ['leg', 'leg']}),
+            ('one foot for each', {'feet': []}),
         ):
             with self.assertRaisesRegex(ValueError, message):
                 parameters.read({**good, **change})
