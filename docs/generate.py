@@ -230,7 +230,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
-    unit, searched = task_type(spec).samples, task_type(spec).score == 'distance'
+    unit, searched = task_type(spec).samples, 'cycles' in run['settings']
     trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
     if searched:
@@ -458,9 +458,9 @@ def solved() -> str:
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
-        'Medians over the shipped policies of each family, each evaluated without noise in 50 '
-        'episodes: the return divided by its maximum, the share of episodes that lasted to the end, '
-        'and the mean distance.'
+        'Medians over the trained policies of each family, each evaluated without noise in 50 '
+        'episodes (gaits: 200): the return divided by its maximum, the share of episodes that lasted '
+        'to the end, and the mean distance.'
     )
     header = ('family', 'trained', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'

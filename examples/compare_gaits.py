@@ -36,12 +36,14 @@ def main() -> None:
     arguments = parser.parse_args()
     path = resources.directory('trained') / 'default_gaits.json'
     stored = json.loads(path.read_text()) if path.exists() else {}
-    episodes = train_all.EPISODES, train_all.SEED, arguments.threads
+    episodes = train_all.GAIT_EPISODES, train_all.SEED, arguments.threads
     for id_ in arguments.ids or train_all.GAITS:
         if arguments.policy is None and not path.with_name(f'{id_}.json').exists():
             print(f'{id_}: no policy')
             continue
-        print(f'{id_}: median distance (quartiles) of {train_all.EPISODES} episodes', flush=True)
+        print(
+            f'{id_}: median distance (quartiles) of {train_all.GAIT_EPISODES} episodes', flush=True
+        )
         default = evaluation.evaluate(id_, evaluation.zero, *episodes, factory=True)
         print(line('default gait', default), flush=True)
         if arguments.policy is None:

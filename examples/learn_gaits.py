@@ -4,17 +4,17 @@
     python examples/learn_gaits.py FSM_Raptor2D_Terrain_Mixed-v0 --samples 1e6 --output runs
 
 The value of each base action is learnt from a replay buffer (Mnih et al. 2015) with multi-step
-returns, the smaller of two networks' estimates (Fujimoto et al. 2018) and averaged target networks.
-The networks process ground heights relative to the root with 1-D convolutions, as those of Peng,
-Berseth, van de Panne (2016) do. After a fall most simulations return to a state a few cycles
-earlier and continue with other actions, so that the replay contains many states in which the action
-decides about a fall.
+returns and double Q-learning: the network selects the action that the averaged target network
+evaluates (van Hasselt et al. 2016). The networks process ground heights relative to the root with
+1-D convolutions, as those of Peng, Berseth, van de Panne (2016) do. After a fall most simulations
+return to a state a few cycles earlier and continue with other actions, so that the replay contains
+many states in which the action decides about a fall.
 
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
 identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
-curve), `last.npz` (the current averaged network), and at the end `policy.npz`, after a final phase
-in which the learning rate falls and no samples are collected. Needs
-`pip install 'trl_suite[train]'`.
+curve), `last.npz` (the current averaged network), and at the end `policy.npz`: the result of a final
+phase without new samples, in which a new network learns from the replay with a falling learning rate
+(with `--start` the same network continues). Needs `pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class Settings:
 
     samples: float = 2e5  # cycles
     num_envs: int = 64
-    expert_cycles: float = (
-        8e3  # first cycles, with actions of the shipped policy, or else random base actions
-    )
+    start: str = ''  # environment, or file, of the initial policy; '': none
+    # First cycles, with actions of the initial or the shipped policy, or else random base actions.
+    expert_cycles: float = 8e3
     expert_epsilon: float = 0.15  # share of random actions in these cycles
     begin: float = 2e3  # cycles before learning begins; they determine the observation scales
     epsilon: float = 0.08  # share of random actions after `expert_cycles`
@@ -71,25 +71,27 @@ class Settings:
     updates: int = 16  # per cycle of all simulations
     learning_rate: float = 3e-4
     weight_decay: float = 1e-2
-    polyak: float = 0.005  # weight of the new weights in the target networks
-    final_updates: int = 5000  # updates in which the learning rate falls to `final_rate`
+    polyak: float = 0.005  # weight of the new weights in the target network
+    final_updates: int = 8000  # updates in which the learning rate falls to `final_rate`
     final_rate: float = 1e-5
     view: float = 6.5  # m; distance of the farthest ground height in the input
     relief: float = (
-        0.8  # m; heights relative to the root are clipped at this deviation from the mean
+        1.5  # m; heights relative to the root are clipped at this deviation from the mean
     )
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
     ground_units: int = 128  # units of the layer after the convolutions
-    hidden: tuple[int, ...] = (256, 128)
+    hidden: tuple[int, ...] = (512, 256)
     write_every: float = 4096  # cycles
     evaluate_every: float = 16384  # cycles
     evaluation_episodes: int = 32
 
 
 OVERRIDES: dict[str, dict[str, Any]] = {
+    'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 57344},
     'FSM_Hopper2D_*': {'relief': 2.0},
     'FSM_Goat2D_*': {'relief': 1.6},
 }
+CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hold as float32
 CLIP = 5.0  # bound of the networks' inputs, in standard deviations
 _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
@@ -99,7 +101,7 @@ _STATE = (
 _CHANGEABLE = (
     'samples', 'final_updates', 'final_rate', 'write_every', 'evaluate_every', 'evaluation_episodes',
 )  # fmt: skip
-_PARTS = 'networks', 'targets', 'optimizer'
+_PARTS = 'network', 'target', 'optimizer'
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
@@ -178,8 +180,9 @@ class Learner:
         self.settings, self.seed, self.threads = settings, seed, threads
         s, n = settings, settings.num_envs
         self.random = np.random.default_rng(seed)
+        seeds = self.random.integers(2**32, size=n).tolist()  # different from those of evaluations
         self.environments = VectorEnvironment(
-            id_, n, threads, seed, autoreset='disabled', step_limit=None
+            id_, n, threads, seeds, autoreset='disabled', step_limit=None
         )
         environments = self.environments
         parameters = environments.task.gait.parameters
@@ -191,17 +194,14 @@ class Learner:
         # Observed heights are relative to the ground under the root, which above a gap is its
         # floor.
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
-        others = len(self.columns) - self.line
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
-        self.networks = nn.ModuleList(
-            Network(self.line, others, len(self.choices), s) for _ in range(2)
-        )
-        self.targets = copy.deepcopy(self.networks).requires_grad_(False)
-        self.optimizer = torch.optim.AdamW(
-            self.networks.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
-        )
+        self.begin_network()
         self.replay = Replay(int(s.capacity), len(self.columns))
         self.expert = policies.reference(id_) if id_ in policies.available() else None
+        if s.start:
+            shipped = s.start in policies.available()
+            self.expert = (policies.reference if shipped else policies.load)(s.start)
+            self.begin_with(self.expert)
         self.samples = self.updates = 0
         self.loss = 0.0
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
@@ -214,6 +214,42 @@ class Learner:
         self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
         # Of each simulation: retries in a row, and cycles since the last one.
         self.tried = np.zeros((2, n), int)
+
+    def begin_network(self) -> None:
+        """Makes a new network, its target network and its optimizer."""
+        s, others = self.settings, len(self.columns) - self.line
+        self.network = Network(self.line, others, len(self.choices), s)
+        self.target = copy.deepcopy(self.network).requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
+        )
+
+    def begin_with(self, policy: policies.Policy) -> None:
+        """Copies the weights and scales of a policy that this program has trained.
+
+        Raises:
+          ValueError: its inputs or its base actions differ.
+        """
+        line = policy.convolution
+        if line is None or not np.array_equal(policy.columns, self.columns):
+            raise ValueError(
+                f'the network of {policy.id} has other inputs; expected one that learn_gaits.py trained'
+            )
+        if policy.choices.shape != self.choices.shape or (
+            np.abs(policy.choices - self.choices).max() > CHOICE_ERROR
+        ):
+            raise ValueError(
+                f'{policy.id} selects among other base actions than this environment has'
+            )
+        self.mean, self.std = policy.mean.astype(float), policy.std.astype(float)
+        parts = [*self.network.filters, *self.network.hidden, self.network.last]
+        weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in policy.weights)]
+        biases = [*line.biases, *policy.biases]
+        with torch.no_grad():
+            for part, weight, bias in zip(parts, weights, biases, strict=True):
+                part.weight.copy_(torch.tensor(weight))
+                part.bias.copy_(torch.tensor(bias))
+        self.target.load_state_dict(self.network.state_dict())
 
     def seen(self, observation: np.ndarray) -> torch.Tensor:
         """Returns the networks' inputs for columns of observations."""
@@ -243,7 +279,7 @@ class Learner:
             chosen = (away**2).sum(2).argmin(1)
         else:
             with torch.no_grad():
-                values = self.networks[0](self.seen(self.observation[:, self.columns]))
+                values = self.network(self.seen(self.observation[:, self.columns]))
             chosen = values.argmax(1).numpy()
             epsilon[self.greedy] = 0.0
         again = (self.tried[0] > 0) & (self.tried[1] < s.retry_cycles)
@@ -301,28 +337,24 @@ class Learner:
         return True
 
     def learn(self) -> None:
-        """Updates both networks once, and the target networks."""
+        """Updates the network once, and the target network."""
         s, replay = self.settings, self.replay
         picked = self.random.integers(len(replay), size=s.minibatch)
         before, after = self.seen(replay.before[picked]), self.seen(replay.after[picked])
         action = torch.from_numpy(replay.action[picked])[:, None]
-        scale = 1 - s.gamma  # scales values to the size of a cycle's reward
-        with torch.no_grad():
-            following = torch.minimum(*(target(after) for target in self.targets)).amax(1)
-            reward, discount = (
-                torch.from_numpy(each[picked]) for each in (replay.reward, replay.discount)
-            )
-            aim = scale * reward + discount * following
-        loss = sum(
-            (network(before).gather(1, action)[:, 0] - aim).square().mean()
-            for network in self.networks
+        reward, discount = (
+            torch.from_numpy(each[picked]) for each in (replay.reward, replay.discount)
         )
+        with torch.no_grad():
+            following = self.network(after).argmax(1, keepdim=True)
+            aim = reward + discount * self.target(after).gather(1, following)[:, 0]
+        loss = (self.network(before).gather(1, action)[:, 0] - aim).square().mean()
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(
-                list(self.targets.parameters()), list(self.networks.parameters()), s.polyak
+                list(self.target.parameters()), list(self.network.parameters()), s.polyak
             )
         self.updates += 1
         self.loss += (float(loss.detach()) - self.loss) / min(self.updates, 1000)
@@ -332,7 +364,7 @@ class Learner:
         begin, before, s = time.process_time(), self.samples, self.settings
         self.collect()
         middle = time.process_time()
-        if before < s.begin <= self.samples:
+        if before < s.begin <= self.samples and not s.start:
             self.set_scales()
         if self.samples >= s.begin:
             for _ in range(s.updates):
@@ -341,8 +373,13 @@ class Learner:
         self.seconds['learning'] += time.process_time() - middle
 
     def finish(self) -> None:
-        """Updates the networks with a falling learning rate, without new samples."""
+        """Learns with a falling learning rate, without new samples.
+
+        A new network learns from the replay, unless the run began with a policy.
+        """
         s = self.settings
+        if not s.start:
+            self.begin_network()
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
             self.optimizer, s.final_updates, s.final_rate
         )
@@ -353,7 +390,7 @@ class Learner:
         self.seconds['learning'] += time.process_time() - begin
 
     def exported(self) -> policies.Policy:
-        """Returns the first target network as a policy without PyTorch."""
+        """Returns the target network as a policy without PyTorch."""
 
         def arrays(parts: nn.ModuleList, axes: tuple[int, ...]) -> dict[str, Any]:
             return {
@@ -361,7 +398,7 @@ class Learner:
                 'biases': tuple(part.bias.numpy().copy() for part in parts),
             }
 
-        environments, network = self.environments, self.targets[0]
+        environments, network = self.environments, self.target
         strides = *(stride for *_, stride in self.settings.convolutions), 1
         return policies.Policy(
             id=environments.spec.id,

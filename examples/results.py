@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import train_all
 
-from trl_suite.registry import catalogue
+from trl_suite import policies
+from trl_suite.registry import catalogue, terrainrl
 from trl_suite.util import resources
 from trl_suite.util.program import begin_script
 
@@ -141,16 +142,29 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
         own, default = (
             float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
         )
-        published, to_fall = PUBLISHED_DISTANCES.get(id_), '–'
-        if far := run.get('to_first_fall'):
-            low, high = far['distance_interval']
-            to_fall = f'{far["distance"]:.0f} ({low:.0f} to {high:.0f})'
+        published = PUBLISHED_DISTANCES.get(id_)
+        low, high = run['evaluation']['distance_interval']
         rows.append([
             f'`{id_}`', f'{own:.1f}', f'{default:.1f}', f'{own / default:.1f}',
-            f'{run["evaluation"]["distance"]:.1f}', f'{stored[id_]["distance"]:.1f}',
-            to_fall,
+            f'{run["evaluation"]["distance"]:.1f} ({low:.1f} to {high:.1f})',
+            f'{stored[id_]["distance"]:.1f}', f'{run["evaluation"]["speed"]:.2f}',
             f'{published}' if published else '–',
             f'{run["curve"][-1]["samples"] / 1e3:.0f} k', str(run['seed']),
+        ])  # fmt: skip
+    return rows
+
+
+def shared_rows() -> list[list[str]]:
+    """Returns the results of policies on terrains on which they were not trained."""
+    path = resources.directory('trained') / policies.SHARED
+    rows = []
+    for id_, entry in (json.loads(path.read_text()) if path.exists() else {}).items():
+        own, before = entry['evaluation'], entry['before']
+        low, high = own['distance_interval']
+        rows.append([
+            f'`{id_}`', f'`{entry["policy"]}`', f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
+            f'{own["median_distance"]:.0f}', f'{own["speed"]:.2f}', f'{before["distance"]:.0f}',
+            str(PUBLISHED_DISTANCES.get(id_, '–')), str(own['episodes']),
         ])  # fmt: skip
     return rows
 
@@ -210,13 +224,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     episodes = sorted({run['evaluation']['episodes'] for run in runs})
     parts = [
         '# Results',
-        f'A policy is shipped for {len(entries)} of {len(catalogue.BY_ID)} environments. This page is '
+        f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments. This page is '
         f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
         'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` for gait '
         'environments, with the settings in its JSON file; `examples/train_all.py` repeats them. Of '
         'several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
         '[comparison with the papers](findings.md).',
-        f'Every policy was evaluated without noise in {", ".join(map(str, episodes))} episodes that were '
+        f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes that were '
         'used neither for training nor for the selection of a policy during training; the results '
         'therefore differ from the learning curves. (Of several seeds, the best one was selected in these '
         'episodes; all seeds are listed under *Actuation models*.) *Return* is divided by its maximum; the '
@@ -255,9 +269,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         parts += [
             '## Gaits',
             'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
-            'default gait, in the same episodes, which are truncated after 256 cycles. *To the first '
-            f'fall*: mean of {train_all.FALL_EPISODES} episodes that are truncated only after '
-            f'{train_all.FALL_STEPS} cycles, with its 95 % interval. *Decisions*: with '
+            f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which are truncated after '
+            f'{terrainrl.STEP_LIMIT} cycles; the mean with its 95 % interval; speed in m/s. *Decisions*: with '
             '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
             '`examples/learn_gaits.py`, simulated cycles. *2016*: the mean reported by Peng, Berseth and '
             'van de Panne for about 10 million cycles, in another simulator (quoted from memory, not '
@@ -270,10 +283,30 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'ratio',
                     'mean',
                     'default',
-                    'to the first fall',
+                    'speed',
                     '2016',
                     'decisions',
                     'seed',
+                ),
+                rows,
+            ),
+        ]
+    rows = shared_rows()
+    if rows:
+        parts += [
+            '## Gaits on other terrains',
+            'Policies on terrains on which they were not trained, by `examples/share_gaits.py`. *Before*: '
+            'the mean of the policy that was replaced, or else of the default gait, in the same episodes.',
+            table(
+                (
+                    'environment',
+                    'policy of',
+                    'mean, 95 %',
+                    'median',
+                    'speed',
+                    'before',
+                    '2016',
+                    'episodes',
                 ),
                 rows,
             ),

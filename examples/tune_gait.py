@@ -21,11 +21,9 @@ import argparse
 import dataclasses
 import itertools
 import json
-import os
 import pathlib
-import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -35,7 +33,7 @@ from trl_suite.controllers import CONTROL_TIMESTEP, Parameters, available, load,
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.gait.rules import FRAME, LONGEST_CYCLE, SUBSTEPS
 from trl_suite.tasks.gait.task import GaitTask
-from trl_suite.util import errors
+from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -301,29 +299,55 @@ def search(arguments: argparse.Namespace) -> tuple[np.ndarray, dict[str, Any]]:
     }
 
 
-def write(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Path:
-    """Enters a gait as set 'tuned' and as action 0; the rest of the file is unchanged."""
+def write(character: str, data: dict[str, Any]) -> pathlib.Path:
+    """Writes the parameters of a character's gait: one line per state in a set."""
     path = pathlib.Path(parameters.__file__).parent / f'{character}.json'
-    text = path.read_text()
-    data = json.loads(text)
     misc, width = len(data['misc']), len(data['state_parameters'])
-    values = [repr(float(value)) for value in vector]
-    env_ids = [values[:misc], *(values[i : i + width] for i in range(misc, len(values), width))]
-    body = ',\n'.join('      ' + ', '.join(row) for row in env_ids)
-    entry = f'"tuned": [\n{body}\n    ]'
-    if 'tuned' in data['sets']:
-        text = re.sub(r'"tuned": \[[^\]]*\]', entry, text, count=1)
-    else:
-        text = re.sub(r'\n  \},\n  "base_actions"', f',\n    {entry}\\g<0>', text, count=1)
-    text = re.sub(r'\n  "tuning": \{.*\},(?=\n)', '', text)
-    action_offset = f'"action_offset": "tuned",\n  "tuning": {json.dumps(log)},'
-    text = re.sub(r'"action_offset": [^,]*,', lambda _: action_offset, text, count=1)
-    data['sets']['tuned'] = [float(value) for value in vector]
-    assert json.loads(text) == {**data, 'action_offset': 'tuned', 'tuning': log}
-    part = path.with_name(f'.{character}.part')
-    part.write_text(text)
-    os.replace(part, path)
+
+    def numbers(values: Sequence[float]) -> str:
+        rows = [values[:misc], *(values[i : i + width] for i in range(misc, len(values), width))]
+        lines = ['      ' + json.dumps(list(map(float, row)))[1:-1] for row in rows]
+        return '[\n' + ',\n'.join(lines) + '\n    ]'
+
+    def items(entries: dict[str, Any], shown: Callable[[Any], str] = json.dumps) -> str:
+        lines = [f'    {json.dumps(name)}: {shown(value)}' for name, value in entries.items()]
+        return '{\n' + ',\n'.join(lines) + '\n  }'
+
+    parts = []
+    for name, value in data.items():
+        if name == 'sets':
+            text = items(value, numbers)
+        elif name in ('targets', 'tuning'):
+            text = items(value)
+        elif name == 'start':
+            joints = items(value['joints']).replace('\n', '\n  ')
+            text = items({k: v for k, v in value.items() if k != 'joints'})
+            text = f'{text[:-4]},\n    "joints": {joints}\n  }}'
+        elif name.endswith('base_actions'):
+            lines = ',\n'.join(f'    {json.dumps(each)}' for each in value)
+            text = f'[\n{lines}\n  ]'
+        else:
+            text = json.dumps(value)
+        parts.append(f'  {json.dumps(name)}: {text}')
+    text = '{\n' + ',\n'.join(parts) + '\n}\n'
+    assert json.loads(text) == data
+    with files.replacing(path) as part:
+        part.write_text(text)
     return path
+
+
+def stored(character: str) -> dict[str, Any]:
+    """Returns the contents of the parameter file of a character's gait."""
+    return json.loads((pathlib.Path(parameters.__file__).parent / f'{character}.json').read_text())
+
+
+def enter(character: str, vector: np.ndarray, log: dict[str, Any]) -> pathlib.Path:
+    """Enters a gait as set 'tuned' and as action 0."""
+    data = stored(character)
+    data['sets']['tuned'] = vector.tolist()
+    data['action_offset'] = 'tuned'
+    data.setdefault('tuning', {})['tuned'] = log
+    return write(character, data)
 
 
 def main() -> None:
@@ -377,7 +401,7 @@ def main() -> None:
         parser.error('a search requires exactly one character')
     vector, log = search(arguments)
     print(json.dumps(log))
-    print(write(arguments.characters[0], vector, log))
+    print(enter(arguments.characters[0], vector, log))
     return None
 
 

@@ -1,5 +1,8 @@
 """Tests of the gait state machines: parameters, dynamics, laws and transitions, recomputed."""
 
+import json
+import pathlib
+
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -12,12 +15,13 @@ from trl_suite.controllers import dynamics, machine, parameters
 from trl_suite.engine import BatchWorld, PhysicsWorld, light_model
 
 DT = 1 / 600
+FOLDER = pathlib.Path(parameters.__file__).parent
 NAMES = ('dog', 'goat', 'raptor', 'biped2d_simbicon', 'hopper')
 STRIDERS = ('raptor', 'biped2d_simbicon')
 # Parameters, those of an action, of no state, of each state; base actions; target speed.
 COUNTS = {
-    'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 5, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
-    'biped2d_simbicon': (33, 28, 5, 7, 8, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
+    'dog': (30, 29, 6, 6, 8, 4.0), 'goat': (30, 29, 6, 6, 7, 2.0), 'raptor': (37, 28, 5, 8, 8, 4.0),
+    'biped2d_simbicon': (33, 28, 5, 7, 10, 3.0), 'hopper': (9, 9, 1, 2, 8, 3.0),
 }  # fmt: skip
 # Of base action 0, and the largest deviation of any base action from the action_offset, by name.
 FIGURES = {
@@ -88,6 +92,8 @@ class ParametersTest(parameterized.TestCase):
         self.assertCountEqual(controllers.available(), NAMES)
         with self.assertRaisesRegex(ValueError, "unknown character with a gait 'dgo'.*'dog'"):
             controllers.load('dgo')
+        with self.assertRaisesRegex(ValueError, "unknown base_actions 'orginal'.*'original'"):
+            controllers.load('dog', 'orginal')
 
     @parameterized.parameters(*COUNTS)
     def test_counts(self, name):
@@ -108,8 +114,9 @@ class ParametersTest(parameterized.TestCase):
                 self.assertStartsWith(parameter, f'{state}.')
 
     @parameterized.parameters(*FIGURES)
-    def test_base_actions(self, name):
-        gait = controllers.load(name)
+    def test_base_actions_of_the_original(self, name):
+        gait = controllers.load(name, 'original')
+        self.assertLen(gait.base_actions, len(gait.blends))
         for parameter, (value, action_scale) in FIGURES[name].items():
             place = gait.place(parameter)
             self.assertAlmostEqual(gait.base_actions[0, place], value, places=6, msg=parameter)
@@ -122,14 +129,26 @@ class ParametersTest(parameterized.TestCase):
         idle = np.delete(np.arange(len(gait.names)), gait.actions)
         np.testing.assert_array_equal(gait.action_scale[idle], 0)
 
-    @parameterized.parameters(*NAMES)
-    def test_actions_reach_base_actions(self, name):
-        gait = controllers.load(name)
+    @parameterized.product(name=NAMES, base_actions=('default', 'original'))
+    def test_actions_reach_base_actions(self, name, base_actions):
+        gait = controllers.load(name, base_actions)
         actions = gait.action(gait.base_actions)
         self.assertLessEqual(np.abs(actions).max(), 1 + 1e-12)
         np.testing.assert_allclose(np.abs(actions).max(0), 1, atol=1e-12)  # all are within [-1, 1]
         found = gait.vector(np.clip(actions, -1, 1))
         np.testing.assert_allclose(found, gait.base_actions, atol=1e-9)
+
+    @parameterized.parameters(*NAMES)
+    def test_sets_that_were_tuned(self, name):
+        gait, original = controllers.load(name), controllers.load(name, 'original')
+        np.testing.assert_array_equal(gait.action_offset, original.action_offset)
+        tuned = set(json.loads((FOLDER / f'{name}.json').read_text()).get('tuning', {}))
+        for a, b, _ in original.blends:
+            self.assertNoCommonElements({a, b}, tuned)
+        if gait.blends == original.blends:
+            np.testing.assert_array_equal(gait.base_actions, original.base_actions)
+        else:  # action 0 is the first base action
+            np.testing.assert_array_equal(gait.base_actions[0], gait.action_offset)
 
     def test_action_0_is_the_default_gait(self):
         dog, raptor, hopper = map(controllers.load, ('dog', 'raptor', 'hopper'))

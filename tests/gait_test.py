@@ -538,7 +538,7 @@ class CycleTest(parameterized.TestCase):
 class BaseActionTest(parameterized.TestCase):
     """The discrete interface: a preference per base action, at 30 Hz."""
 
-    @parameterized.parameters(*zip(EXAMPLES, (8, 5, 8, 8, 8), strict=True))
+    @parameterized.parameters(*zip(EXAMPLES, (8, 7, 8, 10, 8), strict=True))
     def test_choices(self, id_, count):
         environment = make(id_, interface='base_action')
         self.assertEqual(environment.action_spec().shape, (count,))
@@ -578,12 +578,29 @@ class BaseActionTest(parameterized.TestCase):
             stumble = 0.2 / (1 + 10 * environment.info['stumbled'] * 30)
             self.assertAlmostEqual(step.reward, 0.8 * np.exp(-0.5 * (4 - speed) ** 2) + stumble)
 
+    def test_base_actions_of_the_original(self):
+        environment = make(BIPED, interface='base_action', base_actions='original')
+        self.assertEqual(environment.action_spec().shape, (8,))
+        preferences = np.zeros(8)
+        preferences[5] = 1.0
+        environment.step(preferences)
+        gait = environment.task.gait
+        walk, jump = gait.parameters.sets['biped_walk'], gait.parameters.sets['biped_jump']
+        expected = (walk + jump) / 2
+        np.testing.assert_allclose(gait.state.vector[0], expected, atol=1e-12)
+        environment = make(BIPED, base_actions='original')
+        reach = environment.action_map.action_scale
+        offset = gait.parameters.action_offset
+        furthest = np.abs(gait.parameters.base_actions - offset).max(0)
+        np.testing.assert_allclose(reach, furthest[gait.parameters.actions])
+
 
 class OptionTest(parameterized.TestCase):
     """Invalid options are rejected."""
 
     @parameterized.parameters(
         ({'interface': 'parameter'}, "unknown interface 'parameter'.*'parameters'"),
+        ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
         ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
         ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
         ({'start_noise': np.inf}, 'start_noise is inf'), ({'spawn': 'here'}, "'here'"),

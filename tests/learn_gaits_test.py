@@ -83,7 +83,7 @@ class LearnTest(absltest.TestCase):
         policy.check(learner.environments)
         observation = learner.replay.before[: len(learner.replay)].astype(float)
         with torch.no_grad():
-            values = learner.targets[0](learner.seen(observation)).numpy()
+            values = learner.target(learner.seen(observation)).numpy()
         whole = np.zeros((len(observation), policy.observation_size))
         whole[:, learner.columns] = observation
         # Where two are as good, rounding decides.
@@ -91,6 +91,27 @@ class LearnTest(absltest.TestCase):
         self.assertGreater(clear.sum(), 5)
         expected = learner.choices[values.argmax(1)]
         np.testing.assert_allclose(policy(whole)[clear], expected[clear], atol=1e-6)
+
+    def test_a_run_begins_with_a_policy(self):
+        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+        for _ in range(6):
+            learner.advance()
+        with tempfile.TemporaryDirectory() as name:
+            path = f'{name}/policy.npz'
+            policies.save(learner.exported(), path)
+            settings = dataclasses.replace(TINY, start=path)
+            other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+            observation = learner.replay.before[: len(learner.replay)].astype(float)
+            with torch.no_grad():
+                seen = learner.seen(observation)
+                values = learner.target(seen), other.network(seen)
+            np.testing.assert_allclose(values[1], values[0], atol=1e-5)
+            before = other.mean.copy()
+            for _ in range(4):
+                other.advance()
+            np.testing.assert_array_equal(other.mean, before)
+        with self.assertRaisesRegex(ValueError, 'other inputs'):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, start=HOPPER), 1)
 
     def test_a_run_writes_its_policy_and_resumes_exactly(self):
         curves = []

@@ -164,7 +164,7 @@ class CatalogueTest(parameterized.TestCase):
             self.assertEqual((spec.domain, spec.actuation, spec.clip), ('terrainrl', 'gait', None))
             ground = id_.split('_', 3)[3].removesuffix('-v0')
             self.assertEqual(spec.task, f'{figure[:-2]}_{ground}'.lower())
-            self.assertEqual((dict(spec.options), spec.step_limit), ({}, 256))
+            self.assertEqual((dict(spec.options), spec.step_limit), ({}, 5000))
 
     @parameterized.parameters(*list(GAITS)[::4])
     def test_parts_of_ids_of_gaits(self, id_):
@@ -174,7 +174,7 @@ class CatalogueTest(parameterized.TestCase):
         self.assertEqual(task.character.spec.name, FIGURES[id_.split('_')[1]])
         self.assertEqual(task.interface, 'parameters')
         self.assertEqual(list(environment.blocks), ['terrain', 'pose', 'velocity'])
-        self.assertEqual(environment.step_limit, 256)
+        self.assertEqual(environment.step_limit, 5000)
         self.assertAlmostEqual(environment.physics.timestep(), 1 / 1200)
 
     def test_three_dimensions(self):

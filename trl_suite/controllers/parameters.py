@@ -15,7 +15,7 @@ One JSON file per character:
     absolute                 parameters of which the absolute value is used
     target_speed             m/s, for the reward
     sets                     name -> vector
-    base_actions             [set, set, blend]: the actions of the papers' mixture of experts
+    base_actions             [set, set, blend]: gaits to select from; they determine the action ranges
     action_offset            action 0: name of a set, or index of a base action
     search_scale             name without state -> standard deviation for a search
     start                    initial state: height of the root m, pitch rad, velocity of the root
@@ -23,6 +23,9 @@ One JSON file per character:
 
 and optionally, for exceptions:
 
+    original_base_actions    the base actions of the papers' mixture of experts, if `base_actions`
+                             are others
+    tuning                   set -> record and scores of the search that found it
     gravity_compensation     false: legs of a bound on the ground do not support the weight
     forward_only             true: a root that moves backwards is a fall
     backward_reward          false: the reward of a cycle with negative speed is 0
@@ -30,7 +33,7 @@ and optionally, for exceptions:
     observe_pitch            true: pitch and its rate replace z of the last link and its rate
 
 Source of the values: the controllers of Terrain RL Simulator (2018) and of Peng, Berseth, van de
-Panne (2016); the sets 'tuned' of biped2d_simbicon and goat were found for this suite.
+Panne (2016). The sets that 'tuning' lists, and 'tuned' of biped2d_simbicon, were found for this suite.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ import numpy as np
 from trl_suite.util import errors
 
 KINDS = ('bound', 'stride', 'hop')
+BASE_ACTIONS = ('default', 'original')
 REWARD = {'speed': 0.8, 'stumble': 0.2}
 
 
@@ -127,16 +131,25 @@ def available() -> tuple[str, ...]:
 
 
 @functools.cache
-def load(character: str) -> Parameters:
+def load(character: str, base_actions: str = 'default') -> Parameters:
     """Returns the parameters of a character's gait.
 
+    Args:
+      character: its name.
+      base_actions: 'default', or 'original' for those of the papers.
+
     Raises:
-      ValueError: the character has no gait.
+      ValueError: the character has no gait, or `base_actions` is unknown.
     """
+    if base_actions not in BASE_ACTIONS:
+        raise ValueError(errors.unknown('base_actions', base_actions, BASE_ACTIONS))
     if character not in available():
         raise ValueError(errors.unknown('character with a gait', character, available()))
     text = (importlib.resources.files(__package__) / f'{character}.json').read_text()
-    return read(json.loads(text))
+    data = json.loads(text)
+    if base_actions == 'original':
+        data['base_actions'] = data.get('original_base_actions', data['base_actions'])
+    return read(data)
 
 
 def read(data: dict[str, Any]) -> Parameters:

@@ -1,10 +1,11 @@
 """Trained policies as data: small networks in .npz files, evaluated with NumPy only."""
 
-from trl_suite.policies.files import available, load, reference, save
+from trl_suite.policies.files import SHARED, available, load, reference, save, trained_for
 from trl_suite.policies.network import ACTIVATIONS, Convolution, Policy, placed
 
 __all__ = [
     'ACTIVATIONS',
+    'SHARED',
     'Convolution',
     'Policy',
     'available',
@@ -12,4 +13,5 @@ __all__ = [
     'placed',
     'reference',
     'save',
+    'trained_for',
 ]

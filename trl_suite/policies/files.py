@@ -73,6 +73,7 @@ Floats are written as float32, or as float16 if that is exact.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import json
 import os
@@ -86,6 +87,7 @@ from trl_suite.util import resources
 from trl_suite.util.files import check_path, existing, load_arrays, replacing
 
 FORMAT = 'trl_suite policy'
+SHARED = 'shared.json'  # in trained/; see its README
 VERSION = 1
 # Key in the file -> dtype kinds, number of axes.
 _FIELDS = {
@@ -230,16 +232,31 @@ def reference(id: str) -> Policy:
             f'no policy is shipped for {id!r}; '
             + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
         )
-    path = resources.directory('trained') / f'{id}.npz'
+    other = trained_for(id)
+    path = resources.directory('trained') / f'{other}.npz'
     policy = load(path)
-    if policy.id != id:
-        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {id!r}")
-    return policy
+    if policy.id != other:
+        raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {other!r}")
+    return policy if id == other else dataclasses.replace(policy, id=id)
 
 
 def available() -> tuple[str, ...]:
     """Returns the ids of the environments that have a shipped policy, sorted."""
-    return tuple(sorted(path.stem for path in resources.directory('trained').glob('*.npz')))
+    own = (path.stem for path in resources.directory('trained').glob('*.npz'))
+    return tuple(sorted({*own, *_shared()}))
+
+
+def trained_for(id: str) -> str:
+    """Returns the id of the environment in which the shipped policy of an environment was trained."""
+    return _shared().get(id, id)
+
+
+def _shared() -> dict[str, str]:
+    """Returns the environments that use the policy of another one, and its id."""
+    path = resources.directory('trained') / SHARED
+    if not path.exists():
+        return {}
+    return {id_: entry['policy'] for id_, entry in json.loads(path.read_text()).items()}
 
 
 def _small(value: Any) -> Any:

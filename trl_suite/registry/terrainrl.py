@@ -7,6 +7,10 @@ from __future__ import annotations
 
 from trl_suite.registry.spec import EnvSpec
 
+# Cycles. The best policies of the 2016 paper fall after 2 km on average, some 1200 cycles of 1 to 2 m;
+# one in sixty of their episodes would last longer than this.
+STEP_LIMIT = 5000
+
 # Name in ids, preset, words.
 _GAIT_TERRAINS = (
     ('Gaps', 'gaps', 'gaps'),
@@ -48,6 +52,7 @@ def _gait(character: str, name: str, preset: str, words: str, original: bool) ->
         task_type='gait',
         description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait parameters of a cycle.',
         tags=frozenset({'planar', 'original' if original else 'completion'}),
+        step_limit=STEP_LIMIT,
     )
 
 

@@ -117,7 +117,7 @@ def moving_items() -> Iterator[Item]:
 
 def _policy_digest(id: str) -> str:
     """Returns a digest of the policy that is shipped for an environment, '' if none is."""
-    return _digest(f'{id}.npz') if id in policies.available() else ''
+    return _digest(f'{policies.trained_for(id)}.npz') if id in policies.available() else ''
 
 
 def moving_path(id: str) -> str:

@@ -32,7 +32,7 @@ TYPES = (
             ),
             Difference('the reward is that of the cycle that the action controlled, and never NaN'),
             differences.FACES,
-            differences.CUT,
+            Difference('episodes are truncated after 5000 cycles (discount 1)'),
         ),
     ),
 )

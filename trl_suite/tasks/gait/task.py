@@ -17,7 +17,8 @@ from trl_suite import actuation
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
-from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics
+from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
+from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
 from trl_suite.kinematics.planar import (
     PlanarBody,
@@ -69,6 +70,11 @@ class GaitConfig(Config):
         'action has one preference per base action, and the base action with the largest one is used '
         'when the next cycle begins',
         choices=INTERFACES,
+    )
+    base_actions: str = option(
+        'default',
+        "'default', or 'original': those of the papers, which differ for the biped and the goat",
+        choices=BASE_ACTIONS,
     )
     substeps: int = option(
         SUBSTEPS, 'physics steps per control step of 1/600 s', at_least=1, at_most=MOST_SUBSTEPS
@@ -129,14 +135,14 @@ class GaitTask(Task):
         self.character, self.arena, self.config = character, arena, config
         self.interface = interface = config.interface
         self.figure = PlanarFigure(character, arena, BEHIND, AHEAD, SAMPLES)
-        self.gait = Gait(character, arena.ground_body, arena.mjcf_model)
+        parameters = load(character.spec.name, config.base_actions)
+        self.gait = Gait(character, arena.ground_body, arena.mjcf_model, parameters)
         self._control_substeps = int(config.substeps)
         timestep = CONTROL_TIMESTEP / config.substeps
         self.set_timesteps(FRAME, timestep)
         actuation.add(character, 'torque', timestep)
         for joint in character.joints:  # the gaits were tuned for joints without these
             joint.damping = joint.armature = 0
-        parameters = self.gait.parameters
         if interface == 'parameters':
             names = tuple(parameters.names[i] for i in parameters.actions)
             self.action_map = ActionMap(

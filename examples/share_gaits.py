@@ -1,0 +1,58 @@
+"""Evaluates a trained gait policy on other terrains of its character, and ships it where it is better.
+
+    python examples/share_gaits.py FSM_Dog2D_Terrain_Mixed-v0 FSM_Dog2D_Terrain_Gaps-v0
+
+Observation and action are the same on all terrains. The other environments get the policy of the first
+id if its mean distance is above the 95 % interval of their shipped policy, or else of the default gait.
+Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
+environment in which it was trained; `evaluation`, its results; and `before`, the results of the shipped
+policy or the default gait that it replaces.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import train_all
+
+from trl_suite import evaluation, policies
+from trl_suite.util import files, resources
+from trl_suite.util.program import begin_script
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('policy', metavar='ID', help='environment of the policy')
+    parser.add_argument(
+        'ids', nargs='+', metavar='ID', help='environments in which it is evaluated'
+    )
+    parser.add_argument('--episodes', type=int, default=train_all.GAIT_EPISODES)
+    parser.add_argument('--threads', type=int, default=1, help='0: all cores')
+    arguments = parser.parse_args()
+    path = resources.directory('trained') / policies.SHARED
+    for id_ in arguments.ids:
+        options = arguments.episodes, train_all.SEED, arguments.threads
+        if id_ in policies.available():
+            before = evaluation.evaluate(id_, policies.reference(id_), *options)
+        else:
+            before = evaluation.evaluate(id_, evaluation.zero, *options, factory=True)
+        found = evaluation.evaluate(id_, policies.reference(arguments.policy), *options)
+        print(
+            f'{id_}: {found["distance"]:.1f} m, median {found["median_distance"]:.1f} m; '
+            f'before: {before["distance"]:.1f} m, median {before["median_distance"]:.1f} m',
+            flush=True,
+        )
+        if found['distance'] <= before['distance_interval'][1]:
+            continue
+        shared = json.loads(path.read_text()) if path.exists() else {}
+        shared[id_] = {'policy': arguments.policy, 'evaluation': found, 'before': before}
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(dict(sorted(shared.items()))) + '\n')
+        for suffix in ('npz', 'json'):
+            path.with_name(f'{id_}.{suffix}').unlink(missing_ok=True)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

@@ -1,0 +1,307 @@
+"""Searches for gaits that pass obstacles at which a character's other gaits fall.
+
+    python examples/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
+    python examples/tune_base_actions.py goat --terrain cliffs_rugged --alone
+    python examples/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
+
+For each terrain, in the order given, the gaits found so far run over it until they fall, and the
+states one to three cycles before these falls are stored. The score of a gait in a state is the
+distance travelled with that gait for one cycle (two if the legs change roles each cycle) and the
+default gait in the next cycles, divided by the usual distance of as many cycles. The score of a set
+of gaits is the mean over states of the score of its best gait. CMA-ES (Hansen 2016,
+arXiv:1604.00772) searches for the gait that increases the score of the set most. The stored scores
+are those in states that were not used by the search.
+
+With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
+travelled, divided by the distance at the target speed.
+
+Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
+gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`.
+Needs `pip install 'trl_suite[tune]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cma
+import numpy as np
+import tune_gait
+
+from trl_suite import controllers
+from trl_suite.controllers import Parameters
+from trl_suite.util import errors, files
+from trl_suite.util.program import begin_script
+
+BACK = 3  # largest number of cycles from a state to the fall
+AFTER = 3  # cycles with the default gait after those with the candidate
+USUAL = 0.8  # share of the distance on flat ground that gives the full score
+OTHERS = 0.3  # share of the cycles before a fall with other gaits than the default one
+HORIZON = 8.0  # s, with `--alone`
+STATES, VALIDATION = 32, 64  # numbers of states for the search, and for the stored scores
+STARTS = 6  # number of noisy starts with `--alone`
+FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
+FRICTION = 0.81
+DIGITS = 4
+
+
+class Obstacles:
+    """Simulations of one character on one terrain.
+
+    Attributes:
+      default: gait after the candidate, (P,).
+      usual: distance of the default gait on flat ground in as many cycles, times `USUAL`, m.
+    """
+
+    def __init__(self, gait: Parameters, terrain: str, default: np.ndarray, num_envs: int) -> None:
+        self.gait, self.default = gait, default
+        self.lead = 2 if gait.kind == 'stride' else 1
+        self.bench = tune_gait.Bench(gait.character, num_envs, gait.action_offset, terrain)
+        self.bench.environments.reset()
+        flat = tune_gait.Bench(gait.character, STARTS, gait.action_offset)
+        runs = tune_gait.measure(flat, default, [FRICTION])
+        flat.environments.close()
+        self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
+
+    def actions(self, vectors: np.ndarray) -> np.ndarray:
+        """Returns the actions that set parameters (..., P)."""
+        places = self.gait.actions
+        return (vectors - self.gait.action_offset)[..., places] / self.bench.action_scale[places]
+
+    def collect(
+        self, vectors: np.ndarray, count: int, rng: np.random.Generator
+    ) -> list[dict[str, Any]]:
+        """Returns states shortly before falls of gaits (k, P), of which mostly the first one runs."""
+        environments = self.bench.environments
+        environments.seed(int(rng.integers(2**32)))
+        environments.reset(list(range(count)))
+        past: list[list[dict[str, Any]]] = [[] for _ in range(count)]
+        going, back = np.ones(count, bool), rng.integers(1, BACK + 1, count)
+        action = np.zeros((environments.num_envs, len(self.gait.actions)))
+        while going.any():
+            ids = np.flatnonzero(going)
+            for i in ids.tolist():
+                past[i] = [*past[i], environments.get_state([i])][-BACK:]
+            chosen = rng.integers(len(vectors), size=len(ids)) * (rng.random(len(ids)) < OTHERS)
+            action[ids] = self.actions(vectors[chosen])
+            step = environments.step(action, ids)
+            ended = step.terminated | step.truncated
+            for i in ids[ended[ids]].tolist():
+                if len(past[i]) >= back[i]:
+                    going[i] = False
+                else:  # the episode is too short
+                    environments.reset([i])
+                    past[i] = []
+        return [states[-number] for states, number in zip(past, back, strict=True)]
+
+    def scores(self, vectors: np.ndarray, states: Sequence[dict[str, Any]]) -> np.ndarray:
+        """Returns the scores of gaits (m, P) in each state, (m, states)."""
+        environments, count = self.bench.environments, len(states)
+        most = environments.num_envs // count
+        found = []
+        for first in range(0, len(vectors), most):
+            part = vectors[first : first + most]
+            going = np.arange(len(part) * count)
+            for i in going.tolist():
+                environments.set_state(states[i % count], [i])
+            begin = self.position(going)
+            reached = begin.copy()
+            candidate, default = np.zeros((2, environments.num_envs, len(self.gait.actions)))
+            candidate[going] = np.repeat(self.actions(part), count, axis=0)
+            default[:] = self.actions(self.default)
+            for cycle in range(self.lead + AFTER):
+                step = environments.step(candidate if cycle < self.lead else default, going)
+                going = going[~(step.terminated | step.truncated)[going]]
+                reached[going] = self.position(going)
+                if not len(going):
+                    break
+            share = np.clip((reached - begin) / self.usual, 0, 1)
+            found.append(share.reshape(len(part), count))
+        return np.concatenate(found)
+
+    def alone(self, vectors: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        """Returns the scores of repeated gaits (m, P) for each start, (m, starts)."""
+        shape = len(vectors), len(seeds)
+        rows, n = self.bench.environments.num_envs, len(vectors) * len(seeds)
+        vectors, seeds = np.repeat(vectors, len(seeds), axis=0), np.tile(seeds, len(vectors))
+        found = []
+        for first in range(0, n, rows):  # the last part is filled up
+            part = np.arange(first, first + rows) % n
+            runs = self.bench.run(vectors[part], seeds[part], HORIZON, np.full(rows, FRICTION))
+            found.append(runs.distance / (HORIZON * self.gait.target_speed))
+        return np.clip(np.concatenate(found)[:n], 0, 1).reshape(shape)
+
+    def position(self, env_ids: np.ndarray) -> np.ndarray:
+        """Returns the positions of the roots along the ground, (m,) m."""
+        task = self.bench.task
+        return task.world.qpos[env_ids, int(task.figure.pose_qpos[0])]
+
+
+def search(
+    objective: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    gait: Parameters,
+    arguments: argparse.Namespace,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Returns the best gaits of the last generations, and the mean of the last one, (m, P)."""
+
+    def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
+        result = np.tile(start, (len(candidates), 1))
+        result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
+        result[:, gait.absolute] = np.abs(result[:, gait.absolute])
+        result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
+        return result
+
+    options = {
+        'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
+        'seed': int(rng.integers(1, 2**31)),
+    }  # fmt: skip
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(gait.actions)), arguments.sd, options)
+    finalists: list[np.ndarray] = []
+    for number in range(arguments.generations):
+        candidates = strategy.ask()
+        scores = objective(vectors(candidates))
+        strategy.tell(candidates, -scores)
+        finalists = [*finalists, candidates[scores.argmax()]][-FINALISTS:]
+        if number % 10 == 9:
+            print(f'  {number + 1:3} best {scores.max():.3f} mean {scores.mean():.3f}', flush=True)
+    return vectors([strategy.result.xfavorite, *finalists])
+
+
+def alone(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches for a gait to repeat; returns it (P,), and all scores from new starts (m, starts)."""
+    seeds = rng.integers(2**32, size=(2, 4 * STARTS))
+    start = known[obstacles.alone(known, seeds[0]).mean(1).argmax()]
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return obstacles.alone(vectors, rng.integers(2**32, size=STARTS)).mean(1)
+
+    found = search(objective, start, obstacles.gait, arguments, rng)
+    chosen = found[obstacles.alone(found, seeds[0]).mean(1).argmax()]
+    return chosen, obstacles.alone(np.array([*known, chosen]), seeds[1])
+
+
+def complement(
+    obstacles: Obstacles, known: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Searches for a gait to add; returns it (P,), and all scores in new states (m, states)."""
+    states = obstacles.collect(known, STATES, rng)
+    before = obstacles.scores(known, states)
+    best = before.max(0)
+
+    def objective(vectors: np.ndarray) -> np.ndarray:
+        return np.maximum(obstacles.scores(vectors, states), best).mean(1)
+
+    found = search(objective, known[before.mean(1).argmax()], obstacles.gait, arguments, rng)
+    fresh = [obstacles.collect(known, VALIDATION, rng) for _ in range(2)]
+    best = obstacles.scores(known, fresh[0]).max(0)
+    chosen = found[np.maximum(obstacles.scores(found, fresh[0]), best).mean(1).argmax()]
+    return chosen, obstacles.scores(np.array([*known, chosen]), fresh[1])
+
+
+def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
+    """Makes gaits the base actions of a character, in this order.
+
+    Numbers are indices of base actions of the original.
+
+    Raises:
+      ValueError: a name is unknown.
+    """
+    data = tune_gait.stored(character)
+    data.setdefault('tuning', {})
+    original = data.setdefault('original_base_actions', data['base_actions'])
+    numbers = list(map(str, range(len(original))))
+    for name in names:
+        if name in found:
+            data['sets'][name] = found[name]['vector']
+            data['tuning'][name] = found[name]['tuning']
+        elif name not in data['sets'] and name not in numbers:
+            raise ValueError(errors.unknown('gait', name, [*found, *data['sets'], *numbers]))
+    data['base_actions'] = [
+        original[int(name)] if name in numbers else [name, name, 0] for name in names
+    ]
+    used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
+    used.add(data['action_offset'])
+    for part in ('sets', 'tuning'):
+        data[part] = {name: value for name, value in data[part].items() if name in used}
+    return tune_gait.write(character, data)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('character', choices=controllers.available())
+    parser.add_argument(
+        '--terrain', nargs='+', default=[], help='terrains; one gait is searched for each'
+    )
+    parser.add_argument('--alone', action='store_true', help='repeat the gait')
+    parser.add_argument(
+        '--start', nargs='+', help='sets, or numbers of base actions; default: action 0'
+    )
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument(
+        '--sd', type=float, default=0.5, help='initial standard deviation, in search scales'
+    )
+    parser.add_argument('--population', type=int, default=12)
+    parser.add_argument('--generations', type=int, default=30)
+    parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
+    parser.add_argument(
+        '--enter',
+        nargs='+',
+        metavar='SET',
+        help='sets, or numbers of base actions of the original, that become the base actions',
+    )
+    arguments = parser.parse_args()
+    gait = controllers.load(arguments.character)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    path = arguments.output / f'{gait.character}.json'
+    stored = json.loads(path.read_text()) if path.exists() else {}
+
+    if arguments.enter:
+        print(enter(gait.character, stored, arguments.enter))
+        return
+
+    def vector(name: str) -> np.ndarray:
+        if name in stored:
+            return np.array(stored[name]['vector'])
+        return tune_gait.vector_of(gait, name)
+
+    known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
+    rng = np.random.default_rng(arguments.seed)
+    for terrain in arguments.terrain:
+        began = time.process_time()
+        print(gait.character, terrain, flush=True)
+        have = np.array(known)
+        num_envs = arguments.population * (STARTS if arguments.alone else STATES)
+        obstacles = Obstacles(gait, terrain, have[0], num_envs)
+        tune = alone if arguments.alone else complement
+        chosen, scores = tune(obstacles, have, arguments, rng)
+        obstacles.bench.environments.close()
+        record = {
+            'terrain': terrain, 'search': tune.__name__,
+            'seed': arguments.seed, 'generations': arguments.generations,
+            'population': arguments.population, 'sd': arguments.sd,
+            'default': round(float(scores[0].mean()), 3),
+            'set_before': round(float(scores[:-1].max(0).mean()), 3),
+            'alone': round(float(scores[-1].mean()), 3),
+            'set_after': round(float(scores.max(0).mean()), 3),
+            'cpu_seconds': round(time.process_time() - began),
+        }  # fmt: skip
+        number = 1 + sum(name.rsplit('_', 1)[0] == terrain for name in stored)
+        stored[f'{terrain}_{number}'] = {'vector': chosen.tolist(), 'tuning': record}
+        known.append(chosen)
+        print(f'{terrain}_{number}', record, flush=True)
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(stored, indent=1))
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()
