@@ -18,9 +18,7 @@ parser.add_argument('file', nargs='?', type=pathlib.Path)
 parser.add_argument('--feet', nargs='+', default=FEET)
 parser.add_argument('--fall', nargs='+', default=['trunk'])
 parser.add_argument('--terrain', help='level ground by default')
-parser.add_argument(
-    '--spatial', action=argparse.BooleanOptionalAction
-)  # by default from the root joints
+parser.add_argument('--spatial', action=argparse.BooleanOptionalAction)  # default: by root joints
 parser.add_argument('--seed', type=int, default=1)
 parser.add_argument('--output', type=pathlib.Path, default='own_character.png')
 args = parser.parse_args()

@@ -240,7 +240,7 @@ class ChromiumTest(FolderTest):
         page.on('pageerror', lambda error: self.messages.append(('error', str(error))))
         page.on('request', lambda request: self.messages.append(('request', request.url)))
         page.goto(address)
-        page.wait_for_selector('canvas')
+        page.wait_for_selector('canvas >> visible=true')
         return page
 
     def wait_for(self, condition, what):

@@ -185,7 +185,7 @@ class TableTest(parameterized.TestCase):
         self.assertEqual(chosen, muscles.MUSCLES['raptor']['run'])
         with self.assertRaisesRegex(ValueError, "muscle set of 'raptor'.*'rum'.*'run'"):
             actuation.character_muscles(raptor, 'rum')
-        with self.assertRaisesRegex(ValueError, 'for muscle control, not for position'):
+        with self.assertRaisesRegex(ValueError, 'is an option of muscle control, not position'):
             suite.make('PD_Raptor2D_LLC_Imitate_Flat-v0', task_kwargs={'muscle_set': 'run'})
         id_ = 'MTU_Raptor2D_LLC_Imitate_Flat-v0'
         for name, peak in (('plain', 6000), ('run', 5692.86906)):

@@ -222,7 +222,7 @@ class CharacterTest(Folder):
 
     @parameterized.named_parameters(
         ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
-        ('inner_root', {'root': 'left_shin'}, "is a child of another body; did you mean 'trunk'"),
+        ('inner_root', {'root': 'left_shin'}, "hangs on another body; did you mean 'trunk'"),
         ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
         ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
         ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
@@ -321,7 +321,7 @@ class CharacterTest(Folder):
     def test_contradicting_root_joints_are_noted(self):
         spec = self.planar(spatial=True)
         self.assertTrue(spec.spatial)
-        self.assertRegex(spec.notes[0], 'spatial=True was given, .* two slides and a hinge')
+        self.assertRegex(spec.notes[0], 'spatial=True was given .* two slides and a hinge')
         self.assertEqual(self.planar(spatial=False).notes, self.planar().notes)
 
     @parameterized.named_parameters(
@@ -537,7 +537,7 @@ class TerrainTest(Folder):
         ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
         ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
-        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'cannot be read as an image'),
+        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture that can be read'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),
@@ -734,7 +734,7 @@ class TaskTest(parameterized.TestCase):
         ('shape', {'rewards': {'a': (1, parts.joint_angles)}}, r"reward 'a' has shape \(1, 11\)"),
         ('finite', {'rewards': {'a': (1, lambda t: np.full(1, np.inf))}}, "'a' is not finite"),
         ('size', {'observations': {'a': (0, parts.speed)}}, 'size 0'),
-        ('taken', {'observations': {'pose': (1, parts.speed)}}, "block 'pose' already"),
+        ('taken', {'observations': {'pose': (1, parts.speed)}}, "already has a block 'pose'"),
         ('pair', {'rewards': {'a': parts.speed}}, r'expected \(weight, function\)'),
         ('function', {'failures': {'a': 1}}, 'expected a function'),
         ('dict', {'rewards': [1]}, 'expected a dict'),

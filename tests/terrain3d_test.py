@@ -708,7 +708,7 @@ class RegisterTest(parameterized.TestCase):
 
     def test_a_taken_name_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'hills3d'):
-            terrain.register3d('hills3d')
+            terrain.register3d('hills3d')(np.abs)
 
     @parameterized.parameters(
         (lambda: np.zeros(3), 'must return a Layout'),

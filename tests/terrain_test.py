@@ -490,7 +490,7 @@ class RegisterTest(parameterized.TestCase):
 
     def test_a_taken_name_is_rejected(self):
         with self.assertRaisesRegex(ValueError, 'var2d_gaps'):
-            terrain.register('var2d_gaps')
+            terrain.register('var2d_gaps')(np.abs)
         function = lambda parameters, length, rng: terrain.Profile(np.ones(9), np.zeros(9, bool))  # noqa: E731
         terrain.register('var2d_gaps', replace=True)(function)
         self.assertIs(terrain.GENERATORS['var2d_gaps'].function, function)

@@ -288,6 +288,9 @@ def unlimited(environment: str, **options: Any) -> SuiteEnv:
     return SuiteEnv(environment, max_episode_steps=-1, **options)
 
 
+unlimited.metadata = METADATA  # type: ignore[attr-defined]  # `make` reads the render modes of it
+
+
 def masked(info: Info, env_ids: np.ndarray) -> Info:
     """Info in Gymnasium's format: 0 in other simulations, and for each key the mask '_key'."""
     result: Info = {}
