@@ -79,6 +79,10 @@ class Controller:
                 f'({n}, {"k" if size is None else size}), one simulation for each body'
             )
         if not np.isfinite(action).all():
+            # Of an observation that is no number nothing follows: the simulation has diverged.
+            diverged = ~np.isfinite(observation).all(1)
+            action = np.where(diverged[:, None], 0.0, action)
+        if not np.isfinite(action).all():
             env_id = int(np.argwhere(~np.isfinite(action))[0, 0])
             raise ValueError(
                 f'controller {self.name} gives no finite action for simulation {env_id}'
@@ -94,6 +98,7 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
         from observations (n, size) to actions (n, k).
 
     Raises:
+      TypeError: none of these.
       ValueError: a broken file; see `policies.load`.
       FileNotFoundError: there is no such file.
     """
@@ -103,4 +108,6 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
         return Controller(source, repr(source.id))
     if callable(source):
         return Controller(source, getattr(source, '__name__', type(source).__name__))
+    if not isinstance(source, (str, os.PathLike)):
+        raise TypeError(f'controller is a policy, its file or a function, not {source!r}')
     return Controller(policies.load(source), repr(os.fspath(source)))

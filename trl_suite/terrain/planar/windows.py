@@ -9,6 +9,8 @@ import numpy as np
 from trl_suite.terrain.planar.generators import SPACING
 from trl_suite.util.compiled import compiled_inline
 
+FARTHEST = 1e4  # m from its window; a character beyond has broken down, and gets no ground
+
 _CELLS_PER_METRE = 1 / SPACING
 
 
@@ -99,7 +101,7 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
 @compiled_inline
 def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether a character at x, m, is so far that its window must be laid anew."""
-    return abs(x - ground.centre[i]) > ground.reach
+    return ground.reach < abs(x - ground.centre[i]) < FARTHEST
 
 
 @compiled_inline
