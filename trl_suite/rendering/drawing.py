@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # a terrain can be plotted where the engine cannot be loaded
 
 Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
 GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
+_drawn_by: set[int] = set()  # the process that has drawn; a forked child has another number
 GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
 
 
@@ -62,8 +63,16 @@ def frame(
     Raises:
       ValueError: unknown camera, a size that is not positive or above the model's limit, or a ghost
         where the task has no reference clip.
-      RuntimeError: there is no OpenGL to draw with; the message names MUJOCO_GL and its choices.
+      RuntimeError: there is no OpenGL to draw with (the message names MUJOCO_GL and its choices), this
+        process was forked from one that has drawn, or another thread uses the environment.
     """
+    with getattr(environment, 'one_thread', contextlib.nullcontext()):
+        return _frame(environment, height, width, camera, ghost)
+
+
+def _frame(
+    environment: composer.Environment, height: int, width: int, camera: str | int, ghost: bool
+) -> np.ndarray:
     physics = environment.physics
     limits = physics.model.vis.global_
     for name, size, limit in (
@@ -158,12 +167,19 @@ def _camera(physics: Any, camera: str | int) -> int:
 
 def _check_gl(physics: Any) -> None:
     """Makes the drawing context at the first picture."""
+    process = os.getpid()
+    if _drawn_by and process not in _drawn_by:
+        raise RuntimeError(
+            'drawing does not survive a fork: the OpenGL context stays in the parent, which has drawn '
+            "already. Draw there, or start processes with multiprocessing's 'spawn'"
+        )
     try:
         _use_chosen_library()
         _ = physics.contexts
     # What fails here depends on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
+    _drawn_by.add(process)
 
 
 def _use_chosen_library() -> None:
