@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import pathlib
 import re
@@ -45,21 +46,30 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     """
     try:
         arguments = _parser(prog).parse_args(argv)
+        if sys.stdout is None:
+            raise OSError('standard output is closed')
         command = engine.load(f'trl_suite.cli.{arguments.command}')
         status = command.run(arguments) or 0
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read the output has had enough; nothing may be flushed into the pipe at exit.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
     except KeyboardInterrupt:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
     except (ValueError, ImportError, RuntimeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _drop_output()
         print(f'trl-suite: error: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
     return status
+
+
+def _drop_output() -> None:
+    """Lets go of what could not be written, so that Python does not try once more at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
