@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike
 from trl_suite import rendering, suite
 from trl_suite.environments.environment import Environment
 from trl_suite.environments.vector import VectorEnvironment
-from trl_suite.registry.catalogue import EnvSpec
+from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.util import errors
 
 try:
@@ -78,7 +78,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
-            spec = suite.find(environment) if isinstance(environment, str) else environment
+            spec = spec_of(environment)
             environment = suite.build_environment(
                 spec, limited(spec, task_kwargs, max_episode_steps), {}
             )
@@ -173,7 +173,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
-        spec = suite.find(environment) if isinstance(environment, str) else environment
+        spec = spec_of(environment)
         options = limited(spec, task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
             spec, num_envs, num_threads, options.pop('random', None),
@@ -235,11 +235,15 @@ def metadata(task: Any) -> Info:
 
 def limited(spec: EnvSpec, task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
     """Options whose step limit is the smaller of a simulation's and Gymnasium's (None or -1 for none)."""
-    options = dict(task_kwargs or {})
+    options = errors.options('task_kwargs', task_kwargs)
     if max_episode_steps is None or max_episode_steps == -1:
         return options
-    if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
-        raise ValueError(f'max_episode_steps is {max_episode_steps}; expected a positive integer')
+    whole = isinstance(max_episode_steps, (int, np.integer)) and max_episode_steps >= 1
+    if not whole or isinstance(max_episode_steps, bool):
+        raise ValueError(
+            f'max_episode_steps is {max_episode_steps!r}; expected a positive integer, or None or -1 '
+            "for the environment's own limit"
+        )
     own = options.get('step_limit', spec.step_limit)
     options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)
     return options

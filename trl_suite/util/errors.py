@@ -5,7 +5,8 @@ import difflib
 import numbers
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,38 @@ def _listed(names: list[str]) -> str:
     if len(names) <= MANY:
         return ', '.join(names)
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
+
+
+def check_whole(name: str, value: object, low: int, high: int, why: str = '') -> None:
+    """Checks that an argument is a whole number between two bounds.
+
+    Args:
+      name: of the argument.
+      value: may be any number that is whole.
+      low, high: bounds, which are allowed.
+      why: where a bound comes from, for the message.
+
+    Raises:
+      ValueError: it is not; the message has its name and the bounds.
+    """
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not number or value % 1 or not low <= value <= high:  # type: ignore[operator]
+        raise ValueError(f'{name} is {value!r}; expected a whole number from {low} to {high}{why}')
+
+
+def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Returns a copy of options by name; none for None.
+
+    Args:
+      name: of the argument that holds them.
+      value: what is given.
+
+    Raises:
+      TypeError: it is no mapping.
+    """
+    if value is not None and not isinstance(value, Mapping):
+        raise TypeError(f'{name} is {value!r}; expected a dict of options by name')
+    return dict(value or {})
 
 
 def check_kind(name: str, value: object, hint: object) -> None:
