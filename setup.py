@@ -75,6 +75,7 @@ setup(
             'pytest-xdist',
             'build',
             'gymnasium>=1.1',
+            'hypothesis>=6',
             'imageio[ffmpeg]',
             'matplotlib',
             'scipy',

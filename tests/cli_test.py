@@ -795,7 +795,10 @@ class ProgramTest(CommandTest):
         self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
 
     def test_output_that_cannot_be_written(self):
-        for redirection, message in (('>&-', 'standard output is closed'), ('>/dev/full', 'No space')):
+        for redirection, message in (
+            ('>&-', 'standard output is closed'),
+            ('>/dev/full', 'No space'),
+        ):
             done = subprocess.run(
                 ['bash', '-c', f'"{sys.executable}" -m trl_suite list --tag blind {redirection}'],
                 capture_output=True, text=True, timeout=60, check=False,
@@ -831,7 +834,7 @@ class ProgramTest(CommandTest):
         with tempfile.TemporaryDirectory() as folder:
             # What PyOpenGL does where the library of OSMesa is not installed.
             pathlib.Path(folder, 'OpenGL').mkdir()
-            pathlib.Path(folder, 'OpenGL/__init__.py').write_text("None.glGetError")
+            pathlib.Path(folder, 'OpenGL/__init__.py').write_text('None.glGetError')
             path = os.pathsep.join([folder, *sys.path])
             done = self.program('info', GAPS, MUJOCO_GL='osmesa', PYTHONPATH=path)
             self.assertEqual((done.returncode, done.stdout), (2, ''))

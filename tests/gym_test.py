@@ -415,9 +415,13 @@ class VectorTest(Same, parameterized.TestCase):
 
     @parameterized.parameters(0, 2.5, -3, np.inf, 'abc', True)
     def test_refused_max_episode_steps(self, steps):
-        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'):
+        with self.assertRaisesRegex(
+            ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'
+        ):
             SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
-        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'):
+        with self.assertRaisesRegex(
+            ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'
+        ):
             SuiteEnv(FLAT, max_episode_steps=steps)
         with self.assertRaisesRegex(ValueError, 'already made'):
             SuiteEnv(suite.make(FLAT), max_episode_steps=5)

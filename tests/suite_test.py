@@ -403,8 +403,12 @@ class LoadTest(parameterized.TestCase):
             call()
 
     @parameterized.parameters(
-        (lambda: suite.combine(None), 'a character is a CharacterSpec or a name, one of dog.*not None'),
-        (lambda: suite.build(3), 'a character is'), (lambda: suite.make(None), 'the id .* not None'),
+        (
+            lambda: suite.combine(None),
+            'a character is a CharacterSpec or a name, one of dog.*not None',
+        ),
+        (lambda: suite.build(3), 'a character is'),
+        (lambda: suite.make(None), 'the id .* not None'),
         (lambda: suite.make([]), 'the id of an environment is a string'),
         (lambda: suite.build('dog', clip=3), 'clip is a name, a file, a Clip or Steps, not 3'),
         (lambda: suite.make(GAPS, 3), 'task_kwargs is 3; expected a dict'),
@@ -416,7 +420,9 @@ class LoadTest(parameterized.TestCase):
             call()
 
     def test_an_unknown_controller_is_no_environment(self):
-        with self.assertRaisesRegex(ValueError, "^unknown controller 'PD_Biped3D_LLC_General.*Step-v0"):
+        with self.assertRaisesRegex(
+            ValueError, "^unknown controller 'PD_Biped3D_LLC_General.*Step-v0"
+        ):
             suite.make(HIGH, {'controller': 'PD_Biped3D_LLC_General-v0'})
 
     def test_given_options_are_not_changed(self):

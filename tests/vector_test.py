@@ -487,12 +487,18 @@ class RobustnessTest(parameterized.TestCase):
         ({'dtype': np.int32}, 'float64 or float32'),
         ({'seed': [1, 2]}, '2 seeds for 3 simulations'),
         ({'environment': 'PD_Biped2D_Gap_Terrain-v0'}, 'PD_Biped2D_Gaps_Terrain-v0'),
-        *(({'num_envs': value}, 'num_envs is .*; expected a whole number from 1')
-          for value in ('abc', None, np.inf, np.nan, [2], True, 2**32)),
-        *(({'num_threads': value}, 'num_threads is .*; expected a whole number from 0')
-          for value in ('abc', None, np.inf, 1.5, 2**40)),
-        *(({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
-          for value in ('abc', np.inf, [1, 2], -2)),
+        *(
+            ({'num_envs': value}, 'num_envs is .*; expected a whole number from 1')
+            for value in ('abc', None, np.inf, np.nan, [2], True, 2**32)
+        ),
+        *(
+            ({'num_threads': value}, 'num_threads is .*; expected a whole number from 0')
+            for value in ('abc', None, np.inf, 1.5, 2**40)
+        ),
+        *(
+            ({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
+            for value in ('abc', np.inf, [1, 2], -2)
+        ),
         ({'seed': -1}, 'seed is -1; expected 0 or a positive integer'),
         ({'task_kwargs': {'sub_steps': 3}}, "did you mean 'substeps'"),
     )

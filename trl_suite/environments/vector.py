@@ -112,7 +112,9 @@ class VectorEnvironment:
         self._task_kwargs = options = errors.options('task_kwargs', task_kwargs)
         if 'random' in options:
             raise ValueError("task_kwargs has 'random'; here the argument `seed` takes its place")
-        own = self.spec.step_limit if np.ndim(step_limit) == 0 and step_limit == -1 else step_limit
+        own = (
+            self.spec.step_limit if isinstance(step_limit, int) and step_limit == -1 else step_limit
+        )
         self.step_limit = arguments.check_step_limit(options.pop('step_limit', own))
         self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
         self._num_threads = int(num_threads)
@@ -340,9 +342,7 @@ class VectorEnvironment:
                     f'the state has {len(state["world"])} simulations; expected {len(ids)}'
                 )
             if len(set(ids)) != len(ids):
-                raise ValueError(
-                    f'simulations {ids}; expected each of {len(ids)} simulations once'
-                )
+                raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
             for i, env_id in enumerate(ids):
                 self._task.set_state(env_id, state['task'][i])
                 self._world.set_state(env_id, state['world'][i])

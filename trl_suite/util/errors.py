@@ -106,7 +106,10 @@ def _fits(value: object, hint: object) -> bool:
         return hint is bool or not isinstance(value, bool)
     if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
         (inner,) = typing.get_args(hint)
-        return isinstance(value, Iterable) and all(_fits(each, inner) for each in value)
+        # Bytes and dicts can be gone through, too, but hold something else.
+        if not isinstance(value, Iterable) or isinstance(value, (bytes, Mapping)):
+            return False
+        return all(_fits(each, inner) for each in value)
     return True
 
 
