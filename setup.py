@@ -99,5 +99,5 @@ setup(
         'docs': ['mkdocs>=1.6,<2'],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'import-linter==2.16'],
     },
-    entry_points={'console_scripts': ['trl-suite = trl_suite.cli:main']},
+    entry_points={'console_scripts': ['trl-suite = trl_suite.__main__:main']},
 )

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from unittest import mock
 
 import imageio.v3 as iio
@@ -831,6 +832,54 @@ class ProgramTest(CommandTest):
         done = self.program('info', GAPS, MUJOCO_GL='nonsense')
         self.assertEqual((done.returncode, done.stdout), (2, ''))
         self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
+
+    def test_output_that_cannot_be_written(self):
+        for redirection, message in (
+            ('>&-', 'standard output is closed'),
+            ('>/dev/full', 'No space'),
+        ):
+            done = subprocess.run(
+                ['bash', '-c', f'"{sys.executable}" -m trl_suite list --tag blind {redirection}'],
+                capture_output=True, text=True, timeout=60, check=False,
+            )  # fmt: skip
+            self.assertEqual((done.returncode, done.stdout), (2, ''))
+            self.assertRegex(done.stderr, f'^trl-suite: error: [^\n]*{message}[^\n]*\n$')
+
+    def test_an_interrupt_while_the_program_is_imported(self):
+        with tempfile.TemporaryDirectory() as folder:
+            # Numpy is imported by all commands.
+            pathlib.Path(folder, 'numpy.py').write_text('raise KeyboardInterrupt')
+            done = self.program('list', PYTHONPATH=os.pathsep.join([folder, *sys.path]))
+        self.assertEqual(
+            (done.returncode, done.stdout, done.stderr), (130, '', 'trl-suite: interrupted\n')
+        )
+
+    def test_an_interrupt_of_the_gallery(self):
+        with subprocess.Popen(
+            [sys.executable, '-m', 'trl_suite', 'gallery', '--output', str(self.folder / 'all')],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        ) as process:  # fmt: skip
+            while not list(self.folder.rglob('*.jpg')) + list(self.folder.rglob('*.png')):
+                self.assertIsNone(process.poll())
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+        self.assertEqual((process.returncode, out), (130, ''))
+        self.assertEndsWith(err, 'trl-suite: interrupted\n')
+        self.assertNotIn('Traceback', err)
+        self.assertEmpty(list(self.folder.rglob('*.part*')))
+
+    def test_a_missing_library_while_no_picture_is_asked_for(self):
+        with tempfile.TemporaryDirectory() as folder:
+            # What PyOpenGL does where the library of OSMesa is not installed.
+            pathlib.Path(folder, 'OpenGL').mkdir()
+            pathlib.Path(folder, 'OpenGL/__init__.py').write_text('None.glGetError')
+            path = os.pathsep.join([folder, *sys.path])
+            done = self.program('info', GAPS, MUJOCO_GL='osmesa', PYTHONPATH=path)
+            self.assertEqual((done.returncode, done.stdout), (2, ''))
+            self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL[^\n]*\n$')
+            done = self.program('list', '--tag', 'blind', MUJOCO_GL='osmesa', PYTHONPATH=path)
+            self.assertEqual((done.returncode, done.stderr), (0, ''))
 
     def test_a_closed_pipe_is_not_an_error(self):
         with subprocess.Popen(

@@ -1,7 +1,10 @@
 """Tests of trl_suite.environments.environment, over every environment of the catalogue."""
 
 import gc
+import pickle
+import threading
 import weakref
+from unittest import mock
 
 import dm_env
 import numpy as np
@@ -11,10 +14,11 @@ from dm_control import composer, mjcf
 from dm_env import test_utils
 from helpers import links_on_ground
 
-from trl_suite import characters, motion, suite, terrain
+from trl_suite import characters, motion, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.imitation.planar import PlanarImitation
+from trl_suite.vector import VectorEnvironment
 
 # Links and joints of each figure; muscles where it has any.
 FIGURES = {'Biped2D': (12, 11, None), 'Dog2D': (21, 20, 44), 'Raptor2D': (19, 18, 40)}
@@ -627,6 +631,10 @@ class ConstructionTest(parameterized.TestCase):
         ({'step_limit': 0}, 'step_limit is 0'), ({'step_limit': 2.5}, 'step_limit is 2.5'),
         ({'time_limit': 0}, 'time_limit is 0'), ({'time_limit': np.nan}, 'time_limit is nan'),
         ({'random': -1}, 'random is -1'), ({'random': 2**32}, 'random is 4294967296'),
+        *(({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
+          for value in (np.inf, np.nan, 'abc', True, [2], np.arange(2), -1)),
+        *(({'time_limit': value}, 'time_limit is .*; expected a positive number of seconds')
+          for value in (None, 'abc', True, [2], np.arange(2), -1)),
     )  # fmt: skip
     def test_invalid_arguments_are_rejected(self, options, message):
         with self.assertRaisesRegex(ValueError, message):
@@ -652,12 +660,18 @@ class ConstructionTest(parameterized.TestCase):
     def test_a_closed_environment_raises_errors(self):
         environment = suite.make('PD_Biped2D_Flat-v0', {'random': 0})
         environment.reset()
+        state = environment.get_state()
         environment.close()
         environment.close()
-        with self.assertRaisesRegex(RuntimeError, 'closed'):
-            environment.step(np.zeros(11))
-        with self.assertRaisesRegex(RuntimeError, 'closed'):
-            environment.reset()
+        for call in (
+            lambda: environment.step(np.zeros(11)), environment.reset, environment.get_state,
+            lambda: environment.set_state(state), environment.observation,
+            environment.observation_spec, lambda: environment.info, lambda: environment.physics,
+            lambda: environment.add_extra_hook('before_step', print),
+            lambda: rendering.frame(environment), lambda: pickle.dumps(environment),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(RuntimeError, 'the environment is closed'):
+                call()
 
     @parameterized.parameters(*EXAMPLES)
     def test_close_frees_the_simulation(self, id_):
@@ -673,6 +687,75 @@ class ConstructionTest(parameterized.TestCase):
         for look in (lambda: environment.task, lambda: environment.info, environment.action_spec):
             with self.assertRaisesRegex(RuntimeError, 'closed'):
                 look()
+
+
+class ThreadsTest(parameterized.TestCase):
+    """A second thread is refused by name, for as long as the first one is inside."""
+
+    def check(self, environment, calls):
+        inside, leave, found = threading.Event(), threading.Event(), []
+        step = environment.task.step
+
+        def wait(*arguments):
+            inside.set()
+            leave.wait(60)
+            return step(*arguments)
+
+        def first():
+            with mock.patch.object(environment.task, 'step', wait):
+                found.append(calls[0]())
+
+        thread = threading.Thread(target=first)
+        thread.start()
+        self.assertTrue(inside.wait(60))
+        for call in calls:
+            with self.assertRaisesRegex(RuntimeError, 'another thread.*one environment for each'):
+                call()
+        leave.set()
+        thread.join()
+        self.assertLen(found, 1)
+        calls[0]()  # one after the other is fine
+
+    def test_single(self):
+        environment = suite.make(GAPS, {'random': 0})
+        environment.reset()
+        state = environment.get_state()
+        self.check(environment, (
+            lambda: environment.step(np.zeros(11)), environment.reset, environment.get_state,
+            lambda: environment.set_state(state), environment.close,
+            lambda: rendering.frame(environment),
+        ))  # fmt: skip
+
+    def test_vector(self):
+        environments = VectorEnvironment(GAPS, 2, 1, seed=0)
+        environments.reset()
+        state = environments.get_state()
+        self.check(environments, (
+            lambda: environments.step(np.zeros((2, 11))), environments.reset, environments.render,
+            environments.get_state, lambda: environments.set_state(state), environments.close,
+            lambda: environments.copy_from(environments, [0], [1]), lambda: environments.seed(3),
+        ))  # fmt: skip
+
+    def test_threads_that_race(self):
+        environment, found = suite.make(GAPS, {'random': 0}), []
+        environment.reset()
+
+        def work():
+            for _ in range(30):
+                try:
+                    environment.step(np.zeros(11))
+                    found.append(None)
+                except RuntimeError as error:
+                    found.append(str(error))
+
+        threads = [threading.Thread(target=work) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        self.assertLen(found, 120)
+        self.assertIn(None, found)
+        self.assertLessEqual(len(set(found)), 2)
 
 
 if __name__ == '__main__':

@@ -436,11 +436,15 @@ class VectorTest(Same, parameterized.TestCase):
         env.reset(seed=1)
         self.assertEqual(env.step(np.zeros(env.action_space.shape, np.float32))[0][-1], 1)
 
-    @parameterized.parameters(0, 2.5, -3)
+    @parameterized.parameters(0, 2.5, -3, np.inf, 'abc', True)
     def test_invalid_max_episode_steps_are_rejected(self, steps):
-        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
+        with self.assertRaisesRegex(
+            ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'
+        ):
             SuiteVectorEnv(FLAT, 2, max_episode_steps=steps)
-        with self.assertRaisesRegex(ValueError, f'max_episode_steps is {steps}'):
+        with self.assertRaisesRegex(
+            ValueError, f'max_episode_steps is {steps!r}; expected a positive integer'
+        ):
             SuiteEnv(FLAT, max_episode_steps=steps)
         with self.assertRaisesRegex(ValueError, 'already made'):
             SuiteEnv(suite.make(FLAT), max_episode_steps=5)

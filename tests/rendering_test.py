@@ -532,6 +532,38 @@ except RuntimeError as error:
                 self.assertRegex(done.stdout, 'egl or osmesa .* glfw .*\n$')
                 self.assertEqual(done.stdout.count('\n'), 1)
 
+    def test_a_forked_child_is_refused_not_hung(self):
+        if not hasattr(os, 'fork'):
+            self.skipTest('no fork here')
+        program = f"""
+import os, signal
+from trl_suite import rendering, suite
+from trl_suite.vector import VectorEnvironment
+environment, many = suite.make({GAPS!r}), VectorEnvironment({GAPS!r}, 1, 1)
+environment.reset()
+many.reset()
+rendering.frame(environment)
+child = os.fork()
+if child == 0:
+    signal.alarm(50)
+    new = suite.make({GAPS!r})
+    new.reset()
+    for each in environment, new:
+        try:
+            rendering.frame(each)
+        except RuntimeError as error:
+            print(error)
+    environment.close()
+    print('closed', flush=True)
+    os._exit(0)
+print(os.waitpid(child, 0)[1], rendering.frame(environment).std() > 10)
+"""
+        done = run_headless(program, {})
+        self.assertEqual((done.returncode, done.stderr), (0, ''))
+        lines = done.stdout.splitlines()
+        self.assertRegex(lines[0], "cannot render after a fork: .* 'spawn'$")
+        self.assertEqual(lines[1:], [lines[0], 'closed', '0 True'])
+
     def test_dm_control_imported_first(self):
         # It then has chosen GLFW, which finds no screen.
         program = f"""

@@ -14,8 +14,10 @@ from trl_suite import motion, suite
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import make
 from trl_suite.environments.environment import Environment
+from trl_suite.registry import catalogue
 from trl_suite.tasks.imitation.planar import PlanarImitation
 from trl_suite.terrain import load
+from trl_suite.vector import VectorEnvironment
 
 EXAMPLES = (
     'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Mixed_Terrain-v0',
@@ -29,6 +31,8 @@ SPATIAL = (
 )  # fmt: skip
 GAITS = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Slopes-v0')  # more in gait_test
 DOG = EXAMPLES[1]
+ONE_OF_EACH = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())
+BROKEN = (('qvel', 1e12), ('qvel', np.nan), ('qpos', 1e12), ('qpos', np.nan))
 
 
 def advance(environment, steps, seed=0, scale=1.0):
@@ -247,6 +251,59 @@ class SaveTest(parameterized.TestCase):
         other.set_state(environment.get_state())
         np.testing.assert_array_equal(other.observation()['dog/joints_pos'], expected)
         np.testing.assert_array_equal(advance(environment, 20), advance(other, 20))
+
+
+class DivergenceTest(parameterized.TestCase):
+    """Who goes back to a state before the physics broke down goes on as if it never had."""
+
+    def test_single(self):
+        for id_ in ONE_OF_EACH:
+            environment = suite.make(id_, {'random': 1})
+            environment.reset()
+            state, data = environment.get_state(), environment.physics.data
+            idle = np.zeros(len(environment.action_map))
+            expected = environment.step(idle)
+            for field, value in BROKEN:
+                with self.subTest(id_, field=field, value=value):
+                    environment.set_state(state)
+                    getattr(data, field)[:] = value
+                    broken = environment.get_state()
+                    step = environment.step(idle)
+                    self.assertTrue(step.last() and step.discount == 0 and step.reward == 0)
+                    self.assertTrue(environment.info['diverged'])
+                    environment.set_state(state)
+                    step = environment.step(idle)
+                    self.assertEqual(step.reward, expected.reward)
+                    np.testing.assert_equal(step.observation, expected.observation)
+                    # A state that is broken itself: the episode ends or goes on, and the next is fine.
+                    environment.set_state(broken)
+                    for value in environment.step(idle).observation.values():
+                        self.assertTrue(np.isfinite(value).all())
+                    environment.reset()
+                    self.assertFalse(environment.step(idle).last())
+
+    def test_vector(self):
+        for id_ in ONE_OF_EACH:
+            options = {'num_threads': 1, 'seed': 1, 'autoreset': 'disabled'}
+            one, other = (VectorEnvironment(id_, 2, **options) for _ in range(2))
+            for each in one, other:
+                each.reset()
+            state, idle = one.get_state(), np.zeros((2, len(one.action_map)))
+            expected = one.step(idle)
+            for field, value in BROKEN:
+                with self.subTest(id_, field=field, value=value):
+                    for each in one, other:
+                        each.set_state(state)
+                        getattr(each.task.world, field)[1] = value
+                        step = each.step(idle)
+                        np.testing.assert_array_equal(step.info['diverged'], [False, True])
+                    one.set_state(state)
+                    other.copy_from(one, [0, 1], [0, 1])
+                    for each in one, other:
+                        step = each.step(idle)
+                        np.testing.assert_array_equal(step.observation, expected.observation)
+                        np.testing.assert_array_equal(step.reward, expected.reward)
+                        self.assertFalse(step.info['diverged'].any())
 
 
 class PickleTest(parameterized.TestCase):

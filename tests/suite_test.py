@@ -15,6 +15,7 @@ from trl_suite.registry import catalogue
 from trl_suite.util import resources
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+HIGH = 'PD_Biped3D_HLC_Forest-v0'
 # The planar ids of tracking that the original registers: 21 of PLAiD and 9 of Imitation.
 ORIGINAL = (
     *(
@@ -400,6 +401,29 @@ class LoadTest(parameterized.TestCase):
     def test_unknown_names_get_the_closest_ones(self, call, message):
         with self.assertRaisesRegex(ValueError, re.compile(message, re.DOTALL)):
             call()
+
+    @parameterized.parameters(
+        (
+            lambda: suite.combine(None),
+            'a character is a CharacterSpec or a name, one of dog.*not None',
+        ),
+        (lambda: suite.build(3), 'a character is'),
+        (lambda: suite.make(None), 'the id .* not None'),
+        (lambda: suite.make([]), 'the id of an environment is a string'),
+        (lambda: suite.build('dog', clip=3), 'clip is a name, a file, a Clip or Steps, not 3'),
+        (lambda: suite.make(GAPS, 3), 'task_kwargs is 3; expected a dict'),
+        (lambda: suite.make(GAPS, None, 'x'), "environment_kwargs is 'x'; expected a dict"),
+        (lambda: suite.make(HIGH, {'controller': 3}), 'controller is 3; expected a policy'),
+    )
+    def test_other_types_are_named(self, call, message):
+        with self.assertRaisesRegex(TypeError, message):
+            call()
+
+    def test_an_unknown_controller_is_no_environment(self):
+        with self.assertRaisesRegex(
+            ValueError, "^unknown controller 'PD_Biped3D_LLC_General.*Step-v0"
+        ):
+            suite.make(HIGH, {'controller': 'PD_Biped3D_LLC_General-v0'})
 
     def test_given_options_are_not_changed(self):
         task_kwargs, environment_kwargs = {'random': 1, 'substeps': 8}, {'flat_observation': True}

@@ -363,6 +363,60 @@ class PartialBatchTest(parameterized.TestCase):
             ):
                 call([3])
 
+    @parameterized.parameters(1, 2)
+    def test_none_of_them(self, num_threads):
+        """Loops that reset or step those that a mask names need not ask whether it names any."""
+        environments = VectorEnvironment(FLAT, 3, num_threads, 0, autoreset='disabled')
+        before, idle = environments.reset(), np.zeros((3, 6))
+        state = pickle.dumps(environments.get_state())
+        for none in ([], (), np.zeros(3, bool), np.zeros(0, int), np.zeros(0)):
+            np.testing.assert_array_equal(environments.reset(none), before)
+            np.testing.assert_array_equal(environments.reset(none, seed=4), before)
+            step = environments.step(idle, none)
+            np.testing.assert_array_equal(step.observation, before)
+            np.testing.assert_array_equal(step.reward, 0)
+            environments.set_state(environments.get_state(none), none)
+            environments.copy_from(environments, [], none)
+        self.assertEqual(pickle.dumps(environments.get_state()), state)
+
+    @parameterized.parameters(
+        'Torque_Biped2D_LLC_Imitate_Flat-v0', 'Vel_Biped2D_LLC_Imitate_Flat-v0', GAPS,
+        'PD_Biped2D_LLC_Imitate_Run_Flat-v0',
+    )  # fmt: skip
+    def test_a_state_of_another_environment(self, id_):
+        environments, other = (VectorEnvironment(each, 2, 1, 0) for each in (FLAT, id_))
+        for each in environments, other:
+            each.reset()
+        before = pickle.dumps(environments.get_state())
+        single = suite.make(FLAT)
+        single.reset()
+        for state in (other.get_state(), {}, single.get_state()):
+            with self.assertRaisesRegex(ValueError, 'the state belongs to .*; this environment is'):
+                environments.set_state(state)
+        with self.assertRaisesRegex(ValueError, 'the state belongs to simulations of'):
+            single.set_state(environments.get_state())
+        for state in (None, [], 3):
+            for each in environments, single:
+                with self.assertRaisesRegex(TypeError, 'a state is a dict from get_state, not '):
+                    each.set_state(state)
+        partial = environments.get_state()
+        del partial['ended']
+        with self.assertRaisesRegex(ValueError, "the state lacks 'ended'"):
+            environments.set_state(partial)
+        self.assertEqual(pickle.dumps(environments.get_state()), before)
+
+    def test_options_that_are_arrays(self):
+        options = [{'start_phase': np.array([[0.0, high]])} for high in (0.5, 0.5, 0.6)]
+        one, same, other = (VectorEnvironment(FLAT, 2, 1, 0, task_kwargs=each) for each in options)
+        for each in one, same, other:
+            each.reset()
+        one.copy_from(same, [0], [1])
+        np.testing.assert_array_equal(one.task.world.qpos[1], same.task.world.qpos[0])
+        with self.assertRaisesRegex(ValueError, 'id or options differ'):
+            one.copy_from(other, [0], [1])
+        with self.assertRaisesRegex(TypeError, 'other is Environment; expected VectorEnvironment'):
+            one.copy_from(suite.make(FLAT), [0], [1])
+
     def test_invalid_copies_are_rejected(self):
         environments, other = VectorEnvironment(GAPS, 2, 1, 0), VectorEnvironment(FLAT, 2, 1, 0)
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):
@@ -429,17 +483,72 @@ class RobustnessTest(parameterized.TestCase):
         ({'dtype': np.int32}, 'float64 or float32'),
         ({'seed': [1, 2]}, '2 seeds for 3 simulations'),
         ({'environment': 'PD_Biped2D_Gap_Terrain-v0'}, 'PD_Biped2D_Gaps_Terrain-v0'),
+        *(
+            ({'num_envs': value}, 'num_envs is .*; expected a whole number from 1')
+            for value in ('abc', None, np.inf, np.nan, [2], True, 2**32)
+        ),
+        *(
+            ({'num_threads': value}, 'num_threads is .*; expected a whole number from 0')
+            for value in ('abc', None, np.inf, 1.5, 2**40)
+        ),
+        *(
+            ({'step_limit': value}, 'step_limit is .*; expected a positive integer or None')
+            for value in ('abc', np.inf, [1, 2], -2)
+        ),
+        ({'seed': -1}, 'seed is -1; expected 0 or a positive integer'),
         ({'task_kwargs': {'sub_steps': 3}}, "did you mean 'substeps'"),
     )
     def test_invalid_arguments_are_rejected(self, arguments, message):
         with self.assertRaisesRegex(ValueError, message):
             VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
 
+    @parameterized.parameters(
+        ({'environment': 3}, 'an environment is an id, an alias or an EnvSpec, not 3'),
+        ({'environment': None}, 'an environment is an id'), ({'seed': 2.5}, 'seed is 2.5; expected'),
+        ({'seed': 'abc'}, "seed is 'abc'; expected an integer"),
+        ({'task_kwargs': 3}, 'task_kwargs is 3; expected a dict of options'),
+    )  # fmt: skip
+    def test_arguments_of_another_type(self, arguments, message):
+        with self.assertRaisesRegex(TypeError, message):
+            VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
+
+    @parameterized.parameters([[0.7]], [['a']], [[[0, 1]]], [[None]])
+    def test_numbers_of_simulations_that_are_none(self, env_ids):
+        environments, before = self.environments, pickle.dumps(self.environments.get_state())
+        for call in (
+            environments.reset, environments.get_state, lambda ids: environments.seed(3, ids),
+            lambda ids: environments.step(np.zeros((3, 6)), ids),
+            lambda ids: environments.set_state(environments.get_state([0]), ids),
+            lambda ids: environments.copy_from(environments, [0], ids),
+            lambda ids: environments.render(ids[0]),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(TypeError, 'env_ids is .* expected integers'):
+                call(env_ids)
+        self.assertEqual(pickle.dumps(environments.get_state()), before)
+
+    @parameterized.parameters('datetime64[D]', 'timedelta64[s]', complex, 'U1')
+    def test_actions_that_are_no_numbers(self, dtype):
+        for environment, n in (self.environments, (3,)), (suite.make(FLAT), ()):
+            environment.reset()
+            with self.assertRaisesRegex(ValueError, 'not an array of numbers: the type is'):
+                environment.step(np.zeros((*n, 6)).astype(int).astype(dtype))
+
     def test_a_closed_environment_raises_errors(self):
-        self.environments.close()
-        self.environments.close()
-        with self.assertRaisesRegex(RuntimeError, 'closed'):
-            self.environments.step(np.zeros((3, 6)))
+        environments, other = self.environments, VectorEnvironment(FLAT, 3, 1, seed=0)
+        other.reset()
+        state = environments.get_state()
+        environments.close()
+        environments.close()
+        for call in (
+            lambda: environments.step(np.zeros((3, 6))), environments.reset, environments.render,
+            environments.get_state, lambda: environments.set_state(state),
+            lambda: environments.seed(1), lambda: environments.begin(np.arange(3)),
+            lambda: environments.share(print, np.arange(3)), lambda: environments.info,
+            lambda: environments.task, lambda: environments.copy_from(other, [0], [0]),
+            lambda: other.copy_from(environments, [0], [0]),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(RuntimeError, 'the environment is closed'):
+                call()
 
     def test_a_step_before_reset_raises_an_error(self):
         with self.assertRaisesRegex(RuntimeError, 'before the first reset'):

@@ -1,8 +1,18 @@
-"""`python -m trl_suite`: the command line."""
+"""`python -m trl_suite` and `trl-suite`: the command line."""
 
 import sys
 
-from trl_suite import cli
+
+def main(prog: str = 'trl-suite') -> int:
+    """Runs the command line; an interrupt while it is imported ends in one line, too."""
+    try:
+        from trl_suite import cli
+
+        return cli.main(prog=prog)
+    except KeyboardInterrupt:
+        print('trl-suite: interrupted', file=sys.stderr)
+        return 130
+
 
 if __name__ == '__main__':
-    sys.exit(cli.main(prog='python -m trl_suite'))
+    sys.exit(main('python -m trl_suite'))

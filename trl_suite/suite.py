@@ -47,7 +47,7 @@ def load(
     Raises:
       ValueError: unknown names or options; the message has the closest matches.
     """
-    if domain_name not in TASKS_BY_DOMAIN:
+    if str(domain_name) not in TASKS_BY_DOMAIN:
         raise ValueError(errors.unknown('domain', domain_name, TASKS_BY_DOMAIN))
     if task_name not in TASKS_BY_DOMAIN[domain_name]:
         raise ValueError(
@@ -56,7 +56,7 @@ def load(
             )
         )
     spec = catalogue.BY_TASK[domain_name, task_name]
-    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(spec, task_kwargs, environment_kwargs)
 
 
 def make(
@@ -68,7 +68,7 @@ def make(
 
     Arguments and errors are those of `load`.
     """
-    return build_environment(find(id), dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(find(id), task_kwargs, environment_kwargs)
 
 
 def reference_policy(id: str) -> policies.Policy:
@@ -101,7 +101,7 @@ def build(
       ValueError: unknown names or options, or parts that are incompatible.
     """
     spec = combine(character, actuation, terrain, task, clip)
-    return build_environment(spec, dict(task_kwargs or {}), dict(environment_kwargs or {}))
+    return build_environment(spec, task_kwargs, environment_kwargs)
 
 
 def combine(
@@ -133,6 +133,13 @@ def combine(
       ValueError: unknown names, or parts that are incompatible.
     """
     own: dict[str, Any] = {}
+    if not isinstance(character, (str, characters.CharacterSpec)):
+        raise TypeError(
+            f'a character is a CharacterSpec or a name, one of {", ".join(characters.CHARACTERS)}; '
+            f'not {character!r}'
+        )
+    if not isinstance(clip, (str, motion.Clip, motion.Steps, type(None))):
+        raise TypeError(f'clip is a name, a file, a Clip or Steps, not {clip!r}')
     if not isinstance(character, str):
         own['character'], character = character, character.name
     elif character not in characters.CHARACTERS:
@@ -232,9 +239,13 @@ def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
 
 
 def build_environment(
-    spec: EnvSpec, task_kwargs: dict[str, Any], environment_kwargs: dict[str, Any]
+    spec: EnvSpec,
+    task_kwargs: Mapping[str, Any] | None,
+    environment_kwargs: Mapping[str, Any] | None,
 ) -> Environment:
     """Builds an environment from its spec; see `load` for the other arguments."""
+    task_kwargs = errors.options('task_kwargs', task_kwargs)
+    environment_kwargs = errors.options('environment_kwargs', environment_kwargs)
     known = [*_ENVIRONMENT_OPTIONS, 'flat_observation']
     for name in environment_kwargs:
         if name not in known:

@@ -77,7 +77,10 @@ class ActionMap:
         shape = (*env_ids, len(self))
         are, have = ('actions are', 'actions have') if env_ids else ('action is', 'action has')
         try:
-            action = np.asarray(action, dtype=float)
+            action = np.asarray(action)
+            if action.dtype.kind not in 'fiubO':  # NumPy would turn dates and strings into numbers
+                raise ValueError(f'the type is {action.dtype}')
+            action = action.astype(float, copy=False)
         except (TypeError, ValueError) as error:
             raise ValueError(f'{are} not an array of numbers: {error}') from None
         if action.shape != shape:

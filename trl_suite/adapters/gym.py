@@ -80,7 +80,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
         if not isinstance(environment, Environment):
-            spec = suite.find(environment) if isinstance(environment, str) else environment
+            spec = catalogue.spec_of(environment)
             environment = suite.build_environment(spec, limited(task_kwargs, max_episode_steps), {})
         elif task_kwargs or max_episode_steps is not None:
             raise ValueError(
@@ -174,7 +174,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
-        spec = suite.find(environment) if isinstance(environment, str) else environment
+        spec = catalogue.spec_of(environment)
         options = limited(task_kwargs, max_episode_steps)
         self.environment = VectorEnvironment(
             spec, num_envs, num_threads, options.pop('random', None),
@@ -242,14 +242,18 @@ def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
 
     Gymnasium's is None if it is not given, and -1 for none.
     """
-    options = dict(task_kwargs or {})
+    options = errors.options('task_kwargs', task_kwargs)
     if max_episode_steps is None:
         return options
-    if max_episode_steps == -1:
+    whole = isinstance(max_episode_steps, (int, np.integer)) and not isinstance(
+        max_episode_steps, bool
+    )
+    if whole and max_episode_steps == -1:
         return {'step_limit': None, **options}
-    if int(max_episode_steps) != max_episode_steps or max_episode_steps < 1:
+    if not whole or max_episode_steps < 1:
         raise ValueError(
-            f'max_episode_steps is {max_episode_steps}; expected a positive integer, or -1'
+            f'max_episode_steps is {max_episode_steps!r}; expected a positive integer, or -1 for no '
+            'limit'
         )
     own = options.get('step_limit')
     options['step_limit'] = max_episode_steps if own is None else min(own, max_episode_steps)

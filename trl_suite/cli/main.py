@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import pathlib
 import re
@@ -50,13 +51,14 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     try:
         with program.terminable():
             arguments = _parser(prog).parse_args(argv)
+            if sys.stdout is None:
+                raise OSError('standard output is closed')
             command = engine.load(f'trl_suite.cli.{arguments.command}')
             status = command.run(arguments) or 0
             sys.stdout.flush()
     except BrokenPipeError:
         # The reader has closed the pipe; nothing may be flushed into it at exit.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
     except program.Terminated:
         print('trl-suite: terminated', file=sys.stderr)
@@ -65,9 +67,17 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
     except program.EXPECTED as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _drop_output()
         print(f'trl-suite: error: {program.in_one_line(error)}', file=sys.stderr)
         return 2
     return status
+
+
+def _drop_output() -> None:
+    """Discards output that cannot be written, so that Python does not try again at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):

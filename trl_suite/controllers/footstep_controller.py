@@ -79,6 +79,10 @@ class Controller:
                 f'({n}, {"k" if size is None else size}), one row for each observation'
             )
         if not np.isfinite(action).all():
+            # The simulation of an observation that is not finite has diverged; its action is unused.
+            diverged = ~np.isfinite(observation).all(1)
+            action = np.where(diverged[:, None], 0.0, action)
+        if not np.isfinite(action).all():
             env_id = int(np.argwhere(~np.isfinite(action))[0, 0])
             raise ValueError(
                 f'controller {self.name} returns an action that is not finite for observation {env_id}'
@@ -94,6 +98,7 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
         (n, size) to actions (n, k).
 
     Raises:
+      TypeError: another type.
       ValueError: a corrupt file; see `policies.load`.
       FileNotFoundError: there is no such file.
     """
@@ -103,4 +108,6 @@ def load(source: str | os.PathLike[str] | Controller | Function) -> Controller:
         return Controller(source, repr(source.id))
     if callable(source):
         return Controller(source, getattr(source, '__name__', type(source).__name__))
+    if not isinstance(source, (str, os.PathLike)):
+        raise TypeError(f'controller is {source!r}; expected a policy, its file or a function')
     return Controller(policies.load(source), repr(os.fspath(source)))

@@ -11,10 +11,12 @@ from dm_control import composer
 from dm_control.composer import observation as composer_observation
 from dm_env import specs
 
+from trl_suite.environments import arguments
 from trl_suite.tasks.task import Task
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
+_STATE = ('world', 'task', 'random', 'steps', 'reset_next_step')
 _NO_SUBSTEPS = 'substeps run in one call to C; use a plain composer.Environment for this task'
 
 
@@ -27,6 +29,8 @@ class Environment(composer.Environment):
 
     As usual in dm_env, `TimeStep.discount` of the last step is 0 if the task failed and 1 if the
     step or time limit ended the episode.
+
+    Only one thread may use an environment at a time; a second one is rejected.
     """
 
     _task: Task
@@ -53,10 +57,8 @@ class Environment(composer.Environment):
           ValueError: a limit that is not positive, an invalid seed, or substep hooks.
           TypeError: a seed that is not an integer.
         """
-        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
-            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
-        if not time_limit > 0:
-            raise ValueError(f'time_limit is {time_limit}; expected a positive number of seconds')
+        step_limit = arguments.check_step_limit(step_limit)
+        time_limit = arguments.check_time_limit(time_limit)
         if isinstance(random, (float, str, bytes)):
             raise TypeError(f'random is {random!r}; expected a seed, an integer in [0, 2**32)')
         if isinstance(random, int) and not 0 <= random < 2**32:
@@ -64,6 +66,7 @@ class Environment(composer.Environment):
         self._flat_observation = flat_observation
         self._step_limit = step_limit
         self._steps = 0
+        self.one_thread = arguments.OneThread()  # entered by all that touches the simulation
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
@@ -88,6 +91,7 @@ class Environment(composer.Environment):
                 raise ValueError(f'the task or an entity in it has a {name} hook: {_NO_SUBSTEPS}')
 
     def add_extra_hook(self, hook_name: str, hook_callable: Callable[..., None]) -> None:
+        self._check_open()
         if hook_name in _SUBSTEP_HOOKS:
             raise ValueError(f'cannot add a {hook_name} hook: {_NO_SUBSTEPS}')
         super().add_extra_hook(hook_name, hook_callable)
@@ -106,15 +110,16 @@ class Environment(composer.Environment):
         """Begins an episode; returns its first time step.
 
         Raises:
-          RuntimeError: after `close`.
+          RuntimeError: after `close`, or while another thread uses the environment.
         """
-        self._check_open()
-        self._steps = 0
-        self._reset_next_step = False
-        self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-        if self._extra_observables:
-            self._observation_updater.reset(self._physics_proxy, self._random_state)
-        return dm_env.restart(self._observe())
+        with self.one_thread:
+            self._check_open()
+            self._steps = 0
+            self._reset_next_step = False
+            self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+            if self._extra_observables:
+                self._observation_updater.reset(self._physics_proxy, self._random_state)
+            return dm_env.restart(self._observe())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Takes one action; begins a new episode instead if the last time step ended one.
@@ -124,12 +129,15 @@ class Environment(composer.Environment):
 
         Raises:
           ValueError: an action of the wrong shape, or with NaN or infinity.
-          RuntimeError: after `close`.
+          RuntimeError: after `close`, or while another thread uses the environment.
         """
-        self._check_open()
-        action = self._task.action_map.checked(action)
-        if self._reset_next_step:
-            return self.reset()
+        with self.one_thread:
+            self._check_open()
+            action = self._task.action_map.checked(action)
+            return self.reset() if self._reset_next_step else self._advance(action)
+
+    def _advance(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Takes one action within an episode."""
         task, physics = self._task, self._physics_proxy
         if self._extra_observables:
             self._observation_updater.prepare_for_next_control_step()
@@ -154,10 +162,11 @@ class Environment(composer.Environment):
 
     def close(self) -> None:
         """Frees the simulation and the task; may be called twice."""
-        if self._physics is not None:
-            super().close()
-            # All of them lead to arrays in the model and its data, which would stay with them.
-            self._task = self._hooks = self._observation_updater = None  # type: ignore[assignment]
+        with self.one_thread:
+            if self._physics is not None:
+                super().close()
+                # All of them lead to arrays in the model and its data, which would stay with them.
+                self._task = self._hooks = self._observation_updater = None  # type: ignore[assignment]
 
     @property
     def task(self) -> Task:
@@ -172,6 +181,11 @@ class Environment(composer.Environment):
     def _check_open(self) -> None:
         if self._physics is None:
             raise RuntimeError('the environment is closed')
+
+    @property
+    def physics(self) -> Any:
+        self._check_open()
+        return super().physics
 
     def _observe(self) -> dict[str, np.ndarray]:
         row = self.task.observation[0].copy()
@@ -193,6 +207,7 @@ class Environment(composer.Environment):
         return self.task.action_spec(self._physics_proxy)
 
     def observation_spec(self) -> dict[str, specs.Array]:
+        self._check_open()
         return {
             name: specs.Array(value.shape, value.dtype, name)
             for name, value in self._observe().items()
@@ -221,7 +236,8 @@ class Environment(composer.Environment):
     @property
     def info(self) -> dict[str, Any]:
         """Further results of the last step, by name: see the task's `info_arrays`."""
-        return self.task.info_of(0)
+        self._check_open()
+        return self._task.info_of(0)
 
     # State.
 
@@ -231,34 +247,39 @@ class Environment(composer.Environment):
         The dict holds arrays and plain values; it can be pickled, and restored by any environment
         that was built in the same way.
         """
-        return {
-            'made_for': self.task.signature,
-            'world': self._task.world.get_state(0),
-            'task': self._task.get_state(0),
-            'random': self._random_state.get_state(),
-            'steps': self._steps,
-            'reset_next_step': self._reset_next_step,
-        }
+        with self.one_thread:
+            self._check_open()
+            return {
+                'made_for': self._task.signature,
+                'world': self._task.world.get_state(0),
+                'task': self._task.get_state(0),
+                'random': self._random_state.get_state(),
+                'steps': self._steps,
+                'reset_next_step': self._reset_next_step,
+            }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores a state from `get_state`; the same actions then give bit-identical results.
 
         Raises:
+          TypeError: the state is not a dict.
           ValueError: the state belongs to another environment; this one is unchanged.
+          RuntimeError: after `close`, or while another thread uses the environment.
         """
-        expected, found = self.task.signature, state.get('made_for')
-        if found != expected:
-            raise ValueError(f'the state belongs to {found}; this environment is {expected}')
-        self._task.set_state(0, state['task'])
-        self._task.world.set_state(0, state['world'])
-        self._random_state.set_state(state['random'])
-        self._steps = state['steps']
-        self._reset_next_step = state['reset_next_step']
-        if self._extra_observables:
-            self._observation_updater.reset(self._physics_proxy, self._random_state)
+        with self.one_thread:
+            self._check_open()
+            arguments.check_state(state, self._task.signature, _STATE)
+            self._task.set_state(0, state['task'])
+            self._task.world.set_state(0, state['world'])
+            self._random_state.set_state(state['random'])
+            self._steps = state['steps']
+            self._reset_next_step = state['reset_next_step']
+            if self._extra_observables:
+                self._observation_updater.reset(self._physics_proxy, self._random_state)
 
     def observation(self) -> dict[str, np.ndarray]:
         """Returns the observation of the current state, e.g. after `set_state`."""
+        self._check_open()
         return self._observe()
 
     def __reduce__(self) -> tuple[Any, ...]:

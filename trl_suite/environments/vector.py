@@ -19,14 +19,17 @@ from numpy.typing import DTypeLike
 
 from trl_suite import rendering
 from trl_suite.engine import BatchWorld, light_model
+from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.build import build_task
-from trl_suite.registry.catalogue import EnvSpec, find
+from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
 
 MOST_ENVS = 2**20  # simulations of one batch
+MOST_THREADS = 4096
 AUTORESET = ('next_step', 'same_step', 'disabled')
+_STATE = ('world', 'task', 'random', 'seeds', 'steps', 'ended', 'fresh')
 
 
 class Step(NamedTuple):
@@ -100,27 +103,22 @@ class VectorEnvironment:
           ValueError: unknown names or options, or numbers out of range.
         """
         errors.check_whole('num_envs', num_envs, 1, MOST_ENVS)
-        if int(num_threads) != num_threads or num_threads < 0:
-            raise ValueError(f'num_threads is {num_threads}; expected 0 or a positive integer')
+        errors.check_whole('num_threads', num_threads, 0, MOST_THREADS, '; 0 uses all cores')
         if autoreset not in AUTORESET:
             raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
         if np.dtype(dtype) not in (np.dtype(np.float64), np.dtype(np.float32)):
             raise ValueError(f'dtype is {np.dtype(dtype)}; expected float64 or float32')
-        self.spec = find(environment) if isinstance(environment, str) else environment
+        self.spec = spec_of(environment)
         self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
         self.flat_observation = flat_observation
-        self._task_kwargs = options = dict(task_kwargs or {})
+        self._task_kwargs = options = errors.options('task_kwargs', task_kwargs)
         if 'random' in options:
             raise ValueError("task_kwargs has 'random'; here the argument `seed` takes its place")
-        own = self.spec.step_limit if step_limit == -1 else step_limit
-        self.step_limit = step_limit = options.pop('step_limit', own)
-        if step_limit is not None and (int(step_limit) != step_limit or step_limit < 1):
-            raise ValueError(f'step_limit is {step_limit}; expected a positive integer or None')
-        self.time_limit: float = options.pop('time_limit', float('inf'))
-        if not self.time_limit > 0:
-            raise ValueError(
-                f'time_limit is {self.time_limit}; expected a positive number of seconds'
-            )
+        own = (
+            self.spec.step_limit if isinstance(step_limit, int) and step_limit == -1 else step_limit
+        )
+        self.step_limit = arguments.check_step_limit(options.pop('step_limit', own))
+        self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
         self._num_threads = int(num_threads)
         self._task = build_task(self.spec, self._task_kwargs)
         model = light_model(self._task.root_entity.mjcf_model)
@@ -129,6 +127,7 @@ class VectorEnvironment:
         )
         self._task.bind(self._world)
         self._pid = os.getpid()
+        self._one_thread = arguments.OneThread()
         self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
         self.control_timestep: float = self._task.control_timestep
         self._steps = np.zeros(self.num_envs, int)
@@ -149,19 +148,25 @@ class VectorEnvironment:
         Args:
           seed: one seed for all n simulations or n seeds, as for the constructor.
           env_ids: numbers of the simulations to reseed, or a mask (n,) bool; None for all.
+
+        Raises:
+          TypeError: a seed that is not an integer.
+          ValueError: a negative seed, or a wrong number of seeds.
         """
-        if seed is None or np.ndim(seed) == 0:
-            sequence = np.random.SeedSequence(seed)  # type: ignore[arg-type]
-            seeds = sequence.generate_state(self.num_envs, np.uint32)
-        else:
-            seeds = np.asarray(seed)
-            if seeds.shape != (self.num_envs,):
-                raise ValueError(f'{seeds.size} seeds for {self.num_envs} simulations')
-            if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
-                raise ValueError('seeds must be integers in [0, 2**32)')
-        for env_id in self._numbers(env_ids).tolist():
-            self.seeds[env_id] = seeds[env_id]
-            self._random[env_id] = np.random.RandomState(int(seeds[env_id]))
+        with self._one_thread:
+            self._check_usable()
+            if seed is None or np.ndim(seed) == 0:
+                sequence = _seed_sequence(seed)
+                seeds = sequence.generate_state(self.num_envs, np.uint32)
+            else:
+                seeds = np.asarray(seed)
+                if seeds.shape != (self.num_envs,):
+                    raise ValueError(f'{seeds.size} seeds for {self.num_envs} simulations')
+                if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
+                    raise ValueError('seeds must be integers in [0, 2**32)')
+            for env_id in self._numbers(env_ids).tolist():
+                self.seeds[env_id] = seeds[env_id]
+                self._random[env_id] = np.random.RandomState(int(seeds[env_id]))
 
     def reset(
         self,
@@ -178,15 +183,16 @@ class VectorEnvironment:
         Returns:
           The observations of all simulations.
         """
-        self._check_usable()
-        numbers = self._numbers(env_ids)
-        if self._fresh and len(numbers) < self.num_envs:
-            raise ValueError('the first reset must be of all simulations')
-        if seed is not None:
-            self.seed(seed, numbers)
-        self._fresh = False
-        self.share(self.begin, numbers)
-        return self._observation()
+        with self._one_thread:
+            self._check_usable()
+            numbers = self._numbers(env_ids)
+            if self._fresh and len(numbers) < self.num_envs:
+                raise ValueError('the first reset must be of all simulations')
+            if seed is not None:
+                self.seed(seed, numbers)
+            self._fresh = False
+            self.share(self.begin, numbers)
+            return self._observation()
 
     def step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None = None) -> Step:
         """Takes one step in every simulation, or in some.
@@ -195,16 +201,20 @@ class VectorEnvironment:
           action: (n, k), clipped to [-1, 1].
           env_ids: numbers of simulations, or a mask (n,) bool; None for all. The others are not
             stepped: their reward and its terms are 0, and their other entries of `info` are those
-              of
-            their last step.
+            of their last step.
 
         Raises:
           ValueError: an action of the wrong shape, or with NaN or infinity; the message names the
             simulation.
-          RuntimeError: before the first reset, after `close`, in a forked process, or with autoreset
-            'disabled' for a simulation that has ended.
+          RuntimeError: before the first reset, after `close`, in a forked process, while another
+            thread uses the environment, or with autoreset 'disabled' for a simulation that has
+            ended.
         """
-        self._check_usable()
+        with self._one_thread:
+            self._check_usable()
+            return self._step(action, env_ids)
+
+    def _step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None) -> Step:
         if self._fresh:
             raise RuntimeError('step before the first reset')
         action = self.action_map.checked(action, self.num_envs)
@@ -261,14 +271,16 @@ class VectorEnvironment:
 
     def render(self, env_id: int = 0, **options: Any) -> np.ndarray:
         """Renders one simulation, (h, w, 3) uint8; options as for `trl_suite.rendering.frame`."""
-        self._check_usable()
-        assert self._world is not None
-        if self._picture is None:  # the models of the simulations have no visual assets
-            self._picture = Environment(build_task(self.spec, self._task_kwargs))
-            self._picture.reset()
-        self._picture.task.set_state(0, self._task.get_state(env_id))
-        self._picture.task.world.set_state(0, self._world.get_state(env_id))
-        return rendering.frame(self._picture, **options)
+        with self._one_thread:
+            self._check_usable()
+            assert self._world is not None
+            if self._picture is None:  # the models of the simulations have no visual assets
+                self._picture = Environment(build_task(self.spec, self._task_kwargs))
+                self._picture.reset()
+            self._ids([env_id])
+            self._picture.task.set_state(0, self._task.get_state(env_id))
+            self._picture.task.world.set_state(0, self._world.get_state(env_id))
+            return rendering.frame(self._picture, **options)
 
     @property
     def task(self) -> Task:
@@ -278,66 +290,73 @@ class VectorEnvironment:
 
     def close(self) -> None:
         """Frees the simulations; may be called twice."""
-        if self._world is not None and os.getpid() == self._pid:
-            self._world.close()
-        self._world = None
-        self._task = None  # type: ignore[assignment]
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        with self._one_thread:
+            if self._world is not None and os.getpid() == self._pid:
+                self._world.close()
+            self._world = None
+            self._task = None  # type: ignore[assignment]
+            if self._picture is not None:
+                self._picture.close()
+                self._picture = None
 
-    def get_state(self, env_ids: Sequence[int] | None = None) -> dict[str, Any]:
+    def get_state(self, env_ids: np.ndarray | Sequence[int] | None = None) -> dict[str, Any]:
         """Returns the complete state of some simulations, or of all.
 
         Args:
-          env_ids: numbers of m simulations; None for all.
+          env_ids: numbers of m simulations, or a mask (n,) bool; None for all.
         """
-        self._check_usable()
-        assert self._world is not None
-        env_ids = list(range(self.num_envs) if env_ids is None else env_ids)
-        self._numbers(env_ids)
-        return {
-            'world': [self._world.get_state(env_id) for env_id in env_ids],
-            'task': [self._task.get_state(env_id) for env_id in env_ids],
-            'random': [self._random[env_id].get_state() for env_id in env_ids],
-            'seeds': self.seeds[env_ids],
-            'steps': self._steps[env_ids],
-            'ended': self._ended[env_ids],
-            'fresh': self._fresh,
-        }
+        with self._one_thread:
+            self._check_usable()
+            assert self._world is not None
+            ids = self._ids(env_ids)
+            return {
+                'made_for': self._owner,
+                'world': [self._world.get_state(env_id) for env_id in ids],
+                'task': [self._task.get_state(env_id) for env_id in ids],
+                'random': [self._random[env_id].get_state() for env_id in ids],
+                'seeds': self.seeds[ids],
+                'steps': self._steps[ids],
+                'ended': self._ended[ids],
+                'fresh': self._fresh,
+            }
 
-    def set_state(self, state: dict[str, Any], env_ids: Sequence[int] | None = None) -> None:
+    def set_state(
+        self, state: dict[str, Any], env_ids: np.ndarray | Sequence[int] | None = None
+    ) -> None:
         """Restores a state from `get_state` of an environment with the same id and options.
 
         Args:
           state: state of m simulations.
-          env_ids: numbers of the m simulations to restore, without repeats; None for all.
+          env_ids: numbers of the m simulations to restore, without repeats, or a mask (n,) bool;
+            None for all.
 
         Raises:
-          ValueError: the state has another number of simulations, or `env_ids` is invalid.
+          TypeError: the state is not a dict.
+          ValueError: the state belongs to another environment or has another number of
+            simulations, or `env_ids` is invalid; this environment is unchanged.
           RuntimeError: only some simulations are restored before the first reset.
         """
-        self._check_usable()
-        assert self._world is not None
-        if env_ids is not None and self._fresh:
-            raise RuntimeError('set_state of some simulations before the first reset')
-        numbers = list(range(self.num_envs) if env_ids is None else env_ids)
-        if len(state['world']) != len(numbers):
-            raise ValueError(
-                f'the state has {len(state["world"])} simulations; expected {len(numbers)}'
-            )
-        if len(self._numbers(numbers)) != len(numbers):
-            raise ValueError(
-                f'simulations {numbers}; expected each of {len(numbers)} simulations once'
-            )
-        for i, env_id in enumerate(numbers):
-            self._task.set_state(env_id, state['task'][i])
-            self._world.set_state(env_id, state['world'][i])
-            self._random[env_id].set_state(state['random'][i])
-        self.seeds[numbers] = state['seeds']
-        self._steps[numbers], self._ended[numbers] = state['steps'], state['ended']
-        if env_ids is None:
-            self._fresh = state['fresh']
+        with self._one_thread:
+            self._check_usable()
+            assert self._world is not None
+            if env_ids is not None and self._fresh:
+                raise RuntimeError('set_state of some simulations before the first reset')
+            arguments.check_state(state, self._owner, _STATE)
+            ids = self._ids(env_ids)
+            if len(state['world']) != len(ids):
+                raise ValueError(
+                    f'the state has {len(state["world"])} simulations; expected {len(ids)}'
+                )
+            if len(set(ids)) != len(ids):
+                raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
+            for i, env_id in enumerate(ids):
+                self._task.set_state(env_id, state['task'][i])
+                self._world.set_state(env_id, state['world'][i])
+                self._random[env_id].set_state(state['random'][i])
+            self.seeds[ids] = state['seeds']
+            self._steps[ids], self._ended[ids] = state['steps'], state['ended']
+            if env_ids is None:
+                self._fresh = state['fresh']
 
     def copy_from(
         self, other: VectorEnvironment, other_rows: Sequence[int], env_ids: Sequence[int]
@@ -353,28 +372,37 @@ class VectorEnvironment:
           env_ids: numbers of as many simulations of this environment, without repeats.
 
         Raises:
+          TypeError: `other` is not a vector environment.
           ValueError: an environment with another id or options, or invalid simulation numbers.
           RuntimeError: one of the two environments was never reset.
         """
-        self._check_usable()
-        other._check_usable()
-        if self._fresh or other._fresh:
-            raise RuntimeError('copy_from before the first reset')
-        assert self._world is not None and other._world is not None
-        if other.spec != self.spec or other._task_kwargs != self._task_kwargs:
-            raise ValueError(
-                f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options differ'
-            )
-        if len(other_rows) != len(env_ids) or len(self._numbers(env_ids)) != len(env_ids):
-            raise ValueError(
-                f'cannot copy {len(other_rows)} simulations to simulations {list(env_ids)}; expected '
-                'as many different ones'
-            )
-        other._numbers(other_rows)
-        for source, env_id in zip(other_rows, env_ids, strict=True):
-            self._task.set_state(env_id, other._task.get_state(source))
-            self._world.set_state(env_id, other._world.get_state(source))
-            self._steps[env_id], self._ended[env_id] = other._steps[source], other._ended[source]
+        if not isinstance(other, VectorEnvironment):
+            raise TypeError(f'other is {type(other).__name__}; expected VectorEnvironment')
+        with self._one_thread, other._one_thread:
+            self._check_usable()
+            other._check_usable()
+            if self._fresh or other._fresh:
+                raise RuntimeError('copy_from before the first reset')
+            assert self._world is not None and other._world is not None
+            if not (
+                arguments.same(other.spec, self.spec)
+                and arguments.same(other._task_kwargs, self._task_kwargs)
+            ):
+                raise ValueError(
+                    f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options '
+                    'differ'
+                )
+            sources, ids = other._ids(other_rows), self._ids(env_ids)
+            if len(sources) != len(ids) or len(set(ids)) != len(ids):
+                raise ValueError(
+                    f'cannot copy {len(sources)} simulations to simulations {ids}; expected as many '
+                    'different ones'
+                )
+            for source, env_id in zip(sources, ids, strict=True):
+                self._task.set_state(env_id, other._task.get_state(source))
+                self._world.set_state(env_id, other._world.get_state(source))
+                self._steps[env_id] = other._steps[source]
+                self._ended[env_id] = other._ended[source]
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(
@@ -384,6 +412,7 @@ class VectorEnvironment:
 
     def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
         """Calls `work` on the threads, each time for a part of the simulations."""
+        self._check_usable()
         assert self._world is not None
         if self._task.in_parts:
             self._world.share(work, env_ids)
@@ -392,6 +421,7 @@ class VectorEnvironment:
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Begins episodes in some simulations, without the checks and observations of `reset`."""
+        self._check_usable()
         if not len(env_ids):
             return
         self._task.reset(env_ids, [self._random[env_id] for env_id in env_ids.tolist()])
@@ -408,19 +438,40 @@ class VectorEnvironment:
         return {name: flat[:, part] for name, part in self.blocks.items()}
 
     def _numbers(self, env_ids: np.ndarray | Sequence[int] | None) -> np.ndarray:
+        """Returns the numbers of simulations, sorted and without repeats."""
+        return np.unique(np.array(self._ids(env_ids), int))
+
+    def _ids(self, env_ids: np.ndarray | Sequence[int] | None) -> list[int]:
+        """Returns the numbers of simulations as they are given.
+
+        Raises:
+          TypeError: they are no integers and no mask.
+          ValueError: there are no such simulations, or a mask has another shape.
+        """
         if env_ids is None:
-            return np.arange(self.num_envs)
-        env_ids = np.asarray(env_ids)
-        if env_ids.dtype == bool:
-            if env_ids.shape != (self.num_envs,):
-                raise ValueError(f'mask has shape {env_ids.shape}; expected ({self.num_envs},)')
-            return np.flatnonzero(env_ids)
-        numbers = np.unique(env_ids.astype(int))
-        if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < self.num_envs):
-            raise ValueError(
-                f'env_ids are {env_ids.tolist()}; expected numbers in [0, {self.num_envs})'
+            return list(range(self.num_envs))
+        numbers = np.atleast_1d(np.asarray(env_ids))
+        if numbers.dtype == bool:
+            if numbers.shape != (self.num_envs,):
+                raise ValueError(f'mask has shape {numbers.shape}; expected ({self.num_envs},)')
+            return np.flatnonzero(numbers).tolist()
+        if not numbers.size:
+            return []
+        if numbers.dtype.kind not in 'iu' or numbers.ndim > 1:
+            raise TypeError(
+                f'env_ids is {env_ids!r}; expected integers, the numbers of simulations, or a mask '
+                f'of {self.num_envs} bools'
             )
-        return numbers
+        if numbers.min() < 0 or numbers.max() >= self.num_envs:
+            raise ValueError(
+                f'env_ids are {numbers.tolist()}; expected numbers in [0, {self.num_envs})'
+            )
+        return numbers.tolist()
+
+    @property
+    def _owner(self) -> str:
+        """What states are made for."""
+        return f'simulations of {self._task.signature}'
 
     def _check_usable(self) -> None:
         if self._world is None:
@@ -430,3 +481,17 @@ class VectorEnvironment:
                 'a vector environment cannot be used after a fork: the child has no copy of its '
                 "threads. Make it in the child, or use multiprocessing's start method 'spawn'"
             )
+
+
+def _seed_sequence(seed: Any) -> np.random.SeedSequence:
+    """Returns the sequence of a seed for all simulations.
+
+    Raises:
+      TypeError: it is no integer.
+      ValueError: it is negative.
+    """
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
+        raise TypeError(f'seed is {seed!r}; expected an integer, one for each simulation, or None')
+    if seed is not None and seed < 0:
+        raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
+    return np.random.SeedSequence(seed)

@@ -9,7 +9,7 @@ from typing import Any
 from trl_suite import characters, motion, policies
 from trl_suite import terrain as terrains
 from trl_suite.arenas import PlanarArena, SpatialArena, scene
-from trl_suite.registry.catalogue import find
+from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.registry.task_types import TASK_TYPES
 from trl_suite.tasks import composed
@@ -87,7 +87,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             option.name: option.default for option in config_type.options() if option.policy
         }
         for name, default in policies_.items():
-            merged[name] = _policy(merged.get(name, default))
+            merged[name] = _policy(name, merged.get(name, default))
         config = config_type.of(spec.id, merged, others)
     if type_ is not None and spec.actuation not in (type_.actuations or (spec.actuation,)):
         raise ValueError(
@@ -106,10 +106,17 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     return composed.compose(task, extras)
 
 
-def _policy(source: Any) -> Any:
-    """Returns the policy shipped for an id or alias; other sources are returned unchanged."""
+def _policy(name: str, source: Any) -> Any:
+    """Returns the policy shipped for an id or alias; other sources are returned unchanged.
+
+    Raises:
+      ValueError: an unknown id; the message has the option's name and the closest ids that have a
+        policy.
+    """
     if not isinstance(source, str) or source.endswith('.npz'):
         return source
+    if source not in BY_ID and source not in ALIASES:
+        raise ValueError(errors.unknown(name, source, (*policies.available(), 'FILE.npz')))
     return policies.reference(find(source).id)
 
 

@@ -10,7 +10,7 @@ from trl_suite.registry import deeploco, imitation, plaid, terrainrl
 from trl_suite.registry.spec import STEP_LIMIT, EnvSpec
 from trl_suite.util import errors
 
-__all__ = ['ALIASES', 'BY_ID', 'BY_TASK', 'SPECS', 'STEP_LIMIT', 'EnvSpec', 'find']
+__all__ = ['ALIASES', 'BY_ID', 'BY_TASK', 'SPECS', 'STEP_LIMIT', 'EnvSpec', 'find', 'spec_of']
 
 SPECS: tuple[EnvSpec, ...] = (
     *plaid.SPECS,
@@ -30,9 +30,24 @@ def find(id: str) -> EnvSpec:
     """Returns the `EnvSpec` of an id or alias.
 
     Raises:
+      TypeError: the id is no string.
       ValueError: unknown id; the message has the closest matches.
     """
+    if not isinstance(id, str):
+        raise TypeError(f'the id of an environment is a string, not {id!r}')
     spec = BY_ID.get(id) or ALIASES.get(id)
     if spec is None:
-        raise ValueError(errors.unknown('environment', id, ALIASES if '/' in str(id) else BY_ID))
+        raise ValueError(errors.unknown('environment', id, ALIASES if '/' in id else BY_ID))
     return spec
+
+
+def spec_of(environment: str | EnvSpec) -> EnvSpec:
+    """Returns the data of an environment that is given by id, by alias, or by its data.
+
+    Raises:
+      TypeError: it is none of these.
+      ValueError: unknown id; the message has the closest matches.
+    """
+    if isinstance(environment, (str, EnvSpec)):
+        return find(environment) if isinstance(environment, str) else environment
+    raise TypeError(f'an environment is an id, an alias or an EnvSpec, not {environment!r}')

@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # plots of terrain need no engine
 
 
 Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
+_drawn_by: set[int] = set()  # the process that has rendered; a forked child has another number
 
 
 def frame(
@@ -64,8 +65,16 @@ def frame(
     Raises:
       ValueError: unknown camera, a size that is not positive or above the model's limit, or a ghost
         although the task has no reference clip.
-      RuntimeError: no OpenGL library works; the message names MUJOCO_GL and its choices.
+      RuntimeError: no OpenGL library works (the message names MUJOCO_GL and its choices), this
+        process was forked from one that has rendered, or another thread uses the environment.
     """
+    with getattr(environment, 'one_thread', contextlib.nullcontext()):
+        return _frame(environment, height, width, camera, ghost)
+
+
+def _frame(
+    environment: composer.Environment, height: int, width: int, camera: str | int, ghost: bool
+) -> np.ndarray:
     physics = environment.physics
     limits = physics.model.vis.global_
     for name, size, limit in (
@@ -192,13 +201,24 @@ def _camera(physics: Any, camera: str | int) -> int:
 
 
 def check_gl(physics: Any) -> None:
-    """Creates the rendering context for the first frame."""
+    """Creates the rendering context for the first frame.
+
+    Raises:
+      RuntimeError: no OpenGL library works, or this process was forked from one that has rendered.
+    """
+    process = os.getpid()
+    if _drawn_by and process not in _drawn_by:
+        raise RuntimeError(
+            'cannot render after a fork: the OpenGL context belongs to the parent process, which has '
+            "rendered. Render there, or use multiprocessing's start method 'spawn'"
+        )
     try:
         _use_chosen_library()
         _ = physics.contexts
     # Errors depend on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
+    _drawn_by.add(process)
 
 
 def _use_chosen_library() -> None:

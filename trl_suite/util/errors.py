@@ -5,7 +5,8 @@ import difflib
 import numbers
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -61,6 +62,21 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
         raise ValueError(f'{name} is {value!r}; expected a whole number from {low} to {high}{why}')
 
 
+def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Returns a copy of options by name; none for None.
+
+    Args:
+      name: of the argument that holds them.
+      value: what is given.
+
+    Raises:
+      TypeError: it is no mapping.
+    """
+    if value is not None and not isinstance(value, Mapping):
+        raise TypeError(f'{name} is {value!r}; expected a dict of options by name')
+    return dict(value or {})
+
+
 def check_kind(name: str, value: object, hint: object) -> None:
     """Checks the value of an option against its type annotation.
 
@@ -90,7 +106,10 @@ def _fits(value: object, hint: object) -> bool:
         return hint is bool or not isinstance(value, bool)
     if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
         (inner,) = typing.get_args(hint)
-        return isinstance(value, Iterable) and all(_fits(each, inner) for each in value)
+        # Bytes and dicts can be gone through, too, but hold something else.
+        if not isinstance(value, Iterable) or isinstance(value, (bytes, Mapping)):
+            return False
+        return all(_fits(each, inner) for each in value)
     return True
 
 

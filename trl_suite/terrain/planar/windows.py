@@ -9,6 +9,10 @@ import numpy as np
 from trl_suite.terrain.planar.generators import SPACING
 from trl_suite.util.compiled import compiled_inline
 
+FARTHEST = (
+    1e4  # m from its window; a character farther away has diverged, and its window is not refilled
+)
+
 _CELLS_PER_METRE = 1 / SPACING
 
 
@@ -100,7 +104,7 @@ def far_height(i: int, x: float, ground: PlanarWindows) -> float:
 @compiled_inline
 def has_left(i: int, x: float, ground: PlanarWindows) -> bool:
     """Returns whether the window of simulation i must be refilled for a character at x, m."""
-    return abs(x - ground.centre[i]) > ground.reach
+    return ground.reach < abs(x - ground.centre[i]) < FARTHEST
 
 
 @compiled_inline

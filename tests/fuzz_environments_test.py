@@ -1,0 +1,305 @@
+"""Random tests: invalid input is rejected by name, and single and vector environments agree.
+
+Hypothesis draws options, actions, numbers of simulations, states, and orders of calls. The fast tests always
+draw the same; the slow ones (`-m slow`) draw a seed, print it, and take it from FUZZ_SEED if that is set;
+FUZZ_EXAMPLES says how many.
+"""
+
+import functools
+import os
+import pickle
+import random
+import warnings
+
+import hypothesis
+import numpy as np
+import pytest
+from absl.testing import absltest, parameterized
+from hypothesis import stateful
+from hypothesis import strategies as st
+
+from trl_suite import suite
+from trl_suite.registry import catalogue
+from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.vector import VectorEnvironment
+
+SLOW = int(os.environ.get('FUZZ_EXAMPLES', '200'))
+COMMON = {
+    'deadline': None, 'database': None, 'suppress_health_check': list(hypothesis.HealthCheck),
+}  # fmt: skip
+SPECS = {
+    'planar_walk': suite.combine('dog', task='walk'),
+    'spatial_walk': suite.combine('biped3d', task='walk'),
+    **{spec.task_type: spec for spec in catalogue.SPECS},
+}  # one of each task type
+IDS = tuple({spec.task_type: spec.id for spec in catalogue.SPECS}.values())
+GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+REFUSALS = (ValueError, TypeError)
+
+numbers = st.one_of(
+    st.sampled_from((0, 1, -1, 2, 4, 10, 33, 0.5, 1.0, -0.0, 1e-12, 1e300, 10**30)),
+    st.floats(allow_nan=True, allow_infinity=True), st.integers(-3, 40), st.booleans(),
+)  # fmt: skip
+anything = st.one_of(
+    numbers, st.none(), st.text(max_size=5), st.just(b'x'), st.just(object()), st.just(np.array),
+    st.just({}), st.just(np.zeros((2, 2))), st.lists(numbers, max_size=3),
+    st.lists(st.lists(numbers, min_size=2, max_size=2), max_size=2), st.just({'a': 1}),
+)  # fmt: skip
+arrays = st.one_of(
+    anything,
+    st.builds(
+        lambda shape, dtype, value: np.full(shape, value).astype(dtype),
+        st.lists(st.sampled_from((0, 1, 2, 3, 11)), max_size=3).map(tuple),
+        st.sampled_from((float, 'float32', int, bool, 'datetime64[D]', 'U3', object, complex)),
+        st.integers(-2, 3),
+    ),
+)
+
+
+def many(test, examples):
+    """Runs a property test, always with the same draws."""
+    hypothesis.seed(0)(hypothesis.settings(max_examples=examples, **COMMON)(test))()
+
+
+def drawn(test, examples):
+    """The same with draws of a seed that is printed."""
+    seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
+    print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={examples}')
+    hypothesis.seed(seed)(hypothesis.settings(max_examples=examples, **COMMON)(test))()
+
+
+@functools.cache
+def pair(id_):
+    """Two simulations, and a single environment for each, which begin again with new seeds."""
+    return VectorEnvironment(id_, 2, 1, seed=0), [suite.make(id_) for _ in range(2)]
+
+
+def begun(id_, seed=0):
+    environments, singles = pair(id_)
+    first = environments.reset(seed=seed)
+    for single, own, observation in zip(singles, environments.seeds, first, strict=True):
+        single.random_state.seed(own)
+        np.testing.assert_array_equal(flat(single.reset()), observation)
+    return environments, singles
+
+
+def flat(time_step):
+    return np.concatenate([block.ravel() for block in time_step.observation.values()])
+
+
+def check_option(task_type, name, value, step):
+    """An option is refused by its name, or the environment works with it."""
+    type_ = TASK_TYPES[task_type]
+    try:
+        type_.config.of(task_type, {name: value})
+    except REFUSALS as error:
+        assert name in str(error), f'{name}={value!r}: {error}'
+        return
+    if not step:
+        return
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            options = {name: value, 'random': 0}
+            environment = suite.build_environment(SPECS[task_type], options, None)
+    except (*REFUSALS, FileNotFoundError) as error:
+        assert str(error), f'{name}={value!r}'
+        return
+    environment.reset()
+    time_step = environment.step(np.zeros(len(environment.action_map)))
+    assert np.isfinite(flat(time_step)).all() and np.isfinite(time_step.reward)
+    environment.close()
+
+
+def option_test(task_type, step):
+    names = [option.name for option in TASK_TYPES[task_type].config.options()]
+
+    @hypothesis.given(st.sampled_from(names), anything)
+    def test(name, value):
+        check_option(task_type, name, value, step)
+
+    return test
+
+
+def argument_test(id_):
+    @hypothesis.given(arrays, arrays)
+    def test(action, env_ids):
+        environments, singles = begun(id_)
+        for environment, arguments in ((singles[0], (action,)), (environments, (action, env_ids))):
+            before = pickle.dumps(environment.get_state())
+            try:
+                found = environment.step(*arguments)
+            except REFUSALS as error:
+                assert str(error)
+                assert pickle.dumps(environment.get_state()) == before
+            else:
+                observation = flat(found) if environment is singles[0] else found.observation
+                assert np.isfinite(observation).all() and np.isfinite(found.reward).all()
+        for call in (environments.reset, environments.get_state):
+            try:
+                call(env_ids)
+            except REFUSALS as error:
+                assert str(error)
+
+    return test
+
+
+def state_test(id_):
+    @hypothesis.given(st.data())
+    def test(data):
+        environments, singles = begun(id_)
+        for environment in (environments, singles[0]):
+            state = environment.get_state()
+            key = data.draw(st.sampled_from((*state, None)))
+            if key == 'world':  # numbers that physics cannot bear
+                value = data.draw(st.floats(allow_nan=True, allow_infinity=True))
+                world = np.array(state['world'])
+                world[..., data.draw(st.integers(0, world.shape[-1] - 1))] = value
+                state['world'] = world
+            elif key == 'made_for' or key is None:
+                state = data.draw(anything) if key is None else {**state, key: data.draw(anything)}
+            else:
+                del state[key]
+            before = pickle.dumps(environment.get_state())
+            try:
+                environment.set_state(state)
+            except REFUSALS as error:
+                assert str(error)
+                assert pickle.dumps(environment.get_state()) == before
+            size = len(environment.action_map)
+            if environment is environments:
+                found = environment.step(np.zeros((2, size))).observation
+                again = environment.reset()
+            else:
+                found, again = flat(environment.step(np.zeros(size))), flat(environment.reset())
+            assert np.isfinite(found).all() and np.isfinite(again).all()
+
+    return test
+
+
+class Calls(stateful.RuleBasedStateMachine):
+    """Two simulations and two single environments are told the same, and do the same."""
+
+    ID = GAPS
+    which = st.integers(0, 1)
+    states = stateful.Bundle('states')
+
+    @stateful.initialize(seed=st.integers(0, 2**32 - 1))
+    def begin(self, seed):
+        self.environments, self.singles = begun(self.ID, seed)
+        self.size = len(self.environments.action_map)
+
+    @stateful.rule(seed=st.integers(0, 9), scale=st.sampled_from((0.0, 0.3, 1.0, 1e9)))
+    def step(self, seed, scale):
+        action = scale * np.random.default_rng(seed).uniform(-1, 1, (2, self.size))
+        found = self.environments.step(action)
+        assert np.isfinite(found.observation).all()
+        for i, single in enumerate(self.singles):
+            time_step = single.step(action[i])
+            np.testing.assert_array_equal(found.observation[i], flat(time_step))
+            assert found.reward[i] == (time_step.reward or 0)
+            assert (found.terminated[i] or found.truncated[i]) == time_step.last()
+            assert found.terminated[i] == (time_step.discount == 0)
+
+    @stateful.rule(i=which)
+    def reset(self, i):
+        found = self.environments.reset([i])
+        np.testing.assert_array_equal(found[i], flat(self.singles[i].reset()))
+
+    @stateful.rule(target=states)
+    def save(self):
+        states = self.environments.get_state(), [single.get_state() for single in self.singles]
+        return pickle.dumps(states)
+
+    @stateful.rule(saved=states)
+    def restore(self, saved):
+        state, alone = pickle.loads(saved)
+        self.environments.set_state(state)
+        for single, own in zip(self.singles, alone, strict=True):
+            single.set_state(own)
+
+    @stateful.rule(i=which, j=which)
+    def copy(self, i, j):
+        self.environments.copy_from(self.environments, [i], [j])
+        state = self.singles[i].get_state()
+        state['random'] = self.singles[j].random_state.get_state()
+        self.singles[j].set_state(state)
+
+    @stateful.rule(i=which)
+    def break_down(self, i):
+        for data, k in (
+            (self.environments.task.world.qvel, i),
+            (self.singles[i].physics.data.qvel, ...),
+        ):
+            data[k] = np.nan
+
+    @stateful.invariant()
+    def same(self):
+        for i, single in enumerate(self.singles):
+            info = self.environments.info
+            assert info['distance'][i] == single.info['distance']
+            assert info['diverged'][i] == single.info['diverged']
+
+
+class Reopened(Calls):
+    """The same, and environments are closed and made again in between."""
+
+    @stateful.rule()
+    def make_again(self):
+        state, old = self.environments.get_state(), (self.environments, *self.singles)
+        self.singles = [pickle.loads(pickle.dumps(single)) for single in self.singles]
+        self.environments = VectorEnvironment(self.ID, 2, 1, seed=3)
+        self.environments.set_state(state)
+        if old[0] is not pair(self.ID)[0]:
+            for each in old:
+                each.close()
+                for call in (each.reset, each.get_state):
+                    with pytest.raises(RuntimeError, match='the environment is closed'):
+                        call()
+
+
+def machine(kind, id_, examples, steps, seed):
+    settings = hypothesis.settings(max_examples=examples, stateful_step_count=steps, **COMMON)
+    calls = hypothesis.seed(seed)(type(f'{kind.__name__}Of', (kind,), {'ID': id_}))
+    stateful.run_state_machine_as_test(calls, settings=settings)
+
+
+class FastTest(parameterized.TestCase):
+    @parameterized.parameters(*TASK_TYPES)
+    def test_options(self, task_type):
+        many(option_test(task_type, False), 100)
+
+    def test_arguments(self):
+        many(argument_test(GAPS), 40)
+
+    def test_states(self):
+        many(state_test(GAPS), 40)
+
+    def test_calls(self):
+        machine(Calls, GAPS, 4, 20, 0)
+        machine(Reopened, GAPS, 1, 10, 1)
+
+
+@pytest.mark.slow
+class SlowTest(parameterized.TestCase):
+    @parameterized.parameters(*TASK_TYPES)
+    def test_options(self, task_type):
+        drawn(option_test(task_type, True), SLOW)
+
+    @parameterized.parameters(*IDS)
+    def test_arguments(self, id_):
+        drawn(argument_test(id_), SLOW)
+
+    @parameterized.parameters(*IDS)
+    def test_states(self, id_):
+        drawn(state_test(id_), SLOW)
+
+    @parameterized.parameters(*IDS)
+    def test_calls(self, id_):
+        seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
+        print(f'FUZZ_SEED={seed} FUZZ_EXAMPLES={SLOW}')
+        machine(Reopened, id_, max(1, SLOW // 10), 30, seed)
+
+
+if __name__ == '__main__':
+    absltest.main()
