@@ -205,7 +205,7 @@ class InfoTest(CommandTest):
         self.assertIn('the pitch of the root is more than 144 degrees', out)
         self.assertIn('less than 0.5 m in 5 s', out)
         self.assertRegex(out, 'one cycle, at most 1.67 s; control 600 Hz, physics 1200 Hz;.*truncated\n'
-                         r'  \(discount 1\) after 256 steps')  # fmt: skip
+                         r'  \(discount 1\) after 5000 steps')  # fmt: skip
         self.assertNotRegex(out, 'backwards|negative|stance leg')
         out = info('FSM_Raptor2D_Terrain_Gaps-v0')
         self.assertIn('Contact.SpineCurve 0', out)
@@ -355,6 +355,7 @@ class InfoTest(CommandTest):
             'for the whole step': 'high',
             'truncated after 200 s': 'high',
             'after 256 steps (discount 1)': 'short',
+            'after 5000 cycles (discount 1)': 'gait',
             'including the pillars': 'forest',
             'a goal is reached or has expired': 'goal_navigation',
             'ball and goal have expired': 'soccer',
@@ -373,13 +374,13 @@ class InfoTest(CommandTest):
                 tracking
                 | {'completion', 'mixed_humanoid', 'PD targets of a dog or raptor', 'terrain'},
             ),
-            ('FSM_Dog2D_Terrain_Mixed-v0', {'gait', 'terrain', 'short'}),
+            ('FSM_Dog2D_Terrain_Mixed-v0', {'gait', 'terrain'}),
             (
                 'FSM_Raptor2D_Terrain_Narrow_Gaps-v0',
-                {'gait', 'terrain', 'raptor', 'completion', 'short'},
+                {'gait', 'terrain', 'raptor', 'completion'},
             ),
-            ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped', 'short'}),
-            ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper', 'short'}),
+            ('FSM_Biped2D_Terrain_Gaps-v0', {'gait', 'terrain', 'biped'}),
+            ('FSM_Hopper2D_Terrain_Gaps-v0', {'gait', 'terrain', 'hopper'}),
             (
                 'PD_Biped2D_LLC_Flat_Step-v0',
                 tracking | {'completion', 'footsteps', 'in the plane'},

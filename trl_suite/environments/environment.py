@@ -166,7 +166,7 @@ class Environment(composer.Environment):
             if self._physics is not None:
                 super().close()
                 # All of them lead to arrays in the model and its data, which would stay with them.
-                self._task = self._hooks = self._observation_updater = None  # type: ignore[assignment]
+                del self._task, self._hooks, self._observation_updater
 
     @property
     def task(self) -> Task:
