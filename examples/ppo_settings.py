@@ -285,7 +285,7 @@ CROWDED = {
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 # The same tasks without footstep planning: starts from the walk, and learns navigation.
-JOURNEYS = {
+DIRECT = {
     'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
     'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6, 'value_goes_on': True, 'map_bound': 0.3,
     'learning_rate': 2e-4,
@@ -345,7 +345,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
-    ('PD_Biped3D_Terrain_*_Hard-v0', JOURNEYS),
+    ('PD_Biped3D_Terrain_*_Hard-v0', DIRECT),
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_Forest-v0', GUIDED),
     ('PD_Biped3D_HLC_DynamicsObstacles-v0', {**MOVING, 'samples': 4e5, 'evaluate_every': 4e4}),

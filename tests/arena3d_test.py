@@ -358,10 +358,10 @@ class DynamicsTest(parameterized.TestCase):
         xy = np.array([(0.0, 0.0)])
         for _ in range(900):
             kinematic.turn(xy)
-            kinematic.way += kinematic.direction * kinematic.speed / 30
+            kinematic.distance += kinematic.direction * kinematic.speed / 30
             stage.run(1 / 30, xy)
         stage.arena._look(0)
-        np.testing.assert_allclose(stage.arena.surroundings.way, kinematic.way, atol=2e-3)
+        np.testing.assert_allclose(stage.arena.surroundings.distance, kinematic.distance, atol=2e-3)
         np.testing.assert_array_equal(stage.arena.surroundings.direction, kinematic.direction)
         self.assertFalse(np.array_equal(kinematic.direction[0], movers.direction))  # some reversed
         # Queries and geometry agree on where they are.

@@ -381,10 +381,10 @@ class MovingTest(parameterized.TestCase):
         found = around('dynamic_obstacles3d', [3])
         movers = found.grounds[0].layout.movers
         far, dt = np.full((1, 2), 1000.0), 1 / 30
-        ways = [found.way[0].copy()]
+        ways = [found.distance[0].copy()]
         for _ in range(6000):
             found.advance(dt, far)
-            ways.append(found.way[0].copy())
+            ways.append(found.distance[0].copy())
         ways = np.array(ways)
         step = movers.speed * dt
         self.assertTrue((ways >= -step - 1e-9).all())
@@ -402,13 +402,13 @@ class MovingTest(parameterized.TestCase):
         for _ in range(2000):
             xy = found.centres()[0, k][None] + 4.9  # beyond 5 m: diagonal
             found.advance(1 / 30, xy)
-        self.assertBetween(found.way[0, k], 0 - 0.1, movers.length[k] + 0.1)
+        self.assertBetween(found.distance[0, k], 0 - 0.1, movers.length[k] + 0.1)
         for _ in range(3000):
             xy = found.centres()[0, k][None] + (4.9, 0)
             found.advance(1 / 30, xy)
-        self.assertGreater(abs(found.way[0, k] - 0.5 * movers.length[k]), movers.length[k])
+        self.assertGreater(abs(found.distance[0, k] - 0.5 * movers.length[k]), movers.length[k])
         found.advance(1 / 30, found.centres()[0, k][None] + (5.1, 0))
-        sign = -1 if found.way[0, k] > 0 else 1
+        sign = -1 if found.distance[0, k] > 0 else 1
         self.assertEqual(found.direction[0, k], sign)
 
     def test_conveyors(self):
@@ -959,7 +959,7 @@ class SurroundingsTest(parameterized.TestCase):
         state = pickle.loads(pickle.dumps(found.state(1)))
         other = around(source, [5, 6, 7])
         other.restore(2, state)
-        for part in ('way', 'direction', 'centre'):
+        for part in ('distance', 'direction', 'centre'):
             np.testing.assert_array_equal(getattr(other, part)[2], getattr(found, part)[1])
         x, y = xy[1:, :1] + np.linspace(-8, 8, 50), xy[1:, 1:] + np.linspace(-8, 8, 50)
         env_ids = np.array([1])

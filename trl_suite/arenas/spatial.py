@@ -16,7 +16,7 @@ from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
 from trl_suite.terrain.spatial.ground import Random
-from trl_suite.terrain.spatial.surroundings import ALL, Rows
+from trl_suite.terrain.spatial.surroundings import ALL, EnvIds
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
@@ -161,7 +161,7 @@ class SpatialArena(composer.Arena):
           xy: start position of its character, m.
         """
         self.surroundings.begin(env_id, ground, xy)
-        self._begin[env_id] = self.surroundings.way[env_id]
+        self._begin[env_id] = self.surroundings.distance[env_id]
         self._world.qpos[env_id, self._qpos] = 0.0
         self._place(env_id)
         self._realise(env_id)
@@ -189,12 +189,12 @@ class SpatialArena(composer.Arena):
         if changed:  # existing contacts refer to boxes that have moved
             self._world.forward(np.array(changed))
 
-    def height(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+    def height(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Heights of the surface in m at points (simulations, k) m, within 12 m of the characters."""
         self._look(env_ids)
         return self.surroundings.height(x, y, env_ids)
 
-    def surface_velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+    def surface_velocity(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Horizontal surface velocities at points (simulations, k) m, (simulations, k, 2) m/s."""
         self._look(env_ids)
         return self.surroundings.velocity(x, y, env_ids)
@@ -203,7 +203,7 @@ class SpatialArena(composer.Arena):
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        env_ids: Rows = ALL,
+        env_ids: EnvIds = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Heights around characters, (simulations, 1024) m; see `Surroundings.height_map`."""
@@ -214,7 +214,7 @@ class SpatialArena(composer.Arena):
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        env_ids: Rows = ALL,
+        env_ids: EnvIds = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Velocities of the surface, (simulations, 2048) m/s; see `Surroundings.velocity_map`."""
@@ -250,15 +250,15 @@ class SpatialArena(composer.Arena):
         if state['ground'] is not None:
             self.surroundings.restore(env_id, state)
             self._begin[env_id] = state['begin']
-            self._world.qpos[env_id, self._qpos] = state['way'] - state['begin']
+            self._world.qpos[env_id, self._qpos] = state['distance'] - state['begin']
             self._place(env_id)
             self._realise(env_id)
 
-    def _look(self, env_ids: Rows | int) -> None:
+    def _look(self, env_ids: EnvIds | int) -> None:
         """Reads the positions of moving boxes of some simulations from the physics."""
         if len(self._qpos):
             moved = self._world.qpos[env_ids][..., self._qpos]
-            self.surroundings.way[env_ids] = self._begin[env_ids] + moved
+            self.surroundings.distance[env_ids] = self._begin[env_ids] + moved
 
     def _realise(self, env_id: int) -> None:
         """Poses the geoms of a simulation as in its window."""
@@ -318,8 +318,10 @@ class SpatialArena(composer.Arena):
         position = np.full((len(self._bodies), 3), PARKED)
         size = np.full((len(self._bodies), 3), SIZE)
         if movers is not None:
-            way = self._begin[env_id, :count, None]
-            position[:count, :2] = around.start[env_id, :count] + way * around.axis[env_id, :count]
+            moved = self._begin[env_id, :count, None]
+            position[:count, :2] = (
+                around.start[env_id, :count] + moved * around.axis[env_id, :count]
+            )
             position[:count, 2] = level + 0.5 * movers.height
             size[:count, :2], size[:count, 2] = movers.half_size, 0.5 * movers.height
             model.jnt_axis[self._joints[:count], :2] = around.axis[env_id, :count]

@@ -359,7 +359,7 @@ class VectorEnvironment:
                 self._fresh = state['fresh']
 
     def copy_from(
-        self, other: VectorEnvironment, other_rows: Sequence[int], env_ids: Sequence[int]
+        self, other: VectorEnvironment, other_ids: Sequence[int], env_ids: Sequence[int]
     ) -> None:
         """Copies the state of simulations of another environment, e.g. to try actions.
 
@@ -368,7 +368,7 @@ class VectorEnvironment:
 
         Args:
           other: environment with the same id and options.
-          other_rows: numbers of its simulations.
+          other_ids: numbers of its simulations.
           env_ids: numbers of as many simulations of this environment, without repeats.
 
         Raises:
@@ -392,7 +392,7 @@ class VectorEnvironment:
                     f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options '
                     'differ'
                 )
-            sources, ids = other._ids(other_rows), self._ids(env_ids)
+            sources, ids = other._ids(other_ids), self._ids(env_ids)
             if len(sources) != len(ids) or len(set(ids)) != len(ids):
                 raise ValueError(
                     f'cannot copy {len(sources)} simulations to simulations {ids}; expected as many '

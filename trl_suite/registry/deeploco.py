@@ -93,13 +93,13 @@ _STEPS = (
     ),
 )  # fmt: skip
 
-HIKE_LIMIT = 400  # footsteps after which an episode is truncated: 200 s
+PLAN_LIMIT = 400  # footsteps after which an episode is truncated: 200 s
 RUN_LIMIT = 667  # the same for running, where a footstep lasts 0.3 s
 
 
 def _hike(
     name: str, preset: str, words: str, *, character: str = 'biped3d_mocap', original: bool = True,
-    task_type: str = 'goal_navigation', limit: int = HIKE_LIMIT, aliases: tuple[str, ...] = (), rate: int = 1200, differences: tuple[str, ...] = (), **options: Any,
+    task_type: str = 'goal_navigation', limit: int = PLAN_LIMIT, aliases: tuple[str, ...] = (), rate: int = 1200, differences: tuple[str, ...] = (), **options: Any,
 ) -> EnvSpec:  # fmt: skip
     return EnvSpec(
         id=f'PD_Biped3D_HLC_{name}-v0',

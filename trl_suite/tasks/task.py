@@ -323,7 +323,7 @@ def check_simulated(lasted: np.ndarray) -> None:
         )
 
 
-def drawn_way(random: np.random.Generator, low: float, high: float) -> np.ndarray:
+def random_displacement(random: np.random.Generator, low: float, high: float) -> np.ndarray:
     """Draws a horizontal displacement with uniform direction and length in [low, high), (2,) m."""
     angle = random.uniform(-np.pi, np.pi)
     return random.uniform(low, high) * np.array([np.cos(angle), np.sin(angle)])
@@ -363,9 +363,9 @@ def start_phases(
     ends = np.cumsum(np.diff(pairs, axis=1))
 
     def phase_of(drawn: float) -> float:
-        way = drawn * ends[-1]
-        i = min(int(np.searchsorted(ends, way, side='right')), len(ends) - 1)
-        return float(pairs[i, 1] - (ends[i] - way))
+        covered = drawn * ends[-1]  # of the union of the intervals
+        i = min(int(np.searchsorted(ends, covered, side='right')), len(ends) - 1)
+        return float(pairs[i, 1] - (ends[i] - covered))
 
     return phase_of
 

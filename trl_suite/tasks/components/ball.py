@@ -15,7 +15,7 @@ from trl_suite.engine import World
 from trl_suite.kinematics.spatial import SpatialMeasurement, SpatialState, ahead_and_left, polar
 from trl_suite.tasks.components.goals import GOAL_COLOUR
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
-from trl_suite.tasks.task import Marker, drawn_way
+from trl_suite.tasks.task import Marker, random_displacement
 from trl_suite.terrain import PRESETS3D
 from trl_suite.util.compiled import compiled, compiled_inline
 
@@ -254,7 +254,7 @@ class Ball:
           count: current control step of the episode.
           random: generator of the displacement and of the time until the ball is placed again.
         """
-        x, y = place + drawn_way(random, *BALL_AWAY)
+        x, y = place + random_displacement(random, *BALL_AWAY)
         self.world.qpos[env_id, self.qpos] = x, y, RADIUS, 1, 0, 0, 0
         self.world.qvel[env_id, self.dof] = 0.0
         lasts = random.uniform(*BALL_LASTS)
@@ -264,7 +264,9 @@ class Ball:
         self, env_id: int, random: np.random.Generator, away: tuple[float, float] = GOAL_AWAY
     ) -> np.ndarray:
         """Draws a goal (3,) m at a distance from one ball between two bounds, m."""
-        return np.append(self.world.qpos[env_id, self.qpos[:2]] + drawn_way(random, *away), 0.0)
+        return np.append(
+            self.world.qpos[env_id, self.qpos[:2]] + random_displacement(random, *away), 0.0
+        )
 
 
 def goal_disc(goal: np.ndarray, radius: float) -> Marker:

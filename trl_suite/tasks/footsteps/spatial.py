@@ -318,9 +318,9 @@ class SpatialFootsteps(SpatialTask):
 
     def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
         """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
-        way = self.goal[env_ids, :2] - places
-        headings = np.arctan2(way[:, 1], way[:, 0])
-        far = np.hypot(way[:, 0], way[:, 1]) > NEAR_GOAL
+        displacement = self.goal[env_ids, :2] - places
+        headings = np.arctan2(displacement[:, 1], displacement[:, 0])
+        far = np.hypot(displacement[:, 0], displacement[:, 1]) > NEAR_GOAL
         self.heading[env_ids[far]] = headings[far]
 
     def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:

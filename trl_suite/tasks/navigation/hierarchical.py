@@ -1,6 +1,6 @@
 """Navigation by footstep plans: the high-level tasks, with a low-level footstep controller.
 
-Source: the hike scenarios of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
+Source: the HLC scenarios of the original; 'DeepLoco: dynamic locomotion skills using hierarchical
 deep reinforcement learning' (Peng, Berseth, Yin, van de Panne 2017).
 """
 
@@ -79,7 +79,7 @@ from trl_suite.tasks.task import (
     check_simulated,
     consecutive,
     drawn_seed,
-    drawn_way,
+    random_displacement,
 )
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial.windows import SAMPLES
@@ -371,7 +371,7 @@ class HierarchicalNavigation(SpatialTask):
         elif away is None:
             goal = self.arena.goal(i, random, place)
         else:
-            x, y = place + drawn_way(random, *away)
+            x, y = place + random_displacement(random, *away)
             height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
             goal = np.array([x, y, height[0, 0]])
         set_goal(i, goal, self.clock.steps[i], random, self.goals)

@@ -65,9 +65,9 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     def policy(observation: np.ndarray) -> np.ndarray:
         parts = {name: observation[:, part] for name, part in blocks.items()}
         bearing, distance = towards_ball(parts) if task.ball else parts['goal'].T
-        way, room = free_way(parts, bearing, distance)
-        length = task.step_length * lengths(way, distance, room)
-        plan = steps(way, length, task.stance, task.step_length)
+        bearing, room = free_bearing(parts, bearing, distance)
+        length = task.step_length * lengths(bearing, distance, room)
+        plan = steps(bearing, length, task.stance, task.step_length)
         return np.clip(task.action_map.action(plan), -1, 1)
 
     return policy
@@ -94,7 +94,7 @@ def direction(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def free_way(
+def free_bearing(
     parts: dict[str, np.ndarray], bearing: np.ndarray, distance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the best bearing around obstacles in the observed maps.
@@ -114,11 +114,11 @@ def free_way(
         blocked |= moving > MOVING
     if not blocked.any():
         return bearing, np.full(n, np.inf)
-    ways = np.clip(CANDIDATES[None] + np.clip(bearing, -1.4, 1.4)[:, None], -np.pi, np.pi)
-    along, cost, room = LOOK, np.zeros(ways.shape), np.full(ways.shape, np.inf)
+    bearings = np.clip(CANDIDATES[None] + np.clip(bearing, -1.4, 1.4)[:, None], -np.pi, np.pi)
+    along, cost, room = LOOK, np.zeros(bearings.shape), np.full(bearings.shape, np.inf)
     for aside in (-CLEARANCE, 0.0, CLEARANCE):
-        x = along * np.cos(ways)[..., None] - aside * np.sin(ways)[..., None]
-        y = along * np.sin(ways)[..., None] + aside * np.cos(ways)[..., None]
+        x = along * np.cos(bearings)[..., None] - aside * np.sin(bearings)[..., None]
+        y = along * np.sin(bearings)[..., None] + aside * np.cos(bearings)[..., None]
         column = np.round((x - AHEAD[0]) / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)).astype(int)
         line = np.round((ASIDE - y) / (2 * ASIDE) * (SAMPLES - 1)).astype(int)
         column, line = np.clip(column, 0, SAMPLES - 1), np.clip(line, 0, SAMPLES - 1)
@@ -127,32 +127,32 @@ def free_way(
         first = np.where(hit.any(2), along[hit.argmax(2)], np.inf)
         cost += 1.0 / first
         room = np.minimum(room, first)
-    cost += 0.15 * np.abs(ways - bearing[:, None])
+    cost += 0.15 * np.abs(bearings - bearing[:, None])
     best = np.arange(n), cost.argmin(1)
-    return ways[best], room[best]
+    return bearings[best], room[best]
 
 
-def lengths(way: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarray:
+def lengths(bearing: np.ndarray, distance: np.ndarray, room: np.ndarray) -> np.ndarray:
     """Returns step lengths (n,) in units of task.step_length.
 
     Args:
-      way: bearings, (n,) rad.
+      bearing: bearings, (n,) rad.
       distance: distances of the goal, (n,) m.
       room: distances of the first obstacle, (n,) m.
     """
-    short = (distance < NEAR) | (np.abs(way) > SHARP)
+    short = (distance < NEAR) | (np.abs(bearing) > SHARP)
     return np.where(room < ROOM, CAUTIOUS, np.where(short, SHORT, LENGTH))
 
 
 def steps(
-    way: np.ndarray, length: np.ndarray, stance: np.ndarray, step_length: float
+    bearing: np.ndarray, length: np.ndarray, stance: np.ndarray, step_length: float
 ) -> np.ndarray:
     """Returns plans (n, 5) in physical units: steps of a length (n,) m along bearings (n,) rad."""
-    turn = np.clip(way, -TURN / step_length, TURN / step_length)
+    turn = np.clip(bearing, -TURN / step_length, TURN / step_length)
     side = SIDE[1 - stance] * WIDTH / 2  # of the foot that swings
     forward, left = direction(turn), direction(turn + np.pi / 2)
     ankle = ANKLE / step_length
-    plan = np.zeros((len(way), len(PLAN_NAMES)))
+    plan = np.zeros((len(bearing), len(PLAN_NAMES)))
     plan[:, :2] = (ankle + length)[:, None] * forward + side[:, None] * left
     plan[:, 2:4] = (ankle + 2 * length)[:, None] * forward - side[:, None] * left
     plan[:, 4] = turn

@@ -26,7 +26,7 @@ from trl_suite.util.compiled import compiled
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
 SPARE = 1.3  # factor on the largest number of boxes in these grounds
 
-Rows = slice | np.ndarray
+EnvIds = slice | np.ndarray
 ALL = slice(None)
 
 
@@ -75,7 +75,7 @@ class Surroundings:
       grounds: of each character.
       boxes: in each window, in order of x.
       centre: centres of the windows, m, (n, 2).
-      way: distances of moving boxes from the start of their paths, m, (n, M).
+      distance: distances of moving boxes from the start of their paths, m, (n, M).
       direction: 1 where they move towards the end, -1 towards the start, (n, M).
       start, axis, length, half_size, speed: of the paths and the moving boxes; see `Movers`.
     """
@@ -87,7 +87,7 @@ class Surroundings:
         self.arrays: SpatialWindows = spatial_ground.empty(n, capacity)
         self._numbers = np.arange(n)
         ground = self.arrays
-        self.centre, self.way, self.direction = (
+        self.centre, self.distance, self.direction = (
             ground.centre, ground.mover_distance, ground.mover_direction,
         )  # fmt: skip
         self.start, self.axis, self.length = (
@@ -139,7 +139,7 @@ class Surroundings:
             self.length[env_id, :movers], self.speed[env_id, :movers] = part.length, part.speed
             self.half_size[env_id, :movers] = part.half_size
             arrays.mover_top[env_id, :movers] = arrays.level[env_id] + part.height
-            self.way[env_id, :movers] = part.phase * part.length
+            self.distance[env_id, :movers] = part.phase * part.length
             self.direction[env_id, :movers] = part.direction
         self._lay(env_id, np.round(np.asarray(xy, float) / SHIFT) * SHIFT)
 
@@ -164,7 +164,7 @@ class Surroundings:
             self._lay(env_id, centre)
         return leaving
 
-    def advance(self, dt: float, xy: np.ndarray, env_ids: Rows = ALL) -> None:
+    def advance(self, dt: float, xy: np.ndarray, env_ids: EnvIds = ALL) -> None:
         """Moves moving boxes, for use without a physics engine.
 
         Args:
@@ -172,19 +172,19 @@ class Surroundings:
           xy: positions of the characters of these simulations, m.
           env_ids: numbers of the simulations.
         """
-        self.way[env_ids] += self.direction[env_ids] * self.speed[env_ids] * dt
+        self.distance[env_ids] += self.direction[env_ids] * self.speed[env_ids] * dt
         self.turn(xy, env_ids)
 
-    def turn(self, xy: np.ndarray, env_ids: Rows = ALL) -> None:
+    def turn(self, xy: np.ndarray, env_ids: EnvIds = ALL) -> None:
         """Reverses moving boxes that are at an end of their path and far from their character.
 
         Within 5 m of the character they continue straight on, even beyond the end of their path.
         """
         _turn_all(self._numbers[env_ids], np.ascontiguousarray(xy, float), self.arrays)
 
-    def centres(self, env_ids: Rows = ALL) -> np.ndarray:
+    def centres(self, env_ids: EnvIds = ALL) -> np.ndarray:
         """Centres of the moving boxes, m, (simulations, M, 2)."""
-        return self.start[env_ids] + self.way[env_ids][..., None] * self.axis[env_ids]
+        return self.start[env_ids] + self.distance[env_ids][..., None] * self.axis[env_ids]
 
     def grid(self, env_id: int) -> np.ndarray:
         """The height grid of a window, along x, then y, m, (VERTICES, VERTICES)."""
@@ -192,13 +192,13 @@ class Surroundings:
 
     # Queries.
 
-    def height(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+    def height(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Heights of the surface at points (simulations, k), m."""
         out = np.empty(np.shape(x))
         self._points(_heights, x, y, env_ids, out)
         return out
 
-    def velocity(self, x: np.ndarray, y: np.ndarray, env_ids: Rows = ALL) -> np.ndarray:
+    def velocity(self, x: np.ndarray, y: np.ndarray, env_ids: EnvIds = ALL) -> np.ndarray:
         """Horizontal surface velocities at points (simulations, k), m/s, (simulations, k, 2)."""
         out = np.zeros((*np.shape(x), 2))
         if self.moving:
@@ -209,7 +209,7 @@ class Surroundings:
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        env_ids: Rows = ALL,
+        env_ids: EnvIds = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Heights around characters, relative to the surface under them.
@@ -234,7 +234,7 @@ class Surroundings:
         self,
         xy: np.ndarray,
         heading: np.ndarray,
-        env_ids: Rows = ALL,
+        env_ids: EnvIds = ALL,
         out: np.ndarray | None = None,
     ) -> np.ndarray:
         """Velocities of the surface around characters, relative to the surface under them.
@@ -254,7 +254,7 @@ class Surroundings:
         query: Callable[..., None],
         x: npt.ArrayLike,
         y: npt.ArrayLike,
-        env_ids: Rows,
+        env_ids: EnvIds,
         out: np.ndarray,
     ) -> None:
         """Calls a compiled loop over points."""
@@ -271,7 +271,7 @@ class Surroundings:
         query: Callable[..., None],
         xy: npt.ArrayLike,
         heading: npt.ArrayLike,
-        env_ids: Rows,
+        env_ids: EnvIds,
         out: np.ndarray,
     ) -> None:
         """Calls a compiled loop over maps."""
@@ -295,7 +295,7 @@ class Surroundings:
         return {
             'ground': ground.state(),
             'centre': self.centre[env_id].tolist(),
-            'way': self.way[env_id].copy(),
+            'distance': self.distance[env_id].copy(),
             'direction': self.direction[env_id].copy(),
         }
 
@@ -303,7 +303,7 @@ class Surroundings:
         """Restores the surroundings of one character."""
         if state['ground'] is not None:
             self.begin(env_id, SpatialGround.from_state(state['ground']), state['centre'])
-            self.way[env_id], self.direction[env_id] = state['way'], state['direction']
+            self.distance[env_id], self.direction[env_id] = state['distance'], state['direction']
 
     def _lay(self, env_id: int, centre: np.ndarray) -> None:
         """Fills a window."""
