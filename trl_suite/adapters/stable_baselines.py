@@ -121,14 +121,14 @@ class SuiteVecEnv(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        raise NotImplementedError(
+        raise RuntimeError(
             f'simulations share one object: set {attr_name} on its `environment`'
         )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        raise NotImplementedError(
+        raise RuntimeError(
             f'simulations share one object: call {method_name} of its `environment`'
         )
 
