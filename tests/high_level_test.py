@@ -903,21 +903,21 @@ class ScriptedTest(parameterized.TestCase):
         y = np.repeat(np.linspace(5.5, -5.5, 32), 32).reshape(32, 32)
         wall = (x > 1.5) & (x < 2.5) & (y > -0.9) & (y < 3)  # more of it to the left
         parts = {'terrain': np.stack([2.0 * wall.ravel(), np.zeros(1024)])}
-        ways, room = scripted.free_way(parts, np.zeros(2), np.full(2, 8.0))
+        ways, room = scripted.free_bearing(parts, np.zeros(2), np.full(2, 8.0))
         np.testing.assert_array_equal(room, np.inf)
         self.assertLess(ways[0], -0.3)
         self.assertAlmostEqual(ways[1], 0)
         moving = np.stack([0.4 * wall.ravel(), np.zeros(1024)])[None].reshape(1, 2048)
-        found, _ = scripted.free_way({'surface': moving}, np.zeros(1), np.full(1, 8.0))
+        found, _ = scripted.free_bearing({'surface': moving}, np.zeros(1), np.full(1, 8.0))
         self.assertLess(found[0], -0.3)
         # Obstacles behind the goal do not block the path.
-        near, room = scripted.free_way(parts, np.zeros(2), np.full(2, 1.0))
+        near, room = scripted.free_bearing(parts, np.zeros(2), np.full(2, 1.0))
         np.testing.assert_allclose(near, 0)
         np.testing.assert_array_equal(room, np.inf)
         # If there is no free path, the result is the free distance.
         around = (np.hypot(x, y) > 1.7).reshape(1, 1024)
         everywhere = {'terrain': 2.0 * around}
-        _, room = scripted.free_way(everywhere, np.zeros(1), np.full(1, 8.0))
+        _, room = scripted.free_bearing(everywhere, np.zeros(1), np.full(1, 8.0))
         self.assertBetween(room[0], 1.2, 2.1)
 
     def test_gets_behind_the_ball(self):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.adapters.gym import action_space, observation_space
+from trl_suite.adapters.gym import action_space, flat, observation_space
 from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.util import errors
@@ -34,9 +34,9 @@ Indices = None | int | Iterable[int]
 class SuiteVecEnv(VecEnv):
     """Many simulations on threads; a simulation whose episode ends is reset in the same step.
 
-    The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_terms' (a dict) and
-    'TimeLimit.truncated'; if its episode ended, also 'terminal_observation'. After `seed(s)`,
-    simulation i has the seed s + i at the next reset, as everywhere in Stable-Baselines3.
+    The info of a simulation has 'fell', 'diverged', 'distance' (m), 'reward_NAME' for each reward
+    term and 'TimeLimit.truncated'; if its episode ended, also 'terminal_observation'. After
+    `seed(s)`, simulation i has the seed s + i at the next reset, as everywhere in Stable-Baselines3.
 
     Attributes:
       environment: the wrapped `trl_suite.environments.vector.VectorEnvironment`.
@@ -82,7 +82,7 @@ class SuiteVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         observation = self.environment.reset(seed=seeds)
-        self.reset_infos = rows_of(self.environment.info)
+        self.reset_infos = rows_of(flat(self.environment.info))
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -93,9 +93,9 @@ class SuiteVecEnv(VecEnv):
         """Performs the step; errors are those of `VectorEnvironment.step`."""
         observation, reward, terminated, truncated, info = self.environment.step(self._actions)
         ended, final = info.pop('ended'), info.pop('final_observation', None)
-        infos = rows_of({**info, 'TimeLimit.truncated': truncated})
+        infos = rows_of({**flat(info), 'TimeLimit.truncated': truncated})
         if ended.any():
-            begun = rows_of(self.environment.info)
+            begun = rows_of(flat(self.environment.info))
             for env_id in np.flatnonzero(ended).tolist():
                 infos[env_id]['terminal_observation'] = row_of(final, env_id)
                 self.reset_infos[env_id] = begun[env_id]
@@ -121,16 +121,12 @@ class SuiteVecEnv(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        raise RuntimeError(
-            f'simulations share one object: set {attr_name} on its `environment`'
-        )
+        raise RuntimeError(f'simulations share one object: set {attr_name} on its `environment`')
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        raise RuntimeError(
-            f'simulations share one object: call {method_name} of its `environment`'
-        )
+        raise RuntimeError(f'simulations share one object: call {method_name} of its `environment`')
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """Returns False for every simulation: none has a Gymnasium wrapper."""
@@ -139,9 +135,7 @@ class SuiteVecEnv(VecEnv):
 
 def rows_of(info: dict[str, Any]) -> list[dict[str, Any]]:
     """Converts a dict of arrays of n simulations to n dicts of Python values."""
-    columns = (
-        rows_of(value) if isinstance(value, dict) else value.tolist() for value in info.values()
-    )
+    columns = (value.tolist() for value in info.values())
     return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
