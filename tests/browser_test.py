@@ -9,6 +9,7 @@ import unittest
 import imageio.v3 as iio
 import mujoco
 import numpy as np
+import pytest
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
@@ -279,6 +280,7 @@ class ChromiumTest(FolderTest):
         self.wait_until_it_moves(page)
         self.assert_quiet('file:')
 
+    @pytest.mark.slow  # without a graphics card a minute of drawing
     def test_the_viewer(self):
         viewer = browser.Browser(DOG, port=0).start()
         self.addCleanup(viewer.stop)

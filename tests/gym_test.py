@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
+from helpers import KINDS
 
 from trl_suite import rendering, suite
 from trl_suite.adapters.gym import flat as flat_info
@@ -124,28 +125,6 @@ def every_id(id_):
                 self.assertAlmostEqual(sum(terms(info)), reward, delta=1e-12)
             self.assertEqual(ours[0].dtype, np.float32)
             np.testing.assert_array_equal(ours, np.array(flat, np.float32))
-
-        def test_vector_entry_point_is_the_sync_vector(self):
-            limit = 1 if spec.task_type in LONG else 3
-            options = {'num_envs': 2, 'task_kwargs': {'step_limit': limit}}
-            ours = gymnasium.make_vec(
-                f'trl_suite/{id_}',
-                vectorization_mode='vector_entry_point',
-                num_threads=1,
-                **options,
-            )
-            theirs = gymnasium.make_vec(f'trl_suite/{id_}', vectorization_mode='sync', **options)
-            self.assertIsInstance(ours, SuiteVectorEnv)
-            for name in ('single_observation_space', 'single_action_space', 'action_space'):
-                self.assertEqual(getattr(ours, name), getattr(theirs, name))
-            self.assertEqual(ours.observation_space, theirs.observation_space)
-            self.assert_same(ours.reset(seed=[3, 4])[0], theirs.reset(seed=[3, 4])[0])
-            ours.action_space.seed(0)
-            for _ in range(limit + 2):
-                action = scale * ours.action_space.sample()
-                self.assert_same(ours.step(action)[0], theirs.step(action)[0])
-            ours.close()
-            theirs.close()
 
         def test_spaces(self):
             env = SuiteEnv(self.env.unwrapped.environment, flat_observation=False)
@@ -314,6 +293,31 @@ class SingleTest(Same, parameterized.TestCase):
 
 class VectorTest(Same, parameterized.TestCase):
     """Simulations against Gymnasium's vector environment of single environments."""
+
+    @parameterized.parameters(*KINDS)
+    def test_vector_entry_point_is_the_sync_vector(self, id_):
+        spec = suite.find(id_)
+        scale = 0.3 if spec.task_type == 'gait' else 1.0
+        limit = 1 if spec.task_type in LONG else 3
+        options = {'num_envs': 2, 'task_kwargs': {'step_limit': limit}}
+        ours = gymnasium.make_vec(
+            f'trl_suite/{id_}',
+            vectorization_mode='vector_entry_point',
+            num_threads=1,
+            **options,
+        )
+        theirs = gymnasium.make_vec(f'trl_suite/{id_}', vectorization_mode='sync', **options)
+        self.assertIsInstance(ours, SuiteVectorEnv)
+        for name in ('single_observation_space', 'single_action_space', 'action_space'):
+            self.assertEqual(getattr(ours, name), getattr(theirs, name))
+        self.assertEqual(ours.observation_space, theirs.observation_space)
+        self.assert_same(ours.reset(seed=[3, 4])[0], theirs.reset(seed=[3, 4])[0])
+        ours.action_space.seed(0)
+        for _ in range(limit + 2):
+            action = scale * ours.action_space.sample()
+            self.assert_same(ours.step(action)[0], theirs.step(action)[0])
+        ours.close()
+        theirs.close()
 
     def pair(self, mode, n=3, seed_list=(5, 9, 11), **options):
         single = {'task_kwargs': SHORT, **options}

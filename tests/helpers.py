@@ -8,8 +8,13 @@ import numpy as np
 from absl.testing import parameterized
 
 from trl_suite import suite, terrain
+from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
+# The first id of each task type with each character: for what depends on nothing else.
+KINDS = tuple(
+    {(spec.task_type, spec.character): spec.id for spec in reversed(catalogue.SPECS)}.values()
+)
 RIGHT, LEFT = 0, 1
 STEP_WEIGHTS = {  # of the reward of footsteps
     name: weight / 1.05

@@ -10,6 +10,7 @@ import tempfile
 from unittest import mock
 
 import numpy as np
+import pytest
 import torch
 from absl.testing import absltest, parameterized
 
@@ -465,6 +466,7 @@ class RunTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, f'stages_averaged: {number}; expected 1 to 2'):
             ppo.Trainer(FLAT, 0, settings, 1)
 
+    @pytest.mark.slow
     def test_a_short_run_learns(self):
         """0.15 M samples, seed 0: measured 0.9 of the maximum over 32 episodes."""
         settings = ppo_settings.settings_for(FLAT, samples=1.5e5, evaluate_every=1.5e5)

@@ -8,6 +8,7 @@ import warnings
 import gymnasium
 import numpy as np
 from absl.testing import parameterized
+from helpers import KINDS
 
 if importlib.util.find_spec('stable_baselines3') is None:
     raise unittest.SkipTest('needs stable-baselines3')
@@ -17,7 +18,6 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from trl_suite import suite
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
 from trl_suite.gym import SuiteEnv
 
@@ -30,7 +30,7 @@ SMALL = {'height': 48, 'width': 64}
 class StableBaselinesTest(parameterized.TestCase):
     """Simulations against single environments, wrappers, and a learner."""
 
-    @parameterized.parameters(*suite.ALL_IDS)
+    @parameterized.parameters(*KINDS)
     def test_single_environments_pass_the_checker(self, id_):
         with warnings.catch_warnings():
             warnings.simplefilter('error')
