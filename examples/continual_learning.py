@@ -17,7 +17,7 @@ import ppo
 import ppo_settings
 import torch
 
-from trl_suite import sequences
+from trl_suite import sequences, suite
 from trl_suite.util.program import begin_script
 
 
@@ -31,9 +31,8 @@ class FineTuning:
     def learn(self, environment, budget):
         trainer = self.trainer
         trainer.environments.close()
-        trainer.environment = environment
+        trainer.spec = suite.find(environment)
         trainer.begin_stage()
-        trainer.spec = trainer.environments.spec
         # The number of samples differs between stages, and so do the seeds.
         seeds = sequences.train_seeds(self.settings.num_envs, (self.seed, trainer.samples))
         trainer.environments.seed(seeds)

@@ -21,7 +21,7 @@ import itertools
 import json
 import pathlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import checkpoints
@@ -218,6 +218,7 @@ class Trainer:
             self.networks.append(self.average)
         self.parameters = [*self.policy.parameters(), *self.value.parameters(), self.log_std]
         self.optimizer = torch.optim.Adam(self.parameters, s.learning_rate, eps=1e-5, fused=True)
+        self.penalty: Callable[[], Any] = lambda: 0.0  # added to the loss of the policy
         self.curve: list[dict[str, Any]] = []
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.recent = np.zeros(
@@ -240,12 +241,18 @@ class Trainer:
             seed = sequence.generate_state(s.num_envs).tolist()
         options = dict(s.stages[self.current - 1][1]) if self.current else {}
         spec = dataclasses.replace(self.spec, terrain=options.pop('terrain', self.spec.terrain))
-        self.environments = VectorEnvironment(
-            spec, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
+        self.enter(
+            VectorEnvironment(
+                spec, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
+            )
         )
-        self.observation = self.environments.reset()
-        self.returns, self.steps = np.zeros(s.num_envs), np.zeros(s.num_envs)
-        self.shares = {name: np.ones(s.num_envs) for name in s.least_share}
+
+    def enter(self, environments: VectorEnvironment) -> None:
+        """Continues in other simulations, with the networks, scales and optimiser so far."""
+        self.environments, n = environments, environments.num_envs
+        self.observation = environments.reset()
+        self.returns, self.steps = np.zeros(n), np.zeros(n)
+        self.shares = {name: np.ones(n) for name in self.settings.least_share}
 
     def begin_with(self, other: policies.Policy) -> None:
         """Copies weights, scales and noise of a policy, by observation blocks."""
@@ -351,8 +358,9 @@ class Trainer:
     def collect(self) -> dict[str, torch.Tensor]:
         """Steps all simulations `horizon` times; returns the samples, flattened."""
         s, environments = self.settings, self.environments
-        shape = (s.horizon, s.num_envs)
-        observations = np.empty((s.horizon + 1, s.num_envs, len(self.scales.mean)))
+        n = environments.num_envs
+        shape = (s.horizon, n)
+        observations = np.empty((s.horizon + 1, n, len(self.scales.mean)))
         noise = self.random.standard_normal((*shape, len(self.log_std)), np.float32)
         means, actions = np.empty_like(noise), np.empty_like(noise)
         reward, ended, failed = np.empty(shape), np.empty(shape, bool), np.empty(shape, bool)
@@ -381,21 +389,21 @@ class Trainer:
                 for share in self.shares.values():
                     share[ended[t]] = 1.0
         observations[-1] = self.seen(self.observation)[0]
-        self.samples += s.horizon * s.num_envs
+        self.samples += s.horizon * n
 
         flat = observations.reshape(-1, observations.shape[-1])
         inputs = self.scales(flat)
         with torch.no_grad():
-            values = self.value(inputs)[:, 0].numpy().reshape(s.horizon + 1, s.num_envs)
+            values = self.value(inputs)[:, 0].numpy().reshape(s.horizon + 1, n)
             following = values[1:].astype(float)
             for t, env_ids, last in cut:
                 following[t, env_ids] = self.value(self.scales(last))[:, 0].numpy()
         following[failed] = 0.0
         advantage = advantages(reward, values[:-1], following, ended, s.gamma, s.lambda_)
-        self.scales.update(flat[: -s.num_envs])  # takes effect after this update
+        self.scales.update(flat[:-n])  # takes effect after this update
         log_probability = -(noise**2 / 2).sum(-1) - np.log(std).sum()
         return {
-            'observation': inputs[: -s.num_envs],
+            'observation': inputs[:-n],
             'action': torch.from_numpy(actions).flatten(0, 1),
             'log_probability': torch.from_numpy(log_probability.astype(np.float32)).flatten(),
             'advantage': torch.from_numpy(advantage.astype(np.float32)).flatten(),
@@ -413,7 +421,7 @@ class Trainer:
 
     def strays(self, terms: dict[str, np.ndarray]) -> np.ndarray:
         """Mask of simulations with a smoothed reward term below its bound, (n,) bool."""
-        s, result = self.settings, np.zeros(self.settings.num_envs, bool)
+        s, result = self.settings, np.zeros(self.environments.num_envs, bool)
         forget = self.environments.control_timestep / s.patience
         for name, least in s.least_share.items():
             self.shares[name] += forget * (terms[name] / self.largest[name] - self.shares[name])
@@ -462,7 +470,7 @@ class Trainer:
                 excess = (mean.abs() - 1).clamp(min=0).square().sum(-1).mean()
                 loss = 0.5 * value_error
                 if not (waits or stopped):
-                    loss = -gain + loss + s.bound_cost * excess
+                    loss = -gain + loss + s.bound_cost * excess + self.penalty()
                 self.optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.parameters, s.gradient_norm)
@@ -532,16 +540,31 @@ class Trainer:
         last = [point['normalized_return'] for point in self.curve[-2:]]
         return len(last) == 2 and min(last) >= self.settings.enough
 
-    def save(self, folder: pathlib.Path) -> None:
-        """Writes checkpoint and curve."""
-        state = {name: getattr(self, name) for name in _STATE}
-        state |= {
-            'settings': dataclasses.asdict(self.settings),
+    def learnt(self) -> dict[str, Any]:
+        """Returns networks, noise, scales, optimiser and random state."""
+        return {
             'networks': [part.state_dict() for part in self.networks],
             'log_std': self.log_std.detach().clone(),
             'optimizer': self.optimizer.state_dict(),
             'scales': (self.scales.count, self.scales.mean, self.scales.square),
             'random': self.random.bit_generator.state,
+        }
+
+    def set_learnt(self, state: dict[str, Any]) -> None:
+        """Restores what `learnt` returned."""
+        for network_, saved in zip(self.networks, state['networks'], strict=True):
+            network_.load_state_dict(saved)
+        self.log_std.data.copy_(state['log_std'])
+        self.optimizer.load_state_dict(state['optimizer'])
+        self.scales.count, self.scales.mean, self.scales.square = state['scales']
+        self.random.bit_generator.state = state['random']
+
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes checkpoint and curve."""
+        state = {name: getattr(self, name) for name in _STATE}
+        state |= {
+            **self.learnt(),
+            'settings': dataclasses.asdict(self.settings),
             'environments': self.environments.get_state(),
         }
         checkpoints.save(state, folder / 'checkpoint.pt')
@@ -562,12 +585,7 @@ class Trainer:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
         for name in _STATE:
             setattr(self, name, state[name])
-        for network_, saved in zip(self.networks, state['networks'], strict=True):
-            network_.load_state_dict(saved)
-        self.log_std.data.copy_(state['log_std'])
-        self.optimizer.load_state_dict(state['optimizer'])
-        self.scales.count, self.scales.mean, self.scales.square = state['scales']
-        self.random.bit_generator.state = state['random']
+        self.set_learnt(state)
         if self.stage != self.current:
             kept = {name: getattr(self, name) for name in _STATE}
             self.environments.close()

@@ -229,20 +229,26 @@ class ExampleTest(absltest.TestCase):
         )  # fmt: skip
         folder = self.enterContext(tempfile.TemporaryDirectory())
         arguments = ['pair', '--budget', '1024', '--episodes', '2', '--threads', '1']
-        learn = example.FineTuning.learn
+        learn, trained_in = example.FineTuning.learn, []
 
         def stopped(learner, environment, budget):
             if environment == pair.ids[1]:
                 raise KeyboardInterrupt
             learn(learner, environment, budget)
 
+        def recorded(learner, environment, budget):
+            learn(learner, environment, budget)
+            trained_in.append(learner.trainer.environments.spec.id)
+
         with (
             mock.patch.object(example.FineTuning, 'learn', stopped),
             self.assertRaises(KeyboardInterrupt),
         ):
             example.main([*arguments, '--output', f'{folder}/parts'])
-        for name in ('parts', 'whole'):
-            example.main([*arguments, '--output', f'{folder}/{name}'])
+        with mock.patch.object(example.FineTuning, 'learn', recorded):
+            for name in ('parts', 'whole'):
+                example.main([*arguments, '--output', f'{folder}/{name}'])
+        self.assertEqual(trained_in, [pair.ids[1], *pair.ids])
         parts, whole = (
             json.loads(pathlib.Path(folder, name, 'pair_s0.json').read_text())
             for name in ('parts', 'whole')
