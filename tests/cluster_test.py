@@ -4,12 +4,17 @@ Clusters are processes of this machine: a head node of one core, and a second no
 is killed while it works.
 """
 
+import concurrent.futures
+import json
+import multiprocessing
 import os
 import pathlib
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-import unittest
+from typing import ClassVar
 from unittest import mock
 
 import numpy as np
@@ -17,6 +22,11 @@ import pytest
 from absl.testing import absltest
 
 from trl_suite import evaluation, policies, sequences
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import ppo
+import ppo_settings
+import train_all
 
 try:
     import ray
@@ -66,7 +76,7 @@ class InBackground(threading.Thread):
         return self.value
 
 
-class TwoNodes(unittest.TestCase):
+class TwoNodes(absltest.TestCase):
     def setUp(self):
         super().setUp()
         paths = os.pathsep.join((str(ROOT), str(ROOT / 'examples')))
@@ -147,6 +157,82 @@ class ExecutorTest(TwoNodes):
             self.assertRaisesRegex(RuntimeError, 'install the same on all nodes'),
         ):
             list(executor.map(len, ['text']))
+
+    def test_a_task_that_no_node_can_run(self):
+        with self.assertWarnsRegex(UserWarning, 'no node has the 64 cores and 0.0 GB'):
+            self.connect(num_cpus=64)
+
+
+class TrainingTest(TwoNodes):
+    """Four runs, one of which starts from the policy of another."""
+
+    PATTERN = 'PD_Biped2D_[FI]*'
+    SETTINGS: ClassVar = {
+        'samples': 24576, 'num_envs': 16, 'minibatch': 128, 'hidden': (32, 32),
+        'evaluate_every': 2048, 'evaluation_episodes': 2, 'value_first': 2048,
+    }  # fmt: skip
+
+    def folder(self):
+        return pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def train(self, folder, *arguments):
+        """Runs train_all in this process; returns what it has entered."""
+        trained = {'TRL_SUITE_TRAINED': str(folder / 'trained')}
+        with mock.patch.dict(os.environ, trained):
+            words = '--filter', self.PATTERN, '--ray', '--runs', str(folder / 'runs'), *arguments
+            train_all.main(words)
+        return entered(folder / 'trained')
+
+    def test_runs_survive_the_loss_of_a_node(self):
+        settings = ppo_settings.settings_for
+        self.enterContext(
+            mock.patch.object(ppo, 'settings_for', lambda id_, **_: settings(id_, **self.SETTINGS))
+        )
+        local, remote = self.folder(), self.folder()
+        one = lambda *_, **__: concurrent.futures.ProcessPoolExecutor(  # noqa: E731
+            1, multiprocessing.get_context('spawn'), max_tasks_per_child=1
+        )
+        with mock.patch('trl_suite.adapters.ray.RayExecutor', one):
+            expected = self.train(local)
+        self.assertLen(expected, 2 * 4)
+        again = InBackground(lambda: self.train(remote, '--address', self.cluster.address))
+        wait_until(
+            lambda: len(list((remote / 'runs').glob('*/*/checkpoint.pt'))) >= 3, 'no checkpoints'
+        )
+        self.kill_one_of(again)
+        self.assertEqual(again.result(), expected)
+        logs = [path.read_text() for path in (remote / 'runs').glob('*/*/log.txt')]
+        self.assertLen(logs, 4)
+        self.assertEqual(sum('continues on' in log for log in logs), 1)
+
+    def test_programs_give_the_same_results_with_and_without_ray(self):
+        found = []
+        for name, words in (('local', ()), ('ray', ('--ray', '--address', self.cluster.address))):
+            folder = self.folder()
+            subprocess.run(
+                [
+                    sys.executable, ROOT / 'examples' / 'train_all.py', '--filter', 'PD_Biped2D_Flat-v0',
+                    '--samples', '4096', '--runs', folder / 'runs', *words,
+                ],
+                env={**os.environ, 'TRL_SUITE_TRAINED': str(folder / name)},
+                cwd=folder, check=True, timeout=PATIENCE,
+            )  # fmt: skip
+            found.append(entered(folder / name))
+        self.assertLen(found[0], 2)
+        self.assertEqual(*found)
+
+
+def entered(folder):
+    """Returns what a folder of trained policies holds, without times and machines."""
+    found = {path.name: path.read_bytes() for path in folder.glob('*.npz')}
+    for path in folder.glob('*.json'):
+        content = json.loads(path.read_text())
+        for run in content['runs']:
+            del run['machine']
+            for point in run['curve']:
+                del point['seconds']
+        found[path.name] = content
+    return found
 
 
 if __name__ == '__main__':

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import platform
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
@@ -57,6 +58,17 @@ class RayExecutor:
         self._begun = not ray.is_initialized()
         if self._begun:
             ray.init(address, log_to_driver=False, logging_level='ERROR')
+        needed = {'CPU': num_cpus, 'memory': memory}
+        if not any(
+            all(node['Resources'].get(name, 0) >= number for name, number in needed.items())
+            for node in ray.nodes()
+            if node['Alive']
+        ):
+            warnings.warn(
+                f'no node has the {num_cpus:g} cores and {memory / 1e9:.1f} GB of memory that a task '
+                'needs; tasks wait until there is one',
+                stacklevel=2,
+            )
         self._call = ray.remote(
             num_cpus=num_cpus, memory=memory or None, max_retries=retries, max_calls=int(fresh),
             scheduling_strategy='SPREAD',
