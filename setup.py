@@ -7,6 +7,7 @@ from setuptools import find_packages, setup
 TORCH = 'torch>=2.5,<2.14'
 BVH = 'pybvh>=0.9,<1'
 VISER = 'viser>=1.1,<2'
+RAY = '>=2.54.1,<2.61'
 
 setup(
     name='trl_suite',
@@ -66,7 +67,8 @@ setup(
         'gymnasium': ['gymnasium>=1.1'],
         'sb3': ['gymnasium>=1.1', 'stable-baselines3>=2.4', TORCH],
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
-        'rllib': ['gymnasium>=1.1', 'ray[rllib]>=2.54.1,<2.61', TORCH],
+        'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],
+        'cluster': [f'ray{RAY}', 'fsspec'],
         'shimmy': ['shimmy>=2.0,<3'],
         'clips': [BVH],
         'train': [TORCH, 'scipy'],

@@ -567,7 +567,6 @@ class Trainer:
             'settings': dataclasses.asdict(self.settings),
             'environments': self.environments.get_state(),
         }
-        checkpoints.save(state, folder / 'checkpoint.pt')
         curve = {
             'id': self.spec.id,
             'seed': self.seed,
@@ -577,6 +576,8 @@ class Trainer:
         }
         with files.replacing(folder / 'curve.json') as part:
             part.write_text(json.dumps(curve, indent=1))
+        # Last: a run that continues from it finds all other files.
+        checkpoints.save(state, folder / 'checkpoint.pt')
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""

@@ -1,7 +1,9 @@
 """Evaluation: the episodes of single environments, summed up, whatever the threads."""
 
+import concurrent.futures
 import dataclasses
 import json
+import pickle
 from unittest import mock
 
 import numpy as np
@@ -90,6 +92,39 @@ class EvaluateTest(parameterized.TestCase):
             self.assertEqual(fewer[name], expected[name][:3])
         other = evaluation.evaluate(GAPS, policy, 3, 5)
         self.assertNotEqual(other['returns'], fewer['returns'])
+
+    def test_results_do_not_depend_on_the_executor(self):
+        class Pickling:
+            """Runs here what was sent and received."""
+
+            sent = ()
+
+            def map(self, fn, *iterables):
+                for arguments in zip(*iterables, strict=True):
+                    data = pickle.dumps((fn, arguments))
+                    self.sent += (len(data),)
+                    fn_, arguments_ = pickle.loads(data)
+                    yield pickle.loads(pickle.dumps(fn_(*arguments_)))
+
+        self.enterContext(mock.patch.object(evaluation, 'PART', 3))
+        pickling = Pickling()
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            for policy, factory in ((make(GAPS), False), (evaluation.random, True)):
+                expected = evaluation.evaluate(GAPS, policy, 7, 2, factory=factory)
+                for executor in (pickling, pool):
+                    found = evaluation.evaluate(
+                        GAPS, policy, 7, 2, factory=factory, executor=executor
+                    )
+                    self.assertEqual(found, expected)
+        self.assertLen(pickling.sent, 2 * 3)
+        self.assertLess(max(pickling.sent), 1e5)  # a policy, and no environment
+
+    def test_several_policies(self):
+        cases = [(GAPS, make(GAPS)), (FLAT, make(FLAT, 1))]
+        expected = [evaluation.evaluate(*case, 3, 2) for case in cases]
+        self.assertEqual(evaluation.evaluate_all(cases, 3, 2), expected)
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            self.assertEqual(evaluation.evaluate_all(cases, 3, 2, executor=pool), expected)
 
     def test_the_random_baseline_repeats(self):
         first = evaluation.evaluate(GAPS, evaluation.random, 5, 1, 1, factory=True)

@@ -1,8 +1,13 @@
 """Tests of the programs that train and compare: which runs there are, and in which order."""
 
+import contextlib
+import io
+import os
 import pathlib
 import sys
+import tempfile
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -12,6 +17,7 @@ from trl_suite.registry import catalogue
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import checkpoints
 import compare_transfer
 import evaluate_plans
 import expert
@@ -32,13 +38,70 @@ class JobsTest(parameterized.TestCase):
         self.assertLen(again, 12)
         self.assertLen([id_ for id_ in again if id_.startswith('MTU_')], 3)
 
-    def test_initial_policies_are_trained_before(self):
+    def test_policies_that_a_run_uses_are_trained_before(self):
         seen = set()
         for id_, _ in train_all.jobs('*'):
             start = ppo_settings.settings_for(id_).start
             if start and start not in ppo.TEACHERS:
                 self.assertIn(start, seen, id_)
+            if '_HLC_' in id_:
+                walker = 'Run_FootStep' if '_Run-' in id_ else 'General_Step'
+                self.assertEqual(train_all.needed(id_), [f'PD_Biped3D_LLC_{walker}-v0'])
+                self.assertContainsSubset(train_all.needed(id_), seen)
             seen.add(id_)
+
+    def test_runs_that_use_the_policy_of_a_failed_run_are_not_trained(self):
+        flat, incline = (f'PD_Biped2D_{name}-v0' for name in ('Flat', 'Incline'))
+        self.assertEqual(train_all.needed(incline), [flat])
+        done = []
+
+        def work(id_, seed):
+            done.append(id_)
+            raise ValueError('no network')
+
+        self.enterContext(mock.patch.object(train_all, 'in_processes', lambda _: work))
+        folder = self.enterContext(tempfile.TemporaryDirectory())
+        self.enterContext(mock.patch.dict(os.environ, TRL_SUITE_TRAINED=folder))
+        out = self.enterContext(contextlib.redirect_stdout(io.StringIO()))
+        self.enterContext(contextlib.redirect_stderr(io.StringIO()))
+        with self.assertRaisesRegex(RuntimeError, '4 of 4 runs failed'):
+            train_all.main(['--filter', 'PD_Biped2D_[FI]*'])
+        self.assertLen(done, 3)
+        self.assertNotIn(incline, done)
+        self.assertIn(f'{flat:40}    1  ValueError: no network', out.getvalue())
+        self.assertIn(f'{incline:40}    1  RuntimeError: not trained, since', out.getvalue())
+
+    def test_a_run_in_progress_is_not_overwritten(self):
+        runs = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        folder = runs / 'PD_Biped2D_Flat-v0' / 'seed_1'
+        work = train_all.in_processes(
+            train_all.parsed(['--runs', str(runs), '--overwrite', '--samples', '1'])
+        )
+        with (
+            checkpoints.only_run(folder),
+            self.assertRaisesRegex(RuntimeError, 'trains in this folder'),
+        ):
+            work('PD_Biped2D_Flat-v0', 1)
+        self.assertTrue(folder.exists())
+
+    def test_files_that_a_run_reads(self):
+        """The policies of the start and of the controller, and which environments share them."""
+        for id_, expected in (
+            ('PD_Biped2D_Incline-v0', {'PD_Biped2D_Incline-v0', 'PD_Biped2D_Flat-v0'}),
+            (
+                'PD_Biped3D_HLC_Soccer-v0',
+                {'PD_Biped3D_HLC_Soccer-v0', 'PD_Biped3D_LLC_General_Step-v0'},
+            ),
+        ):
+            given = train_all.given(id_)
+            self.assertEqual(given.keys(), {f'{each}.npz' for each in expected} | {'shared.json'})
+            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+            for name, content in given.items():
+                (folder / name).write_bytes(content)
+            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+                self.assertEqual(set(policies.available()), expected)
+                VectorEnvironment(id_, 1, 1, 0).close()
+        self.assertGreater(len(policies.available()), 50)
 
     def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""

@@ -1,5 +1,6 @@
 """Sequences of environments: contents, seeds, metrics, and resumed runs."""
 
+import concurrent.futures
 import importlib.util
 import json
 import pathlib
@@ -131,10 +132,11 @@ class Keeper(Counter):
         self.history = [tuple(row) for row in json.loads((folder / 'history.json').read_text())]
 
 
-def made_up(id_, policy, episodes, seeds, threads):
-    environment, stages = policy
-    assert environment == id_ and min(seeds) >= 2**31 and len(seeds) == episodes
-    return {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
+def made_up(cases, episodes, seeds, threads, executor):
+    assert min(seeds) >= 2**31 and len(seeds) == episodes
+    for id_, (environment, stages) in cases:
+        assert environment == id_
+        yield {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
 
 
 class RunTest(parameterized.TestCase):
@@ -142,7 +144,7 @@ class RunTest(parameterized.TestCase):
         super().setUp()
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.path = self.folder / 'result.json'
-        self.enterContext(mock.patch.object(evaluation, 'evaluate', made_up))
+        self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
 
     def run_short(self, learner, **changes):
         return sequences.run(SHORT, learner, **{'budget': 7, 'path': self.path, **changes})
@@ -202,6 +204,23 @@ class RunTest(parameterized.TestCase):
             self.run_short(Counter())
 
 
+class ExecutorTest(absltest.TestCase):
+    def test_scores_do_not_depend_on_the_executor(self):
+        class Still:
+            def policy(self, environment):
+                return lambda observation: np.zeros((len(observation), 20))
+
+        expected = [
+            evaluation.evaluate(id_, Still().policy(id_), 4, sequences.test_seeds(4, 1))[
+                sequences.SCORE
+            ]
+            for id_ in SHORT.ids
+        ]
+        self.assertEqual(sequences.scores(SHORT, Still(), 4, 1), expected)
+        with concurrent.futures.ThreadPoolExecutor(2) as pool:
+            self.assertEqual(sequences.scores(SHORT, Still(), 4, 1, executor=pool), expected)
+
+
 class ExampleTest(absltest.TestCase):
     def test_example_runs_with_a_small_learner(self):
         """A run that was stopped after the first stage resumes exactly."""
@@ -223,8 +242,11 @@ class ExampleTest(absltest.TestCase):
         # Quicker than episodes, and as telling: what the network has become.
         self.enterContext(
             mock.patch.object(
-                evaluation, 'evaluate',
-                lambda id_, policy, *_: {'normalized_return': float(np.abs(policy.weights[1]).mean())},
+                evaluation, 'evaluate_all',
+                lambda cases, *_, executor: [
+                    {'normalized_return': float(np.abs(policy.weights[1]).mean())}
+                    for _, policy in cases
+                ],
             )
         )  # fmt: skip
         folder = self.enterContext(tempfile.TemporaryDirectory())

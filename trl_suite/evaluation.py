@@ -9,9 +9,10 @@ print(result['return'], result['return_interval'], result['normalized_return'])
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import tqdm
@@ -23,9 +24,21 @@ from trl_suite.tasks.navigation.scripted import scripted
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
 CHUNK = 256  # episodes that run in parallel
+PART = 64  # the same, for an executor: small enough to keep many nodes busy
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
 BOOTSTRAP = 10_000  # bootstrap samples
 _NORMAL_95 = 1.96  # half width of a 95 % confidence interval, in standard errors
+
+
+class Executor(Protocol):
+    """Runs functions elsewhere: a pool of `concurrent.futures`, `adapters.ray.RayExecutor`, ..."""
+
+    def map(self, fn: Callable[..., Any], /, *iterables: Iterable[Any]) -> Iterable[Any]:
+        """Calls a function with arguments from iterables; returns the results in order.
+
+        Starts all calls at once. Functions, arguments and results are pickled if they leave the
+        process.
+        """
 
 
 def evaluate(
@@ -38,13 +51,14 @@ def evaluate(
     *,
     factory: bool = False,
     progress: bool = False,
+    executor: Executor | None = None,
 ) -> dict[str, Any]:
     """Runs complete episodes of an environment; returns statistics and the result of each episode.
 
     Episode i is seeded with the i-th number of `numpy.random.SeedSequence(seed)`: it equals the
     first episode of `suite.make(id, {'random': result['seeds'][i]})`, for any number of episodes
-    and threads, if the policy computes each action from that simulation's observation alone (a
-    `Policy` does).
+    and threads and with any executor, if the policy computes each action from that simulation's
+    observation alone (a `Policy` does).
 
     Args:
       environment: id, alias, or `EnvSpec`.
@@ -52,11 +66,14 @@ def evaluate(
         actions of simulations whose episode has ended are ignored.
       episodes: number of episodes.
       seed: seed of the whole evaluation; or a sequence with one seed per episode.
-      num_threads: threads that step the physics; 0 uses all cores.
+      num_threads: threads that step the physics; 0 uses all cores, with an executor 1.
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
       factory: `policy` is a function `VectorEnvironment` -> policy, so that the policy can use more
         than observations; the values of `BASELINES` are such functions.
-      progress: show a progress bar, in steps up to the step limit, if stderr is a terminal.
+      progress: show a progress bar, in steps up to the step limit, with an executor in parts of
+        `PART` episodes, if stderr is a terminal.
+      executor: runs parts of `PART` episodes, for example on the nodes of a cluster; None runs them
+        in this process. Only the policy and the results are sent.
 
     Returns:
       A dict that can be written as JSON. Settings: 'id', 'episodes', 'seed' (None for a sequence),
@@ -74,45 +91,110 @@ def evaluate(
     Raises:
       ValueError: unknown names or options, numbers out of range, or an incompatible `Policy`.
     """
+    cases = [(environment, policy)]
+    [result] = evaluate_all(
+        cases, episodes, seed, num_threads, task_kwargs, factory=factory, progress=progress,
+        executor=executor,
+    )  # fmt: skip
+    return result
+
+
+def evaluate_all(
+    cases: Iterable[tuple[str | EnvSpec, Callable[[Any], Any]]],
+    episodes: int = 50,
+    seed: int | Sequence[int] = 0,
+    num_threads: int = 0,
+    task_kwargs: Mapping[str, Any] | None = None,
+    *,
+    factory: bool = False,
+    progress: bool = False,
+    executor: Executor | None = None,
+) -> list[dict[str, Any]]:
+    """Calls `evaluate` for pairs of environment and policy; an executor runs all at the same time.
+
+    Arguments, results and errors are those of `evaluate`.
+    """
+    seeds = _seeds(episodes, seed)
+    size = CHUNK if executor is None else PART
+    parts = [seeds[start : start + size] for start in range(0, len(seeds), size)]
+    run = functools.partial(
+        _run,
+        num_threads=num_threads if executor is None else num_threads or 1,
+        task_kwargs=task_kwargs,
+        factory=factory,
+        progress=progress and executor is None,
+    )
+    start: Callable[..., Iterable[Any]] = map if executor is None else executor.map
+    running = [start(functools.partial(run, *case), parts) for case in cases]
+    silent = None if progress and executor is not None else True
+    results = []
+    with tqdm.tqdm(total=len(running) * len(parts), disable=silent, unit='part') as bar:
+        for each in running:
+            done = []
+            for part in each:
+                done.append(part)
+                bar.update()
+            id_, step_limit, _ = done[0]
+            of = {name: np.concatenate([part[name] for *_, part in done]) for name in done[0][2]}
+            results.append(_summary(id_, step_limit, seeds, seed, of))
+    return results
+
+
+def _seeds(episodes: int, seed: int | Sequence[int]) -> list[int]:
+    """Returns the seed of each episode."""
     if int(episodes) != episodes or episodes < 1:
         raise ValueError(f'episodes is {episodes}; expected a positive integer')
     if isinstance(seed, Sequence):
         seeds = list(map(int, seed))
         if len(seeds) != episodes:
             raise ValueError(f'{len(seeds)} seeds for {episodes} episodes')
-    elif int(seed) != seed or seed < 0:
+        return seeds
+    if int(seed) != seed or seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
-    else:
-        seeds = np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
-    chunks = []
-    silent = None if progress else True
-    for start in range(0, len(seeds), CHUNK):
-        chunk = seeds[start : start + CHUNK]
-        environments = VectorEnvironment(
-            environment, len(chunk), num_threads, chunk, autoreset='disabled',
-            task_kwargs=task_kwargs,
-        )  # fmt: skip
-        spec, step_limit = environments.spec, environments.step_limit
-        try:
-            if step_limit is None:
-                raise ValueError(f'{spec.id} has no step limit, so its episodes may never end')
-            if isinstance(policy, Policy):
-                policy.check(environments)
-            with tqdm.tqdm(
-                total=step_limit, delay=PROGRESS_DELAY, disable=silent, unit='step'
-            ) as bar:
-                act = policy(environments) if factory else policy
-                chunks.append(_run(environments, act, bar))
-        finally:
-            environments.close()
-    assert step_limit is not None
-    of = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    return np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
+
+
+def _run(
+    environment: str | EnvSpec,
+    policy: Callable[[Any], Any],
+    seeds: list[int],
+    num_threads: int,
+    task_kwargs: Mapping[str, Any] | None,
+    factory: bool,
+    progress: bool,
+) -> tuple[str, int, dict[str, np.ndarray]]:
+    """Runs one episode per seed, all at the same time; returns id, step limit and results."""
+    environments = VectorEnvironment(
+        environment, len(seeds), num_threads, seeds, autoreset='disabled', task_kwargs=task_kwargs
+    )
+    id_, step_limit = environments.spec.id, environments.step_limit
+    try:
+        if step_limit is None:
+            raise ValueError(f'{id_} has no step limit, so its episodes may never end')
+        if isinstance(policy, Policy):
+            policy.check(environments)
+        silent = None if progress else True
+        with tqdm.tqdm(total=step_limit, delay=PROGRESS_DELAY, disable=silent, unit='step') as bar:
+            act = policy(environments) if factory else policy
+            return id_, step_limit, _episodes(environments, act, bar)
+    finally:
+        environments.close()
+
+
+def _summary(
+    id_: str,
+    step_limit: int,
+    seeds: list[int],
+    seed: int | Sequence[int],
+    of: dict[str, np.ndarray],
+) -> dict[str, Any]:
+    """Returns the result of `evaluate` for the results of its episodes."""
     mean = float(of['returns'].mean())
     interval = None
     if len(seeds) > 1:
         interval = _NORMAL_95 * float(of['returns'].std(ddof=1)) / math.sqrt(len(seeds))
     return {
-        'id': spec.id,
+        'id': id_,
         'episodes': len(seeds),
         'seed': None if isinstance(seed, Sequence) else int(seed),
         'step_limit': step_limit,
@@ -132,7 +214,9 @@ def evaluate(
     }
 
 
-def _run(environments: VectorEnvironment, policy: BatchPolicy, bar: Any) -> dict[str, np.ndarray]:
+def _episodes(
+    environments: VectorEnvironment, policy: BatchPolicy, bar: Any
+) -> dict[str, np.ndarray]:
     """Runs one episode in every simulation."""
     n = environments.num_envs
     returns, lengths, distances, durations = np.zeros(n), np.zeros(n, int), np.zeros(n), np.zeros(n)
@@ -173,9 +257,10 @@ def zero(environments: VectorEnvironment) -> BatchPolicy:
 
 def random(environments: VectorEnvironment) -> BatchPolicy:
     """Makes a policy that draws actions uniformly from [-1, 1]."""
-    generator = np.random.default_rng(environments.seeds.tolist())
-    shape = environments.num_envs, len(environments.action_map)
-    return lambda observation: generator.uniform(-1, 1, shape)
+    size = len(environments.action_map)
+    # One stream per simulation, so that actions do not depend on how episodes are divided.
+    streams = [np.random.default_rng(seed) for seed in environments.seeds.tolist()]
+    return lambda observation: np.array([stream.uniform(-1, 1, size) for stream in streams])
 
 
 def clip(environments: VectorEnvironment) -> BatchPolicy:

@@ -241,6 +241,7 @@ def scores(
     episodes: int = EPISODES,
     seed: int = 0,
     num_threads: int = 0,
+    executor: evaluation.Executor | None = None,
 ) -> list[float]:
     """Tests the current policy of a learner on all tasks.
 
@@ -250,16 +251,16 @@ def scores(
       episodes: episodes per task; the same seed gives the same episodes.
       seed: seed from which the test seeds are drawn.
       num_threads: threads that step the physics; 0 uses all cores.
+      executor: runs the episodes of all tasks at the same time; see `evaluation.evaluate`.
 
     Returns:
       Mean return over the step limit for each task, (T,).
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
     seeds = test_seeds(episodes, seed)
-    return [
-        evaluation.evaluate(id, learner.policy(id), episodes, seeds, num_threads)[SCORE]
-        for id in sequence.ids
-    ]
+    cases = [(id, learner.policy(id)) for id in sequence.ids]
+    found = evaluation.evaluate_all(cases, episodes, seeds, num_threads, executor=executor)
+    return [result[SCORE] for result in found]
 
 
 def run(
@@ -271,6 +272,7 @@ def run(
     seed: int = 0,
     num_threads: int = 0,
     progress: bool = False,
+    executor: evaluation.Executor | None = None,
 ) -> dict[str, Any]:
     """Trains a learner on one environment after the other; tests it on all before and after each.
 
@@ -288,6 +290,8 @@ def run(
       seed: seed from which the test seeds are drawn.
       num_threads: threads that step the physics in tests; 0 uses all cores.
       progress: show a progress bar.
+      executor: runs the episodes of tests, for example on the nodes of a cluster; see
+        `evaluation.evaluate`. The learner stays in this process.
 
     Returns:
       The content of the file: the settings 'sequence', 'ids', 'budget', 'episodes', 'seed'; the
@@ -316,7 +320,7 @@ def run(
                     'cannot resume: it has no methods save and load; remove the file to start again'
                 )
             learner.load(_stage(path, done))
-    test = (episodes, seed, num_threads)
+    test = (episodes, seed, num_threads, executor)
     with tqdm.tqdm(
         total=len(sequence),
         initial=len(result['scores']),

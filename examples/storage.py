@@ -1,0 +1,101 @@
+"""Files of a training run in a place that outlives its machine: a folder, or a URL of fsspec.
+
+Examples of URLs: `s3://bucket/runs`, `gs://bucket/runs`, `sftp://host/home/me/runs`; most need a package of
+their own, which fsspec names if it is missing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import sys
+import tempfile
+import threading
+import uuid
+from collections.abc import Iterator
+
+import fsspec
+
+CHECKPOINT = 'checkpoint.pt'
+EVERY = 5.0  # s between two looks for a new checkpoint
+
+
+def absolute(url: str) -> str:
+    """Returns a URL unchanged, and the absolute path of a folder."""
+    return url if '://' in url else os.path.abspath(url)
+
+
+def fetch(url: str, folder: pathlib.Path) -> None:
+    """Copies the files of a run into a folder; there may be none."""
+    system, path = fsspec.core.url_to_fs(url)
+    if not system.exists(path):
+        return
+    for found in system.ls(path, detail=False):
+        name = found.rstrip('/').rpartition('/')[2]
+        if not name.startswith('.'):
+            system.get_file(found, str(folder / name))
+
+
+def put(folder: pathlib.Path, url: str) -> None:
+    """Copies the files of a run to a store.
+
+    A file replaces that of the store when it is whole, and the checkpoint is the last one: those that
+    it needs are then there.
+    """
+    system, path = fsspec.core.url_to_fs(url)
+    system.makedirs(path, exist_ok=True)
+    names = [each.name for each in folder.iterdir() if not each.name.startswith('.')]
+    for name in sorted(names, key=lambda name: name == CHECKPOINT):
+        part = f'{path}/.{name}.{uuid.uuid4().hex}.part'
+        system.put_file(str(folder / name), part)
+        system.mv(part, f'{path}/{name}')
+
+
+def remove(url: str) -> None:
+    """Removes the files of a run; there may be none."""
+    system, path = fsspec.core.url_to_fs(url)
+    if system.exists(path):
+        system.rm(path, recursive=True)
+
+
+@contextlib.contextmanager
+def kept(folder: pathlib.Path, url: str) -> Iterator[None]:
+    """Copies a run from a store, its files to the store after each checkpoint, and all at the end."""
+    fetch(url, folder)
+    ended = threading.Event()
+    thread = threading.Thread(target=_follow, args=(folder, url, ended), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+    put(folder, url)
+
+
+def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
+    before = _written(folder)
+    while not ended.wait(EVERY):
+        now = _written(folder)
+        if now == before:
+            continue
+        # Files are replaced, never changed: links are those of one moment. The checkpoint is linked
+        # first, so that the other files are not older.
+        with tempfile.TemporaryDirectory(dir=folder.parent) as moment:
+            names = [each.name for each in folder.iterdir() if not each.name.startswith('.')]
+            for name in sorted(names, key=lambda name: name != CHECKPOINT):
+                with contextlib.suppress(FileNotFoundError):
+                    os.link(folder / name, pathlib.Path(moment, name))
+            try:
+                put(pathlib.Path(moment), url)
+            except OSError as error:  # training goes on; the next checkpoint may arrive
+                print(f'{url}: {error}', file=sys.stderr)
+            else:
+                before = now
+
+
+def _written(folder: pathlib.Path) -> int:
+    """Returns the time at which the checkpoint was written, ns; 0 if there is none."""
+    path = folder / CHECKPOINT
+    return path.stat().st_mtime_ns if path.exists() else 0

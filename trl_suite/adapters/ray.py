@@ -1,0 +1,129 @@
+"""Ray: evaluations and sequences on the cores of this machine, or of a cluster.
+
+    from trl_suite import evaluation, policies
+    from trl_suite.adapters.ray import RayExecutor
+
+    id_ = 'PD_Biped2D_Gaps_Terrain-v0'
+    with RayExecutor() as executor:  # or RayExecutor('auto') for a cluster
+        result = evaluation.evaluate(id_, policies.reference(id_), 4096, executor=executor)
+
+`docs/cluster.md` describes how to start a cluster.
+"""
+
+from __future__ import annotations
+
+import platform
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import Any
+
+from trl_suite.util import compiled
+
+try:
+    import ray
+except ImportError as error:
+    message = f"trl_suite.adapters.ray needs an extra ({error}): pip install 'trl_suite[cluster]'"
+    raise ImportError(message) from None
+
+RETRIES = 10  # of a task whose process or node was lost
+
+
+class RayExecutor:
+    """Runs functions as tasks of Ray; those of a lost node run again on another one."""
+
+    def __init__(
+        self,
+        address: str | None = None,
+        *,
+        num_cpus: float = 1,
+        memory: int = 0,
+        retries: int = RETRIES,
+        fresh: bool = False,
+    ) -> None:
+        """Connects to a cluster, unless this process is connected to one.
+
+        Args:
+          address: 'auto' for the cluster that this machine belongs to, or 'HOST:PORT' of its first
+            node; 'local' starts Ray on this machine. None: the cluster of this machine or of
+            `$RAY_ADDRESS` if there is one, otherwise 'local'.
+          num_cpus: cores that a task needs.
+          memory: memory that a task needs, bytes.
+          retries: how often a task is started again after the loss of its process or node.
+          fresh: run each task in a process of its own.
+
+        Raises:
+          ConnectionError: there is no cluster at this address.
+        """
+        self._begun = not ray.is_initialized()
+        if self._begun:
+            ray.init(address, log_to_driver=False, logging_level='ERROR')
+        needed = {'CPU': num_cpus, 'memory': memory}
+        if not any(
+            all(node['Resources'].get(name, 0) >= number for name, number in needed.items())
+            for node in ray.nodes()
+            if node['Alive']
+        ):
+            warnings.warn(
+                f'no node has the {num_cpus:g} cores and {memory / 1e9:.1f} GB of memory that a task '
+                'needs; tasks wait until there is one',
+                stacklevel=2,
+            )
+        self._call = ray.remote(
+            num_cpus=num_cpus, memory=memory or None, max_retries=retries, max_calls=int(fresh),
+            scheduling_strategy='SPREAD',
+        )(_call)  # fmt: skip
+
+    def map(self, fn: Callable[..., Any], /, *iterables: Iterable[Any]) -> Iterator[Any]:
+        """Starts a task for each element of the iterables; returns the results in order.
+
+        Raises:
+          RuntimeError: when a result is taken: a node has other sources of trl_suite.
+          ray.exceptions.RayError: when a result is taken: a task was lost too often.
+          Exception: when a result is taken: what the function raised.
+        """
+        function = ray.put(fn)  # is sent to each node once
+        expected = compiled.fingerprint()
+        tasks = [
+            self._call.remote(expected, function, *arguments)
+            for arguments in zip(*iterables, strict=False)
+        ]
+        return _results(tasks)
+
+    def close(self) -> None:
+        """Disconnects; ends a Ray that this object has started."""
+        if self._begun:
+            ray.shutdown()
+
+    def __enter__(self) -> RayExecutor:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _results(tasks: list[Any]) -> Iterator[Any]:
+    """Yields results; cancels the tasks that are left if the caller stops or a task fails."""
+    try:
+        while tasks:
+            yield ray.get(tasks[0])
+            del tasks[0]
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    finally:
+        for task in tasks:
+            ray.cancel(task)
+
+
+def _call(expected: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    if compiled.fingerprint() != expected:
+        raise RuntimeError(
+            f'{platform.node()}: the sources of trl_suite or the version of MuJoCo differ from '
+            'those of the process that started the task; install the same on all nodes'
+        )
+    return function(*arguments)
