@@ -34,5 +34,5 @@ def flat(suite: unittest.TestSuite) -> Iterator[unittest.TestCase]:
 
 
 def is_slow(test: unittest.TestCase) -> bool:
-    marks = getattr(getattr(test, test._testMethodName), 'pytestmark', ())
-    return any(mark.name == 'slow' for mark in marks)
+    marked = type(test), getattr(test, test._testMethodName)
+    return any(mark.name == 'slow' for each in marked for mark in getattr(each, 'pytestmark', ()))

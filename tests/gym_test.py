@@ -1,4 +1,7 @@
-"""Gymnasium's interface: its checks over every id, and its own vector environments as reference."""
+"""Gymnasium's interface: its checks over every id, and its own vector environments as reference.
+
+Of the ids, one of each task type and character is checked by the fast suite, the others with -m slow.
+"""
 
 import importlib.util
 import os
@@ -10,6 +13,7 @@ import warnings
 
 import gymnasium
 import numpy as np
+import pytest
 from absl.testing import absltest, parameterized
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
@@ -156,6 +160,8 @@ def every_id(id_):
 
 for _id in suite.ALL_IDS:
     _class = every_id(_id)
+    if _id not in KINDS:  # -m slow
+        _class = pytest.mark.slow(_class)
     globals()[_class.__name__] = _class
 del _class  # else it would be collected twice
 
