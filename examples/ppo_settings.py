@@ -329,6 +329,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
     ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
     ('PD_*2D_Mixed_Terrain-v0', {'stages': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
+    ('PD_Raptor2D_Mixed_Terrain-v0', {'samples': 5e6, 'averaged': 3e5, 'enough': np.inf}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
