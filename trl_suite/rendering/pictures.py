@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tqdm.auto
+import tqdm
 
 from trl_suite import terrain as terrains
 from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
@@ -53,7 +53,7 @@ def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) ->
     """
     with Video(path, fps) as writer:
         # disable=None: no bar where stderr is not a terminal; a notebook always has one.
-        for image in tqdm.auto.tqdm(frames, unit='picture', delay=1, disable=None):
+        for image in tqdm.tqdm(frames, unit='picture', delay=1, disable=None):
             writer.add(image)
 
 
