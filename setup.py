@@ -1,6 +1,7 @@
-"""Packages of trl_suite, with the data folders xml/, mocap/ and trained/ inside the wheel."""
+"""Packages of trl_suite, with the data folders xml/ and mocap/ inside the wheel."""
 
 import pathlib
+import re
 
 from setuptools import find_packages, setup
 
@@ -9,11 +10,24 @@ BVH = 'pybvh>=0.9,<1'
 VISER = 'viser>=1.1,<2'
 RAY = '>=2.54.1,<2.61'
 
+VERSION = '0.1.0'
+# Policies that environments need: the footstep controllers. The others are in trained/, which is a
+# distribution of its own.
+CONTROLLERS = ('PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_LLC_Run_FootStep-v0')
+
+
+def long_description() -> str:
+    """Returns README.md without pictures and relative links, which a registry cannot show."""
+    text = pathlib.Path(__file__).with_name('README.md').read_text(encoding='utf-8')
+    text = re.sub(r'!\[[^]]*\]\([^)]*\)', '', text)
+    return re.sub(r'\[([^]]*)\]\((?!https?:)[^)]*\)', r'\1', text)
+
+
 setup(
     name='trl_suite',
-    version='0.1.0',
+    version=VERSION,
     description='Terrain RL Simulator on MuJoCo: locomotion over random terrain, as a suite',
-    long_description=pathlib.Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description=long_description(),
     long_description_content_type='text/markdown',
     author='The trl_suite developers',
     license_expression='Apache-2.0',
@@ -29,7 +43,8 @@ setup(
         'Topic :: Scientific/Engineering :: Physics',
         'Typing :: Typed',
     ],
-    python_requires='>=3.11',
+    # labmaze, which dm-control needs, does not build on 3.13.
+    python_requires='>=3.11,<3.13',
     packages=[
         *find_packages(include=['trl_suite', 'trl_suite.*']),
         'trl_suite.xml',
@@ -47,7 +62,7 @@ setup(
         'trl_suite.terrain': ['*.json'],
         'trl_suite.xml': ['*.xml'],
         'trl_suite.mocap': ['*.npz', '*.md'],
-        'trl_suite.trained': ['*.npz', '*.json', '*.md'],
+        'trl_suite.trained': [f'{id}.npz' for id in CONTROLLERS],
     },
     install_requires=[
         # MuJoCo 4.0.0 breaks dm_control 1.0.50 when a Physics is made.
@@ -62,6 +77,7 @@ setup(
         'trimesh',
     ],
     extras_require={
+        'policies': [f'trl_suite_policies=={VERSION}'],
         'video': ['imageio[ffmpeg]', 'matplotlib'],
         'viewer': [VISER],
         'gymnasium': ['gymnasium>=1.1'],
@@ -98,8 +114,17 @@ setup(
             'stable-baselines3>=2.4',
             TORCH,
         ],
-        'docs': ['mkdocs>=1.6,<2'],
-        'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'import-linter==2.16'],
+        'docs': [
+            'furo>=2025.12.19',
+            'myst-parser>=5,<6',
+            'sphinx>=9,<10',
+            'sphinx-argparse-cli>=1.20,<2',
+            'sphinx-copybutton>=0.5,<1',
+            'sphinx-design>=0.6,<1',
+            'gymnasium>=1.1',
+            VISER,
+        ],
+        'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'import-linter==2.16', 'twine>=6'],
     },
     entry_points={'console_scripts': ['trl-suite = trl_suite.__main__:main']},
 )

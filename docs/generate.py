@@ -10,6 +10,7 @@ written, and the exit status is 1 if a page is out of date.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import pathlib
 import re
@@ -26,7 +27,7 @@ from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
-from trl_suite.util import files
+from trl_suite.util import files, resources
 from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
@@ -97,6 +98,8 @@ def pages() -> dict[str, str]:
             environments[key] = suite.build_environment(spec, {}, {})
         found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
     found['environments/README.md'] = environment_index()
+    for domain in FAMILIES:
+        found[f'families/{domain}.md'] = family_page(domain)
     for name in characters.CHARACTERS:
         found[f'characters/{name}.md'] = character_page(name)
     found['characters/README.md'] = character_index()
@@ -104,6 +107,7 @@ def pages() -> dict[str, str]:
         found[f'terrains/{slug(name)}.md'] = terrain_page(name)
     found['terrains/README.md'] = terrain_index()
     found['speed.md'] = speed_page()
+    found['leaderboard.md'] = leaderboard()
     found[README] = readme()
     return found
 
@@ -257,6 +261,24 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     )
 
 
+def family_page(domain: str) -> str:
+    specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
+    title, _, about = FAMILIES[domain].partition(': ')
+    cells = (
+        (
+            f'[{spec.id}](../environments/{spec.id}.md)<br>{spec.description}',
+            picture('Film strip', gallery.strip_path(spec.id)),
+        )
+        for spec in specs
+    )
+    return page(
+        title,
+        f'{about[0].upper()}{about[1:]}: {len(specs)} environments.',
+        picture(domain, f'families/{domain}.jpg'),
+        table(('environment', ''), cells),
+    )
+
+
 def environment_index() -> str:
     shipped = policies.available()
     parts = []
@@ -265,12 +287,12 @@ def environment_index() -> str:
         cells = [
             (
                 f'[{spec.id}]({spec.id}.md)', spec.description, links('characters', [spec.character]),
-                links('terrains', [spec.terrain]), 'yes' if spec.id in shipped else '',
+                links('terrains', [spec.terrain]), spec.actuation, 'yes' if spec.id in shipped else '',
             )
             for spec in specs
         ]  # fmt: skip
-        header = ('environment', 'task', 'character', 'terrain', 'policy')
-        parts += [f'## {title}', picture(domain, f'families/{domain}.jpg'), table(header, cells)]
+        header = ('environment', 'task', 'character', 'terrain', 'actuation', 'policy')
+        parts += [f'## {title}', table(header, cells)]
     return page(
         'Environments',
         f'{len(catalogue.SPECS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
@@ -417,6 +439,85 @@ def terrain_index() -> str:
     )
 
 
+# Leaderboard
+
+
+RESULTS = DOCS / 'leaderboard'  # result files of policies that are not shipped
+EPISODES, EVALUATED_WITH = 50, 0  # least number of episodes, and the seed, of a result
+GAIT_LIMIT = 5000  # cycles
+
+
+def leaderboard() -> str:
+    cells = []
+    for spec in catalogue.SPECS:
+        by = 'distance' if task_type(spec).score == 'distance' else 'normalized_return'
+        results = sorted(results_of(spec), key=lambda named: -named[1][by])
+        cells += [
+            (
+                f'[{spec.id}](environments/{spec.id}.md)', rank, name,
+                '–' if by == 'distance' else f'{result["normalized_return"]:.3f}',
+                f'{result["completion_rate"]:.0%}', f'{result["distance"]:.1f}', result['episodes'],
+            )
+            for rank, (name, result) in enumerate(results, start=1)
+        ]  # fmt: skip
+    return page(
+        'Leaderboard',
+        'All evaluations whose result files are in the repository: those of the shipped policies, of the '
+        'other seeds of their training, and of the default gaits. They are ranked by return, gaits by '
+        'distance.',
+        table(('environment', 'rank', 'policy', 'return', 'complete', 'distance, m', 'episodes'), cells),
+        '*Return*: mean return divided by the step limit, its maximum (for gaits it has none). '
+        '*Complete*: share of the episodes that lasted to the step limit. *Distance*: mean. Confidence '
+        'intervals and training: [Results](results.md).',
+        '## Add a policy',
+        'Store the policy in the format of the [shipped policies](../trained/README.md), and run',
+        '```sh\ntrl-suite evaluate ID --policy NAME.npz --json docs/leaderboard/ID.NAME.json\n'
+        'python docs/generate.py --pages\n```',
+        f'with at least {EPISODES} episodes and the default seed and step limit, except that gaits are '
+        f'evaluated with `--step-limit {GAIT_LIMIT}`; this is checked. Open a pull request with the '
+        'result file, and with the policy or the program that trained it, so that the result can be '
+        'repeated.',
+    )  # fmt: skip
+
+
+def results_of(spec: catalogue.EnvSpec) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yields the results for an environment with a name for each."""
+    found = gallery.record(spec.id)
+    for run in found['runs'] if found else ():
+        shipped = 'shipped policy, ' * (run['seed'] == found['shipped'])
+        yield f'{shipped}seed {run["seed"]}', run['evaluation']
+    if spec.id in (shared := stored('shared')):
+        policy = shared[spec.id]['policy']
+        yield f'shipped policy of `{policy}`', shared[spec.id]['evaluation']
+    if spec.id in (gaits := stored('default_gaits')):
+        yield 'default gait', gaits[spec.id]
+    for path in sorted(RESULTS.glob(f'{spec.id}.*.json')):
+        yield path.stem.removeprefix(f'{spec.id}.'), submitted(spec, path)
+
+
+@functools.cache
+def stored(name: str) -> dict[str, Any]:
+    """Returns a file of trained/ with results by id."""
+    path = resources.directory('trained') / f'{name}.json'
+    return json.loads(path.read_text(encoding='utf-8'))
+
+
+def submitted(spec: catalogue.EnvSpec, path: pathlib.Path) -> dict[str, Any]:
+    """Reads a result file.
+
+    Raises:
+      ValueError: it does not compare with the other results; the message has the reason.
+    """
+    result = json.loads(path.read_text(encoding='utf-8'))
+    limit = GAIT_LIMIT if task_type(spec).score == 'distance' else spec.step_limit
+    for name, expected in (('id', spec.id), ('seed', EVALUATED_WITH), ('step_limit', limit)):
+        if result.get(name) != expected:
+            raise ValueError(f'{path}: {name} is {result.get(name)!r}; expected {expected!r}')
+    if result['episodes'] < EPISODES:
+        raise ValueError(f'{path}: {result["episodes"]} episodes; expected {EPISODES} or more')
+    return result
+
+
 # Speed
 
 
@@ -558,7 +659,7 @@ def stale(found: dict[str, str]) -> Iterator[str]:
 
 def gone(found: dict[str, str]) -> list[str]:
     """Returns the paths of pages whose subject no longer exists."""
-    there = [p.relative_to(DOCS) for name in ('environments', 'characters', 'terrains')
+    there = [p.relative_to(DOCS) for name in ('environments', 'families', 'characters', 'terrains')
              for p in (DOCS / name).glob('*.md')]  # fmt: skip
     return [path.as_posix() for path in there if path.as_posix() not in found]
 

@@ -3,6 +3,7 @@
 import importlib.util
 import pathlib
 import re
+from unittest import mock
 
 from absl.testing import absltest, parameterized
 
@@ -23,7 +24,7 @@ def load(name):
     return module
 
 
-generate = load('generate')
+generate, conf = load('generate'), load('conf')
 
 
 class PagesTest(absltest.TestCase):
@@ -113,16 +114,42 @@ class WordsTest(parameterized.TestCase):
 
 
 class SiteTest(absltest.TestCase):
-    def test_links_out_of_the_folder_stay_inside_the_site(self):
-        hooks = load('hooks')
+    def page(self, name, text=''):
+        """Returns the text of a page as the site has it."""
+        source = [text]
+        conf.read(mock.MagicMock(), name, source)
+        return source[0]
+
+    def test_pages_from_outside_the_folder(self):
+        for name, path in conf.ELSEWHERE.items():
+            text = self.page(name)
+            self.assertEqual(
+                text.partition('\n')[0], path.read_text(encoding='utf-8').partition('\n')[0]
+            )
+            for link in _LINK.findall(text):
+                self.assertTrue((DOCS / link).exists(), f'{name}: {link}')
         self.assertEqual(
-            hooks.on_page_markdown('[a](../examples/a.py) [b](../characters/dog.md)'),
-            '[a](examples/a.py) [b](../characters/dog.md)',
+            self.page('guide', '[a](../CONTRIBUTING.md#layers) [b](../examples/ppo.py) [c](#d)'),
+            '[a](contributing.md#layers) [b](../examples/ppo.py) [c](#d)',
         )
-        # No other links leave the folder.
-        for file in DOCS.glob('*.md'):
-            for link in _LINK.findall(hooks.on_page_markdown(file.read_text(encoding='utf-8'))):
-                self.assertFalse(link.startswith('..'), f'{file}: {link}')
+
+    def test_every_page_is_in_the_navigation(self):
+        index = (DOCS / 'index.md').read_text(encoding='utf-8')
+        listed = {
+            f'{name}.md' for name in re.findall(r'^[a-z_]+(?:/README)?$', index, re.MULTILINE)
+        }
+        for folder in ('environments', 'families', 'characters', 'terrains'):
+            for page in (DOCS / folder).glob('*.md'):
+                name = page.relative_to(DOCS).with_suffix('').as_posix()
+                listed |= {
+                    str((page.parent / below).resolve().relative_to(DOCS)).removesuffix('.md')
+                    + '.md'
+                    for below in conf.navigation(name).splitlines()[3:-1]
+                }
+        pages = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob('*.md')}
+        self.assertEqual(
+            pages - listed - {'README.md', 'index.md', 'clients.md', 'cluster.md'}, set()
+        )
 
 
 if __name__ == '__main__':

@@ -10,10 +10,14 @@ import sys
 import sysconfig
 import tempfile
 import textwrap
+import tomllib
 
 from absl.testing import absltest
 
+import trl_suite
+
 CHECKOUT = pathlib.Path(__file__).resolve().parents[1]
+TRAINED = 'PD_Dog2D_Gaps_Terrain-v0'
 
 
 def python(code, executable=sys.executable, cwd=None, **variables):
@@ -38,6 +42,12 @@ class PinTest(absltest.TestCase):
         # ('MjModel' object has no attribute 'flex_vertedge'), so an unpinned install is broken.
         self.assertIn("'mujoco>=3.17,<4'", required)
         self.assertIn("'dm-control>=1.0.50'", required)
+
+    def test_the_distributions_have_one_version(self):
+        policies = tomllib.loads((CHECKOUT / 'trained' / 'pyproject.toml').read_text('utf-8'))
+        self.assertEqual(policies['project']['version'], trl_suite.__version__)
+        setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
+        self.assertIn(f"VERSION = '{trl_suite.__version__}'", setup)
 
 
 class DiscoveryTest(absltest.TestCase):
@@ -146,6 +156,15 @@ class WheelTest(absltest.TestCase):
             sys.executable, '-m', 'build', '--wheel', '--outdir', wheels, source, cwd=work
         )
         (wheel,) = wheels.glob('*.whl')
+        self.assertLess(wheel.stat().st_size, 3e6)
+        # Of the second distribution, with one policy instead of all.
+        some = folder / 'policies'
+        some.mkdir()
+        for name in ('pyproject.toml', 'README.md', 'LICENSE', f'{TRAINED}.npz', f'{TRAINED}.json'):
+            shutil.copy(CHECKOUT / 'trained' / name, some / name)
+        self.run_quietly(
+            sys.executable, '-m', 'build', '--wheel', '--outdir', folder, some, cwd=work
+        )
         shutil.rmtree(source)
 
         self.run_quietly(sys.executable, '-m', 'venv', '--without-pip', venv)
@@ -153,10 +172,14 @@ class WheelTest(absltest.TestCase):
         target = pathlib.Path(
             python("import sysconfig; print(sysconfig.get_path('purelib'))", inner)[0].strip()
         )
-        self.run_quietly(
-            sys.executable, '-m', 'pip', '--disable-pip-version-check', '-q', 'install',
-            '--no-deps', '--no-index', '--target', target, wheel,
-        )  # fmt: skip
+
+        def install(file):
+            self.run_quietly(
+                sys.executable, '-m', 'pip', '--disable-pip-version-check', '-q', 'install',
+                '--no-deps', '--no-index', '--target', target, file,
+            )  # fmt: skip
+
+        install(wheel)
         # Third-party packages come from this interpreter; the suite must not.
         others = [sysconfig.get_path('purelib'), sysconfig.get_path('platlib'),
                   *site.getsitepackages()]  # fmt: skip
@@ -185,6 +208,9 @@ class WheelTest(absltest.TestCase):
                     step = environment.step(np.zeros(environment.action_spec().shape))
                 assert all(np.isfinite(v).all() for v in step.observation.values())
             suite.build('goat', terrain='cliffs_rugged').reset()
+            for id_ in suite.ALL_IDS:
+                if '_HLC_' in id_:
+                    suite.make(id_)
             """,
             inner, cwd=work,
         )  # fmt: skip
@@ -210,6 +236,17 @@ class WheelTest(absltest.TestCase):
         top = {path.name for path in target.iterdir()}
         self.assertNotIn('tests', top)
         self.assertFalse((installed / 'mocap' / 'recipes').exists())
+
+        ask = f"""
+            from trl_suite import policies
+            try:
+                print(policies.reference({TRAINED!r}).id, len(policies.available()))
+            except FileNotFoundError as error:
+                print(error)
+        """
+        self.assertIn("pip install 'trl_suite[policies]'", python(ask, inner, cwd=work)[0])
+        install(*folder.glob('*.whl'))
+        self.assertEqual(python(ask, inner, cwd=work)[0].strip(), f'{TRAINED} 1')
 
     def run_quietly(self, *command, cwd=None):
         done = subprocess.run(

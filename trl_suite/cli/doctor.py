@@ -20,8 +20,9 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 
+from trl_suite import policies
 from trl_suite.cli import machine
-from trl_suite.util import compiled
+from trl_suite.util import compiled, resources
 
 BACKENDS = ('egl', 'osmesa', 'glfw')
 OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
@@ -100,6 +101,7 @@ def findings() -> Iterator[Finding]:
     """Yields all findings, in order; takes about ten seconds."""
     yield from versions()
     yield from extras()
+    yield shipped_policies()
     yield cores()
     yield compiled_code()
     works = []
@@ -140,6 +142,16 @@ def extras() -> Iterator[Finding]:
             )  # fmt: skip
         else:
             yield Finding(OK, f"extra '{extra}'")
+
+
+def shipped_policies() -> Finding:
+    """Number of environments for which a trained policy is installed."""
+    text = f'trained policies for {len(policies.available())} environments'
+    if resources.lacks_policies():
+        return Finding(
+            NOTE, f'{text}, the footstep controllers', "pip install 'trl_suite[policies]'"
+        )
+    return Finding(OK, text)
 
 
 def cores() -> Finding:

@@ -214,9 +214,11 @@ class Environment(composer.Environment):
         }
 
     def reward_spec(self) -> specs.Array:
+        """Returns the spec of rewards, which are scalars."""
         return specs.Array((), float, 'reward')
 
     def discount_spec(self) -> specs.BoundedArray:
+        """Returns the spec of discounts: scalars in [0, 1]."""
         return specs.BoundedArray((), float, 0.0, 1.0, 'discount')
 
     @property

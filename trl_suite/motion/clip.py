@@ -234,7 +234,7 @@ class Clip:
 
         Args:
           pairs: names of joints to swap, (right, left) in either order. Other joints keep their
-            columns. By default the joints named right_... and left_....
+            columns. By default the joints named `right_...` and `left_...`.
 
         Raises:
           ValueError: if a name is unknown or the joints of a pair differ in type.

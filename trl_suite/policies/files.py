@@ -223,9 +223,15 @@ def reference(id: str) -> Policy:
       id: id of the environment; `suite.reference_policy` takes aliases, too.
 
     Raises:
-      FileNotFoundError: no policy is shipped for it; the message has the closest that have one.
+      FileNotFoundError: no policy is shipped for it; the message has the closest that have one, or
+        how to install the policies.
     """
     shipped = available()
+    if id not in shipped and resources.lacks_policies():
+        raise FileNotFoundError(
+            f'no policy for {id!r}, because the trained policies are not installed: '
+            "pip install 'trl_suite[policies]', or in a checkout pip install ./trained"
+        )
     if id not in shipped:
         near = difflib.get_close_matches(id, shipped, n=3, cutoff=0)
         raise FileNotFoundError(

@@ -1,8 +1,11 @@
 """Folders of the suite's data files: inside the package in a wheel, else in the checkout."""
 
 import importlib.resources
+import importlib.util
 import os
 import pathlib
+
+POLICIES = 'trl_suite_policies'  # the distribution with the trained policies, see setup.py
 
 
 def directory(kind: str) -> pathlib.Path:
@@ -12,5 +15,18 @@ def directory(kind: str) -> pathlib.Path:
     """
     if kind == 'trained' and os.environ.get('TRL_SUITE_TRAINED'):
         return pathlib.Path(os.environ['TRL_SUITE_TRAINED'])
-    inside = pathlib.Path(str(importlib.resources.files('trl_suite'))) / kind
-    return inside if inside.is_dir() else pathlib.Path(__file__).resolve().parents[2] / kind
+    inside = _inside(kind)
+    if not inside.is_dir():
+        return pathlib.Path(__file__).resolve().parents[2] / kind
+    if kind == 'trained' and (spec := importlib.util.find_spec(POLICIES)):
+        return pathlib.Path(next(iter(spec.submodule_search_locations or ())))
+    return inside
+
+
+def lacks_policies() -> bool:
+    """Returns whether only the footstep controllers are installed, which are part of the wheel."""
+    return directory('trained') == _inside('trained')
+
+
+def _inside(kind: str) -> pathlib.Path:
+    return pathlib.Path(str(importlib.resources.files('trl_suite'))) / kind

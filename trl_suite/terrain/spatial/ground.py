@@ -115,7 +115,7 @@ class SpatialGround:
         movers: np.ndarray | None = None,
         direction: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Horizontal velocities of the surface at points, m/s, of shape (*x.shape, 2).
+        """Horizontal velocities of the surface at points, m/s, of shape `(*x.shape, 2)`.
 
         Args:
           x, y: m, of one shape.

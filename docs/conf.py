@@ -1,0 +1,131 @@
+"""Configures Sphinx: `pip install -e '.[docs]' && sphinx-build -W docs site`.
+
+The pages are Markdown that reads as well on GitHub. What only the site needs is added here: the
+navigation of generated pages, pages from outside docs/, and moving pictures, if there are any.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import os
+import pathlib
+import re
+import textwrap
+from typing import Any
+
+import trl_suite
+from trl_suite.registry import catalogue
+
+DOCS = pathlib.Path(__file__).resolve().parent
+ROOT = DOCS.parent
+# Pages whose text lies outside docs/; the page in docs/ only links to it.
+ELSEWHERE = {
+    'changelog': ROOT / 'CHANGELOG.md',
+    'contributing': ROOT / 'CONTRIBUTING.md',
+    'notebooks': ROOT / 'colab' / 'README.md',
+    'physics_rate': ROOT / 'benchmarks' / 'physics_rate.md',
+    'policies': ROOT / 'trained' / 'README.md',
+}
+PAGES = {path: f'{name}.md' for name, path in ELSEWHERE.items()} | {
+    ROOT / 'README.md': 'index.md',
+    DOCS / 'README.md': 'index.md',
+}
+LINK = re.compile(r'(?<=\]\()(?![a-z]+:|#)([^)#\s]+)')
+STRIP = re.compile(r'!\[Film strip\]\(\S*/environments/(\S+)\.jpg\)')
+
+project = 'trl_suite'
+author = copyright = 'the trl_suite developers'
+release = trl_suite.__version__
+extensions = [
+    'myst_parser',
+    'sphinx.ext.autodoc',
+    'sphinx.ext.autosummary',
+    'sphinx.ext.napoleon',
+    'sphinx.ext.viewcode',
+    'sphinx_argparse_cli',
+    'sphinx_copybutton',
+    'sphinx_design',
+]
+root_doc = 'index'
+exclude_patterns = ['README.md']  # the index on GitHub; here it is the navigation
+templates_path = ['_templates']
+
+myst_enable_extensions = ['colon_fence', 'substitution']
+myst_heading_anchors = 3
+myst_substitutions = {'environments': len(catalogue.SPECS)}
+
+default_role = 'code'
+autodoc_member_order = 'bysource'
+suppress_warnings = ['ref.python']  # fields of the same name in two classes
+autodoc_mock_imports = ['stable_baselines3']
+napoleon_use_ivar = True  # the fields of a NamedTuple are listed once
+
+html_theme = 'furo'
+html_title = 'trl_suite'
+html_static_path = ['_static']
+html_css_files = ['site.css']
+html_js_files = [('sortable.min.js', {'defer': ''}), ('tables.js', {'defer': ''})]
+html_copy_source = False
+html_theme_options = {'sidebar_hide_name': False}
+
+
+def navigation(name: str) -> str:
+    """Returns the part of the navigation below a page."""
+    folder, _, stem = name.partition('/')
+    pages = []
+    if name == 'environments/README':
+        pages = [
+            f'../families/{domain}' for domain in dict.fromkeys(s.domain for s in catalogue.SPECS)
+        ]
+    elif folder == 'families':
+        pages = [f'../environments/{spec.id}.md' for spec in catalogue.SPECS if spec.domain == stem]
+    elif name in ('characters/README', 'terrains/README'):
+        pages = sorted(p.name for p in (DOCS / folder).glob('*.md') if p.stem != 'README')
+    return '\n'.join(['', '```{toctree}', ':hidden:', *pages, '```', '']) if pages else ''
+
+
+def read(app: Any, name: str, source: list[str]) -> None:
+    """Completes the text of a page before it is parsed."""
+    own, text = DOCS / name, source[0]
+    if name in ELSEWHERE:
+        app.env.note_dependency(str(ELSEWHERE[name]))
+        text = ELSEWHERE[name].read_text(encoding='utf-8')
+    start = ELSEWHERE.get(name, own).parent
+
+    def inside(match: re.Match[str]) -> str:
+        target = pathlib.Path(os.path.normpath(start / match[1]))
+        return os.path.relpath(DOCS / PAGES[target] if target in PAGES else target, own.parent)
+
+    source[0] = STRIP.sub(moving, LINK.sub(inside, text)) + navigation(name)
+
+
+def moving(match: re.Match[str]) -> str:
+    """Returns the moving picture of an environment, or its film strip if there is none."""
+    if not (DOCS / 'moving' / f'{match[1]}.webp').exists():
+        return match[0]
+    return f'![{match[1]}](../moving/{match[1]}.webp)'
+
+
+def mark_code(app: Any, what: str, name: str, item: Any, options: Any, lines: list[str]) -> None:
+    """Marks examples and file formats in the docstring of a module as literal text."""
+    if what != 'module':
+        return
+    blocks, literal = [], False
+    for block in '\n'.join(lines).strip().split('\n\n'):
+        was, literal = literal, block.startswith(' ') or is_code(block)
+        if literal and not was:
+            blocks.append('::')
+        blocks.append(textwrap.indent(textwrap.dedent(block), '    ') if literal else block)
+    lines[:] = '\n\n'.join(blocks).split('\n')
+
+
+def is_code(block: str) -> bool:
+    with contextlib.suppress(SyntaxError):
+        return any(not isinstance(part, ast.Name) for part in ast.parse(block).body)
+    return False
+
+
+def setup(app: Any) -> None:
+    app.connect('source-read', read)
+    app.connect('autodoc-process-docstring', mark_code)
