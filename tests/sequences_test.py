@@ -1,21 +1,28 @@
-"""Sequences of environments: contents, seeds, metrics, and resumed runs."""
+"""Sequences of environments: contents, seeds, budgets, metrics, resumed runs, and results."""
 
 import concurrent.futures
-import importlib.util
+import contextlib
+import copy
 import json
 import pathlib
 import sys
 import tempfile
 from unittest import mock
 
+import cli_test
 import numpy as np
+import torch
 from absl.testing import absltest, parameterized
 
 from trl_suite import evaluation, sequences, suite
+from trl_suite.sequences import results
 from trl_suite.vector import VectorEnvironment
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import continual_baselines
+import plaid
+
 SHORT = sequences.Sequence('short', ('plaid/dog_flat', 'plaid/dog_steps', 'plaid/dog_gaps'))
-EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / 'examples'
 
 
 class SequenceTest(parameterized.TestCase):
@@ -78,6 +85,7 @@ class MetricsTest(parameterized.TestCase):
         found = sequences.metrics(self.SCORES, self.INITIAL)
         expected = {
             'average_performance': (0.7 + 0.5 + 1.0) / 3,
+            'learning_accuracy': (0.9 + 0.8 + 1.0) / 3,
             'backward_transfer': ((0.7 - 0.9) + (0.5 - 0.8)) / 2,
             'forward_transfer': ((0.2 - 0.1) + (0.3 - 0.1)) / 2,
             'forgetting': ((0.9 - 0.7) + (0.8 - 0.5)) / 2,
@@ -101,6 +109,18 @@ class MetricsTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'not finite'):
             sequences.forward_transfer(scores, self.INITIAL)
 
+    def test_learning_transfer_is_the_gain_in_mean_over_what_was_missing(self):
+        """The curves have means 0.6 and 0.2 where both are known: (0.6 - 0.2) / (1 - 0.2)."""
+        found = sequences.learning_transfer([0.5, 0.7, None, 0.9], [0.1, 0.3, 0.5, np.nan])
+        self.assertAlmostEqual(found, 0.5)
+        self.assertAlmostEqual(sequences.learning_transfer([0.4, 0.4], [0.5, 0.5]), -0.2)
+        with self.assertRaisesRegex(ValueError, r'shape is \(1,\); expected \(2,\)'):
+            sequences.learning_transfer([0.5], [0.1, 0.3])
+        with self.assertRaisesRegex(ValueError, 'no point in common'):
+            sequences.learning_transfer([0.5, None], [None, 0.1])
+        with self.assertRaisesRegex(ValueError, 'expected less than 1'):
+            sequences.learning_transfer([1.0], [1.0])
+
     @parameterized.parameters((((1, 2, 3), (4, 5, 6)),), (((1,),),), ((1, 2),))
     def test_a_matrix_that_is_not_square_is_rejected(self, scores):
         with self.assertRaisesRegex(ValueError, r'expected \(T, T\)'):
@@ -109,19 +129,103 @@ class MetricsTest(parameterized.TestCase):
             sequences.forward_transfer(self.SCORES, (0, 0))
 
 
+class StageTest(parameterized.TestCase):
+    def stage(self, budget=40, number=1, seed=0):
+        return sequences.Stage(SHORT, number, budget, seed, 1)
+
+    def test_steps_of_every_simulation_are_samples(self):
+        stage = self.stage()
+        environments, other = stage.environments(4), stage.environments(2, 'plaid/dog_flat')
+        self.assertEqual(environments.spec.id, SHORT.ids[1])
+        for each in (environments, other):
+            each.reset()
+        action = np.zeros((4, len(environments.action_map)))
+        environments.step(action)
+        environments.step(action, [0, 3])
+        environments.step(action, np.array([True, False, False, False]))
+        other.step(action[:2])
+        self.assertEqual(stage.samples.tolist(), [2, 4 + 2 + 1, 0])
+        self.assertEqual(stage.left, 40 - 9)
+
+    def test_the_budget_cannot_be_exceeded(self):
+        stage = self.stage(budget=10)
+        environments = stage.environments(4)
+        environments.reset()
+        action = np.zeros((4, len(environments.action_map)))
+        environments.step(action)
+        environments.step(action)
+        before = environments.task.world.time.copy()
+        with self.assertRaisesRegex(
+            sequences.BudgetExceededError,
+            r'stage 1 \(PD_Dog2D_Steps.*4 more samples; expected at most 2, since 8 of 10',
+        ):
+            environments.step(action)
+        np.testing.assert_array_equal(environments.task.world.time, before)
+        self.assertEqual(stage.left, 2)
+        environments.step(action, [0, 1])  # what is left may be used
+        stage.finish()
+        with self.assertRaisesRegex(sequences.BudgetExceededError, 'has ended'):
+            environments.step(action, [0])
+
+    def test_training_seeds_only(self):
+        """Those of two calls, stages or runs differ, and none is a seed for tests."""
+        drawn = [
+            tuple(stage.environments(3).seeds.tolist())
+            for stage in (self.stage(), self.stage(number=0), self.stage(seed=1))
+            for _ in range(2)
+        ]
+        self.assertLen(set(drawn), 6)
+        self.assertLess(max(map(max, drawn)), 2**31)
+        environments = self.stage().environments(3)
+        self.assertEqual(environments.seeds.tolist(), list(drawn[0]))
+        environments.reset(seed=5)
+        self.assertEqual(environments.seeds.tolist(), sequences.train_seeds(3, 5))
+        for seeds in ([1, 2, 2**31], sequences.test_seeds(3)):
+            with self.assertRaisesRegex(ValueError, 'is for tests; expected training seeds'):
+                environments.seed(seeds)
+        with self.assertRaisesRegex(ValueError, 'seed is None'):
+            environments.seed(None)
+        with self.assertRaisesRegex(ValueError, 'seed: expected none'):
+            self.stage().environments(3, seed=1)
+        with self.assertRaisesRegex(ValueError, "of the sequence 'PD_Dog2D_Walls_Terrain-v0'"):
+            self.stage().environments(3, 'plaid/dog_walls')
+
+    def test_curve(self):
+        """Ten episodes of two steps fill the first half of the budget."""
+        stage = self.stage(budget=40)
+        environments = stage.environments(1, step_limit=2, autoreset='disabled')
+        action = np.zeros((1, len(environments.action_map)))
+        rewards = []
+        for _ in range(10):
+            environments.reset()
+            rewards.append(sum(environments.step(action).reward[0] for _ in range(2)))
+        limit = suite.find(SHORT.ids[1]).step_limit
+        expected = [float(reward) / limit for reward in rewards] + [None] * 10
+        self.assertEqual(stage.curve(), expected)
+        # An episode that is broken off does not count.
+        environments.reset()
+        environments.step(action)
+        environments.reset()
+        for _ in range(2):
+            environments.step(action)
+        self.assertAlmostEqual(stage.curve()[11], expected[0], delta=0.5 * expected[0])
+        self.assertIsNone(stage.curve()[10])
+
+
 class Counter:
     """A learner that remembers where it was, and whose scores are made up."""
 
     def __init__(self, stop_at=None):
         self.history, self.stop_at = [], stop_at
 
-    def learn(self, environment, budget):
+    def train(self, stage):
         if len(self.history) == self.stop_at:
             raise KeyboardInterrupt
-        self.history.append((environment, budget))
+        self.history.append((stage.id, stage.budget, stage.seed))
+        stage.spend(stage.number, 5)
 
-    def policy(self, environment):
-        return environment, len(self.history)
+    def policy(self):
+        return len(self.history)
 
 
 class Keeper(Counter):
@@ -134,8 +238,7 @@ class Keeper(Counter):
 
 def made_up(cases, episodes, seeds, threads, executor):
     assert min(seeds) >= 2**31 and len(seeds) == episodes
-    for id_, (environment, stages) in cases:
-        assert environment == id_
+    for id_, stages in cases:
         yield {'normalized_return': 0.1 * stages + 0.01 * SHORT.ids.index(id_)}
 
 
@@ -145,28 +248,33 @@ class RunTest(parameterized.TestCase):
         self.folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.path = self.folder / 'result.json'
         self.enterContext(mock.patch.object(evaluation, 'evaluate_all', made_up))
+        self.enterContext(mock.patch.object(sequences.running.time, 'perf_counter', lambda: 0.0))
 
     def run_short(self, learner, **changes):
         return sequences.run(SHORT, learner, **{'budget': 7, 'path': self.path, **changes})
 
     def test_stages(self):
         learner = Counter()
-        result = self.run_short(learner)
-        self.assertEqual(learner.history, [(id_, 7) for id_ in SHORT.ids])
+        result = self.run_short(learner, seed=3)
+        self.assertEqual(learner.history, [(id_, 7, 3) for id_ in SHORT.ids])
         np.testing.assert_allclose(result['initial'], [0, 0.01, 0.02])
         np.testing.assert_allclose(result['scores'], np.add.outer([0.1, 0.2, 0.3], [0, 0.01, 0.02]))
+        self.assertEqual(result['samples'], [[5, 0, 0], [0, 5, 0], [0, 0, 5]])
         self.assertAlmostEqual(result['metrics']['forgetting'], -0.1)
         self.assertAlmostEqual(result['metrics']['forward_transfer'], 0.15)
-        self.assertEqual(json.loads(self.path.read_text()), result)
+        self.assertRegex(result['learner'], 'sequences_test:Counter$')
+        self.assertEqual(sequences.read(self.path), result)
         self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
         # A finished result needs no learning.
-        self.assertEqual(self.run_short(Counter(stop_at=0)), result)
+        self.assertEqual(self.run_short(Counter(stop_at=0), seed=3), result)
 
     @parameterized.parameters(0, 1, 2)
     def test_a_stopped_run_resumes(self, stop_at):
         whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Keeper(stop_at))
+        with self.assertRaisesRegex(ValueError, 'metrics is missing; the run has not ended'):
+            sequences.read(self.path)
         names = {path.name for path in self.folder.iterdir()} - {'whole.json', 'result.json'}
         self.assertEqual(names, {f'result.stage{stop_at}'} if stop_at else set())
         learner = Keeper()
@@ -176,6 +284,15 @@ class RunTest(parameterized.TestCase):
             [path.name for path in self.folder.iterdir()], ['whole.json', 'result.json']
         )
 
+    def test_a_run_in_parts(self):
+        whole = self.run_short(Keeper(), path=self.folder / 'whole.json')
+        part = self.run_short(Keeper(), stages=2)
+        self.assertEqual(part['scores'], whole['scores'][:2])
+        self.assertNotIn('metrics', part)
+        self.assertEqual(self.run_short(Keeper()), whole)
+        with self.assertRaisesRegex(ValueError, 'stages is 4; expected a whole number from 1 to 3'):
+            self.run_short(Keeper(), stages=4)
+
     def test_a_failed_save_leaves_the_stage_before(self):
         learner = Keeper()
         with (
@@ -183,10 +300,36 @@ class RunTest(parameterized.TestCase):
             self.assertRaisesRegex(OSError, 'full'),
         ):
             self.run_short(learner)
-        self.assertLen(json.loads(self.path.read_text())['scores'], 1)
+        self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
         self.assertCountEqual(
             [path.name for path in self.folder.iterdir()], ['result.json', 'result.stage1']
         )
+
+    def test_a_learner_that_exceeds_its_budget_is_refused(self):
+        class Greedy(Counter):
+            def train(self, stage):
+                super().train(stage)
+                if stage.number == 1:
+                    environments = stage.environments(3, num_threads=1)
+                    environments.reset()
+                    environments.step(np.zeros((3, len(environments.action_map))))
+
+        with self.assertRaisesRegex(sequences.BudgetExceededError, '3 more samples.* at most 2'):
+            self.run_short(Greedy())
+        self.assertLen(sequences.read(self.path, complete=False)['scores'], 1)
+
+    def test_no_samples_after_a_stage(self):
+        class Late(Counter):
+            def train(self, stage):
+                self.stage = stage
+
+            def policy(self):
+                if hasattr(self, 'stage'):
+                    self.stage.spend(0, 1)
+                return 0
+
+        with self.assertRaisesRegex(sequences.BudgetExceededError, 'steps in train only'):
+            self.run_short(Late())
 
     def test_invalid_arguments_are_rejected(self):
         with self.assertRaises(KeyboardInterrupt):
@@ -195,50 +338,189 @@ class RunTest(parameterized.TestCase):
             self.run_short(Counter())
         with self.assertRaisesRegex(ValueError, 'another budget: 7; expected 8'):
             self.run_short(Counter(), budget=8)
+        with self.assertRaisesRegex(ValueError, 'another learner: .*Counter; expected .*Keeper'):
+            self.run_short(Keeper())
         with self.assertRaisesRegex(ValueError, 'budget is 0'):
             self.run_short(Counter(), budget=0)
         with self.assertRaisesRegex(ValueError, "'.txt'"):
             self.run_short(Counter(), path=self.folder / 'result.txt')
+        with self.assertRaisesRegex(TypeError, 'expected the methods train and policy'):
+            self.run_short(object())
         self.path.write_text('{"scores": 3}')
-        with self.assertRaisesRegex(ValueError, 'not a result of sequences.run'):
+        with self.assertRaisesRegex(ValueError, 'result.json: format is missing'):
             self.run_short(Counter())
 
 
 class ExecutorTest(absltest.TestCase):
     def test_scores_do_not_depend_on_the_executor(self):
-        class Still:
-            def policy(self, environment):
-                return lambda observation: np.zeros((len(observation), 20))
+        def still(observation):
+            return np.zeros((len(observation), 20))
 
         expected = [
-            evaluation.evaluate(id_, Still().policy(id_), 4, sequences.test_seeds(4, 1))[
-                sequences.SCORE
-            ]
+            evaluation.evaluate(id_, still, 4, sequences.test_seeds(4, 1))['normalized_return']
             for id_ in SHORT.ids
         ]
-        self.assertEqual(sequences.scores(SHORT, Still(), 4, 1), expected)
+        self.assertEqual(sequences.scores(SHORT, still, 4, 1), expected)
         with concurrent.futures.ThreadPoolExecutor(2) as pool:
-            self.assertEqual(sequences.scores(SHORT, Still(), 4, 1, executor=pool), expected)
+            self.assertEqual(sequences.scores(SHORT, still, 4, 1, executor=pool), expected)
 
 
-class ExampleTest(absltest.TestCase):
-    def test_example_runs_with_a_small_learner(self):
-        """A run that was stopped after the first stage resumes exactly."""
-        self.enterContext(mock.patch.object(sys, 'path', [str(EXAMPLES), *sys.path]))
-        spec = importlib.util.spec_from_file_location(
-            'continual_learning', EXAMPLES / 'continual_learning.py'
+def put(result, name, value):
+    """Changes an entry, such as 'scores[1][2]'."""
+    *path, last = (
+        int(p) if p.isdigit() else p for p in name.replace('[', '.').replace(']', '').split('.')
+    )
+    for part in path:
+        result = result[part]
+    result[last] = value
+
+
+class ResultTest(parameterized.TestCase):
+    def setUp(self):
+        super().setUp()
+        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
+        with mock.patch.object(evaluation, 'evaluate_all', made_up):
+            self.result = sequences.run(SHORT, Counter(), 7, 'result.json')
+
+    def changed(self, name, value, digest=True):
+        result = copy.deepcopy(self.result)
+        put(result, name, value)
+        if digest:
+            result['digest'] = results.digest(result)
+        return result
+
+    @parameterized.parameters(
+        ('format', 'other', "format is 'other'; expected 'trl_suite sequence 1'"),
+        ('sequence', 'plaid_dog', r"ids is \['PD_Dog2D_Flat.*expected \['PD_Dog2D_Flat.*Incline"),
+        ('ids', ['PD_Dog2D_Flat_Terrain-v0'], 'expected two or more environments'),
+        ('ids', 'flat', "ids is 'flat'; expected a list of strings"),
+        ('budget', 14.0, 'budget is 14.0; expected a whole number'),
+        ('budget', 4, r'samples\[0\] is \[5, 0, 0\], in total 5; .* at most 4, the budget'),
+        ('seed', -1, 'seed is -1; expected 0 or more'),
+        ('initial', [0, 0], 'initial: 2 entries; expected 3 numbers'),
+        ('scores', [], 'scores: 0 stages; expected 3'),
+        ('scores[1]', [0.1, 0.2], r'scores\[1\]: 2 entries; expected 3 numbers'),
+        ('scores[1][2]', 'high', r"scores\[1\]\[2\] is 'high'; expected a number"),
+        ('scores[1][2]', float('nan'), r'scores\[1\]\[2\] is nan; expected a number'),
+        ('scores[1][2]', 1.01, r'scores\[1\]\[2\] is 1.01; expected a finite number of at most 1'),
+        ('scores[2][1]', 0.9, r'metrics.average_performance is 0.31.*; expected 0.50'),
+        ('samples[1][1]', 8, r'samples\[1\] is \[0, 8, 0\], in total 8; .* at most 7'),
+        ('samples[1][1]', 2.5, r'samples\[1\].*expected whole numbers'),
+        ('samples[1][1]', -1, r'samples\[1\]\[1\] is -1; .*of at least 0'),
+        ('curves[0]', [], r'curves\[0\]: 0 entries; expected 20 numbers'),
+        ('seconds', [1], 'seconds: 1 stages; expected 3'),
+        ('metrics', {}, 'metrics: expected average_performance'),
+        ('metrics.forgetting', -0.2, 'metrics.forgetting is -0.2; expected -0.1'),
+        ('metrcs', 1, "unknown field 'metrcs'; did you mean 'metrics'"),
+    )  # fmt: skip
+    def test_errors_name_the_field_and_what_was_expected(self, name, value, message):
+        with self.assertRaisesRegex(ValueError, message):
+            sequences.check(self.changed(name, value))
+
+    @parameterized.parameters(
+        'learner', 'trl_suite', 'seed', 'episodes', 'scores[0][2]', 'samples[0][1]', 'seconds[1]'
+    )
+    def test_every_edit_changes_the_digest(self, name):
+        """Also of entries that no metric uses."""
+        sequences.check(self.result)
+        value = 'other' if name in ('learner', 'trl_suite') else 1
+        with self.assertRaisesRegex(ValueError, 'digest is .* changed after the run'):
+            sequences.check(self.changed(name, value, digest=False))
+
+    def test_missing_fields(self):
+        for name in (*results.FIELDS, 'metrics'):
+            result = {key: value for key, value in self.result.items() if key != name}
+            with self.assertRaisesRegex(ValueError, f'^{name} is missing'):
+                sequences.check(result)
+        for other in (3, [], None):
+            with self.assertRaisesRegex(ValueError, 'expected an object with format'):
+                sequences.check(other)
+
+    def test_what_is_comparable(self):
+        notes = sequences.departures(self.result)
+        self.assertLen(notes, 2)
+        self.assertStartsWith(notes[0], 'sequence is short, not plaid_biped or')
+        self.assertEqual(notes[1], 'budget is 7, not 100000 or 1000000')
+        same = {**self.result, 'sequence': 'plaid_dog', 'budget': 100_000}
+        self.assertEqual(sequences.departures(same), [])
+        self.assertEqual(sequences.departures({**same, 'seed': 3}), ['seed is 3, not 0 or 1 or 2'])
+
+
+MODULE = """
+import numpy as np
+
+class Nothing:
+    def __init__(self, sequence, seed):
+        self.size = 11
+
+    def train(self, stage):
+        environments = stage.environments(4)
+        environments.reset()
+        environments.step(np.zeros((4, self.size)))
+
+    def policy(self):
+        return lambda observation: np.zeros((len(observation), self.size))
+"""
+
+
+class CommandTest(cli_test.CommandTest):
+    def test_run_and_check(self):
+        pathlib.Path('my_learner.py').write_text(MODULE)
+        self.addCleanup(setattr, sys, 'path', list(sys.path))
+        arguments = (
+            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothing', '--budget', '1e2',
+            '--episodes', '1', '--threads', '1',
+        )  # fmt: skip
+        out = self.output(*arguments)
+        self.assertRegex(out, r'after PD_Biped2D_Gaps_Terrain-v0 +(0\.\d{3} ?){5}')
+        self.assertRegex(out, r'forgetting +0.000')
+        result = sequences.read('result.json')
+        self.assertEqual((result['budget'], result['learner']), (100, 'my_learner:Nothing'))
+        self.assertEqual(np.trace(result['samples']), np.sum(result['samples']))
+        self.assertEqual(np.sum(result['samples']), 5 * 4)
+        out = self.output('sequences', 'check', 'result.json')
+        self.assertRegex(out, 'my_learner:Nothing, plaid_biped.*not comparable: budget is 100, not')
+        text = pathlib.Path('result.json').read_text()
+        pathlib.Path('edited.json').write_text(text.replace('"budget": 100', '"budget": 101'))
+        self.assert_refused(
+            'edited.json: digest is .* the file was changed', 'sequences', 'check', 'edited.json'
         )
-        example = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(example)
-        pair = sequences.Sequence('pair', ('plaid/biped_flat', 'plaid/biped_gaps'))
-        self.enterContext(mock.patch.dict(sequences.SEQUENCES, pair=pair))
-        small = {'num_envs': 16, 'hidden': (32, 32), 'minibatch': 128}
-        settings = example.ppo_settings.settings_for
+        self.assert_refused(
+            "unknown learner of the module my_learner: 'Nothin'; did you mean 'Nothing'",
+            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothin',
+        )  # fmt: skip
+        self.assert_refused(
+            "'my_learner'; expected module:Class",
+            'sequences', 'run', 'plaid_biped', '--learner', 'my_learner',
+        )  # fmt: skip
+        self.assert_refused(
+            "--budget is 'tiny'; expected small, full or a number",
+            *arguments[:5],
+            '--budget',
+            'tiny',
+        )
+
+    def test_list(self):
+        out = self.output('sequences', 'list')
+        for name in sequences.SEQUENCES:
+            self.assertIn(f'{name} ', out)
+
+
+class BaselinesTest(parameterized.TestCase):
+    """With small networks, in which every stage makes some updates."""
+
+    def setUp(self):
+        super().setUp()
+        self.enterContext(contextlib.chdir(self.enterContext(tempfile.TemporaryDirectory())))
+        self.enterContext(mock.patch.object(continual_baselines, 'NUM_ENVS', 8))
+        settings = continual_baselines.ppo_settings.settings_for
+        small = {'hidden': (16, 16), 'minibatch': 128, 'cloning_epochs': 2}
         self.enterContext(
             mock.patch.object(
-                example.ppo_settings, 'settings_for', lambda id_, **k: settings(id_, **k, **small)
+                continual_baselines.ppo_settings, 'settings_for',
+                lambda id_, **k: settings(id_, **{**k, **small}),
             )
-        )
+        )  # fmt: skip
         # Quicker than episodes, and as telling: what the network has become.
         self.enterContext(
             mock.patch.object(
@@ -249,35 +531,88 @@ class ExampleTest(absltest.TestCase):
                 ],
             )
         )  # fmt: skip
-        folder = self.enterContext(tempfile.TemporaryDirectory())
-        arguments = ['pair', '--budget', '1024', '--episodes', '2', '--threads', '1']
-        learn, trained_in = example.FineTuning.learn, []
 
-        def stopped(learner, environment, budget):
-            if environment == pair.ids[1]:
-                raise KeyboardInterrupt
-            learn(learner, environment, budget)
-
-        def recorded(learner, environment, budget):
-            learn(learner, environment, budget)
-            trained_in.append(learner.trainer.environments.spec.id)
-
-        with (
-            mock.patch.object(example.FineTuning, 'learn', stopped),
-            self.assertRaises(KeyboardInterrupt),
-        ):
-            example.main([*arguments, '--output', f'{folder}/parts'])
-        with mock.patch.object(example.FineTuning, 'learn', recorded):
-            for name in ('parts', 'whole'):
-                example.main([*arguments, '--output', f'{folder}/{name}'])
-        self.assertEqual(trained_in, [pair.ids[1], *pair.ids])
-        parts, whole = (
-            json.loads(pathlib.Path(folder, name, 'pair_s0.json').read_text())
-            for name in ('parts', 'whole')
+    def run_short(self, kind, name, **changes):
+        learner = kind(SHORT, 0)
+        return learner, sequences.run(
+            SHORT, learner, **{'budget': 600, 'path': f'{name}.json', 'episodes': 1, **changes}
         )
-        self.assertEqual(parts, whole)
-        self.assertNotEqual(whole['scores'][0], whole['initial'])
-        self.assertEqual(whole['metrics'], sequences.metrics(whole['scores'], whole['initial']))
+
+    @parameterized.parameters(
+        (continual_baselines.Scratch, np.eye(3)),
+        (continual_baselines.FineTuning, np.eye(3)),
+        (continual_baselines.EWC, np.eye(3)),
+        (continual_baselines.MultiTask, np.ones((3, 3))),
+        (plaid.Plaid, np.tri(3)),
+    )
+    def test_every_stage_trains_in_its_own_environments(self, kind, expected):
+        """The samples of a stage are those of its terrain, or of those that the method needs."""
+        _, result = self.run_short(kind, 'result')
+        found = np.array(result['samples'])
+        np.testing.assert_array_equal(found > 0, expected.astype(bool))
+        self.assertEqual(found.sum(1).max(), found.sum(1).clip(500, 600).max())
+        self.assertEqual(sequences.read('result.json'), result)
+        self.assertNotEqual(result['scores'][0], result['initial'])
+
+    @parameterized.parameters(continual_baselines.FineTuning, continual_baselines.EWC, plaid.Plaid)
+    def test_a_stopped_run_resumes_exactly(self, kind):
+        _, whole = self.run_short(kind, 'whole')
+        train = kind.train
+
+        def stopped(learner, stage):
+            if stage.number == 2:
+                raise KeyboardInterrupt
+            train(learner, stage)
+
+        with mock.patch.object(kind, 'train', stopped), self.assertRaises(KeyboardInterrupt):
+            self.run_short(kind, 'parts')
+        _, parts = self.run_short(kind, 'parts')
+        for name in ('initial', 'scores', 'samples', 'curves', 'metrics'):
+            self.assertEqual(parts[name], whole[name], name)
+
+    def test_scratch_forgets_everything(self):
+        """Trained twice on one environment, it begins with the same weights."""
+        learner = continual_baselines.Scratch(SHORT, 0)
+        first = learner.policy().weights[1]
+        learner.train(sequences.Stage(SHORT, 0, 600, 0, 1))
+        self.assertFalse(np.array_equal(learner.policy().weights[1], first))
+        learner.train(sequences.Stage(SHORT, 1, 10, 0, 1))  # too few samples for an update
+        np.testing.assert_array_equal(learner.policy().weights[1], first)
+
+    def test_fisher_information_of_a_linear_policy(self):
+        """For a mean W s and deviations sigma it is E[s_j^2] / sigma_i^2 for W[i, j]."""
+        learner = continual_baselines.EWC(SHORT, 0)
+        trainer = learner.trainer
+        trainer.policy = torch.nn.Linear(2, len(trainer.log_std), bias=False)
+        with torch.no_grad():
+            trainer.log_std.copy_(torch.linspace(-1, 0, len(trainer.log_std)))
+        observations = torch.tensor([[1.0, 2.0], [3.0, 0.0]]).repeat(5000, 1)
+        with mock.patch.object(continual_baselines, 'FISHER_SAMPLES', len(observations)):
+            learner.consolidate(observations)
+        squares = torch.tensor([[5.0, 2.0]])
+        expected = squares / trainer.log_std.detach().exp()[:, None] ** 2
+        torch.testing.assert_close(learner.fisher['weight'], expected, rtol=0.1, atol=0.0)
+        # Half the sum of importance times squared change.
+        with torch.no_grad():
+            trainer.policy.weight[0, 1] += 0.1
+        penalty = continual_baselines.STRENGTH * 0.5 * learner.fisher['weight'][0, 1] * 0.01
+        torch.testing.assert_close(learner.penalty().detach(), penalty)
+
+    def test_distillation_gives_each_expert_its_terrain(self):
+        """Two experts with constant actions, on terrains that the labels tell apart."""
+        learner = plaid.Plaid(SHORT, 0)
+        stage = sequences.Stage(SHORT, 1, 600, 0, 1)
+        environments = continual_baselines.Several.of(stage, SHORT.ids[:2])
+        labels = []
+        size = len(environments.action_map)
+        experts = [lambda o, a=a: np.full((len(o), size), a) for a in (0.5, -2.0)]
+        learner.trainer.fit = lambda seen, actions: labels.append((len(seen), actions))
+        plaid.distil(learner.trainer, environments, experts, 600, rounds=3)
+        self.assertEqual([count for count, _ in labels], [200, 400, 600])
+        each = labels[-1][1].reshape(-1, 2, 4, size)
+        np.testing.assert_array_equal(each[:, 0], 0.5)
+        np.testing.assert_array_equal(each[:, 1], -1.0)
+        self.assertEqual(stage.samples.tolist(), [300, 300, 0])
 
 
 if __name__ == '__main__':

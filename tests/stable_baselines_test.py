@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from trl_suite.adapters.stable_baselines import SuiteVecEnv
 from trl_suite.gym import SuiteEnv
+from trl_suite.vector import VectorEnvironment
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 FLAT = 'PD_Biped2D_LLC_Imitate_Flat-v0'
@@ -118,6 +119,16 @@ class StableBaselinesTest(parameterized.TestCase):
             envs.set_attr('step_limit', 3)
         with self.assertRaisesRegex(RuntimeError, 'environment'):
             envs.env_method('reset')
+
+    def test_a_vector_environment_is_wrapped(self):
+        options = {'num_envs': 2, 'num_threads': 1, 'seed': 3}
+        made = VectorEnvironment(GAPS, autoreset='same_step', dtype=np.float32, **options)
+        wrapped, own = SuiteVecEnv(made), SuiteVecEnv(GAPS, **options)
+        self.assertIs(wrapped.environment, made)
+        self.assertEqual(wrapped.num_envs, 2)
+        np.testing.assert_array_equal(wrapped.reset(), own.reset())
+        with self.assertRaisesRegex(ValueError, "autoreset is 'disabled'; expected 'same_step'"):
+            SuiteVecEnv(VectorEnvironment(GAPS, 2, autoreset='disabled'))
 
     def test_misuse_raises_errors(self):
         envs = SuiteVecEnv(FLAT, 2, 1)

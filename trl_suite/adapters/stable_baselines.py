@@ -43,15 +43,16 @@ class SuiteVecEnv(VecEnv):
     """
 
     def __init__(
-        self, environment: str | EnvSpec, num_envs: int, num_threads: int = 0,
-        seed: int | Sequence[int] | None = None, *, flat_observation: bool = True,
+        self, environment: str | EnvSpec | VectorEnvironment, num_envs: int = 1,
+        num_threads: int = 0, seed: int | Sequence[int] | None = None, *, flat_observation: bool = True,
         step_limit: int | None = -1, task_kwargs: dict[str, Any] | None = None,
         render_mode: str | None = None, render_kwargs: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
         """Makes the environment; arguments that are not listed are those of `VectorEnvironment`.
 
         Args:
-          environment: id, alias, or `EnvSpec`.
+          environment: id, alias, or `EnvSpec`; or a vector environment with autoreset 'same_step',
+            for which only `render_mode` and `render_kwargs` have an effect.
           num_envs: number of simulations.
           num_threads: threads that step the physics; 0 for all cores.
           seed: one seed, from which that of each simulation is derived, or a sequence of n seeds.
@@ -65,14 +66,18 @@ class SuiteVecEnv(VecEnv):
         if render_mode not in (None, 'rgb_array'):
             raise ValueError(errors.unknown('render_mode', render_mode, ['rgb_array']))
         self.render_mode, self._render_kwargs = render_mode, render_kwargs or {}
-        self.environment = VectorEnvironment(
-            environment, num_envs, num_threads, seed, autoreset='same_step', dtype=np.float32,
-            flat_observation=flat_observation, step_limit=step_limit, task_kwargs=task_kwargs,
-        )  # fmt: skip
+        if not isinstance(environment, VectorEnvironment):
+            environment = VectorEnvironment(
+                environment, num_envs, num_threads, seed, autoreset='same_step', dtype=np.float32,
+                flat_observation=flat_observation, step_limit=step_limit, task_kwargs=task_kwargs,
+            )  # fmt: skip
+        elif environment.autoreset != 'same_step':
+            raise ValueError(f"autoreset is {environment.autoreset!r}; expected 'same_step'")
+        self.environment = environment
         shapes = {name: (part.stop - part.start,) for name, part in self.environment.blocks.items()}
         super().__init__(
             self.environment.num_envs,
-            observation_space(shapes, flat_observation, np.float32),
+            observation_space(shapes, environment.flat_observation, environment.dtype),
             action_space((len(self.environment.action_map),), np.float32),
         )
 

@@ -12,6 +12,8 @@
     trl-suite doctor
     trl-suite bench PD_Dog2D_Gaps_Terrain-v0
     trl-suite gallery --filter Dog2D_Gaps
+    trl-suite sequences run plaid_biped --learner my_module:MyLearner --output result.json
+    trl-suite sequences check result.json
 
 Invalid input ends with one line on stderr and exit status 2. A command NAME is the function `run` of
 the module `trl_suite.cli.NAME` (`try_file` for `try`, which is a keyword of Python); the engine is
@@ -236,6 +238,31 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         '--moving', action='store_true', help='only animated pictures of environments'
     )
+
+    actions = add('sequences', 'benchmark of continual learning').add_subparsers(
+        required=True, dest='action', metavar='action'
+    )
+    actions.add_parser('list', help='list the sequences')
+    command = actions.add_parser(
+        'run', help='train a learner on a sequence, and test it after each stage',
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )  # fmt: skip
+    command.add_argument('name', metavar='NAME', help='of a sequence')
+    command.add_argument(
+        '--learner', required=True, metavar='MODULE:CLASS',
+        help='made as CLASS(sequence, seed), with the methods train(stage) and policy()',
+    )  # fmt: skip
+    command.add_argument('--budget', default='small', help='samples per stage: small, full, or N')
+    command.add_argument('--episodes', type=_positive, default=32, help='per test and environment')
+    command.add_argument('--stages', type=_positive, metavar='N', help='end early, after N stages')
+    command.add_argument('--seed', type=int, default=0, help='of the run')
+    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument(
+        '--output', type=pathlib.Path, default='result.json', metavar='FILE',
+        help='a .json; an unfinished run is resumed',
+    )  # fmt: skip
+    command = actions.add_parser('check', help='check results: fields, budget and metrics')
+    command.add_argument('files', nargs='+', type=pathlib.Path, metavar='FILE', help='a .json')
     return parser
 
 

@@ -1,0 +1,72 @@
+"""`trl-suite sequences`: lists the sequences, runs a learner on one, checks results."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from typing import Any
+
+from trl_suite.cli import engine
+from trl_suite.util import errors
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Runs the action: list, run or check."""
+    {'list': _list, 'run': _run, 'check': _check}[arguments.action](arguments)
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    sequences = engine.load('trl_suite.sequences')
+    for name, sequence in sequences.SEQUENCES.items():
+        print(f'{name:<18} {len(sequence)} environments: {sequence.description}')
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    sequences = engine.load('trl_suite.sequences')
+    sequence = sequences.get(arguments.name)
+    kind = _learner(arguments.learner)
+    result = sequences.run(
+        sequence, kind(sequence, arguments.seed), _budget(arguments.budget, sequences.BUDGETS),
+        arguments.output, arguments.episodes, arguments.seed, arguments.threads, progress=True,
+        stages=arguments.stages,
+    )  # fmt: skip
+    for id, row in zip(sequence.ids, result['scores'], strict=False):
+        print(f'after {id:34}', *(f'{score:.3f}' for score in row))
+    for name, value in result.get('metrics', {}).items():
+        print(f'{name:40} {value:.3f}')
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    sequences = engine.load('trl_suite.sequences')
+    for path in arguments.files:
+        result = sequences.read(path)
+        notes = sequences.departures(result)
+        comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
+        print(
+            f'{path}: {result["learner"]}, {result["sequence"]}, budget {result["budget"]}, seed '
+            f'{result["seed"]}: {comparable}'
+        )
+
+
+def _budget(text: str, budgets: dict[str, int]) -> int:
+    try:
+        return budgets[text] if text in budgets else int(float(text))
+    except (ValueError, OverflowError):
+        raise ValueError(
+            f'--budget is {text!r}; expected {", ".join(budgets)} or a number of samples'
+        ) from None
+
+
+def _learner(text: str) -> Any:
+    """Returns a class by 'module:Class'; the current folder is searched first."""
+    module, _, name = text.partition(':')
+    if not (module and name):
+        raise ValueError(f'--learner is {text!r}; expected module:Class')
+    sys.path.insert(0, os.getcwd())
+    found = importlib.import_module(module)
+    if not hasattr(found, name):
+        classes = [each for each in dir(found) if isinstance(getattr(found, each), type)]
+        raise ValueError(errors.unknown(f'learner of the module {module}:', name, classes))
+    return getattr(found, name)

@@ -1,0 +1,169 @@
+"""What a learner may use in one stage: simulations that count their samples."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence as Numbers
+from typing import Any
+
+import numpy as np
+
+from trl_suite.environments.vector import Step, VectorEnvironment
+from trl_suite.registry import catalogue
+from trl_suite.sequences.catalogue import FIRST_TEST_SEED, Sequence, train_seeds
+from trl_suite.util import errors
+
+POINTS = 20  # of a learning curve
+
+
+class BudgetExceededError(RuntimeError):
+    """A step was refused, since it would exceed the budget of its stage or comes after its end."""
+
+
+class Stage:
+    """One stage of a run.
+
+    A sample is one control step of one simulation. A vector step of n simulations takes n samples,
+    also of simulations that it only resets (`autoreset='next_step'`); resets are free.
+
+    Attributes:
+      id: the environment to be learnt.
+      ids: all environments of the sequence, in order.
+      number: 0 to T - 1.
+      budget: samples that may be taken, in all environments together.
+      seed: of the run.
+      samples: samples taken so far in each environment, (T,) int.
+    """
+
+    def __init__(
+        self, sequence: Sequence, number: int, budget: int, seed: int = 0, num_threads: int = 0
+    ) -> None:
+        self.ids, self.number, self.id = sequence.ids, number, sequence.ids[number]
+        self.budget, self.seed = budget, seed
+        self.samples = np.zeros(len(sequence), int)
+        self._num_threads = num_threads
+        self._made = itertools.count()
+        self._over = False
+        self._returns: list[tuple[int, float]] = []  # samples at the end of an episode, and score
+
+    @property
+    def left(self) -> int:
+        """Samples that may still be taken."""
+        return self.budget - int(self.samples.sum())
+
+    def environments(
+        self, num_envs: int, id: str | None = None, **options: Any
+    ) -> VectorEnvironment:
+        """Makes simulations with training seeds.
+
+        Every call draws other seeds; they depend on the seed of the run, the stage and the number
+        of the call.
+
+        Args:
+          num_envs: number of simulations.
+          id: id or alias of an environment of the sequence; by default the one to be learnt. Which others a learner
+            has used, and how much, is part of its result.
+          options: further arguments of `VectorEnvironment`, such as `autoreset`.
+
+        Returns:
+          An environment whose `step` raises `BudgetExceededError`, without effect, if it would exceed
+          the budget, and which refuses seeds for tests.
+
+        Raises:
+          ValueError: an environment that is not in the sequence, or invalid options.
+        """
+        id = self.id if id is None else catalogue.find(id).id
+        if id not in self.ids:
+            raise ValueError(errors.unknown('environment of the sequence', id, self.ids))
+        if 'seed' in options:
+            raise ValueError('seed: expected none, since the stage draws it from that of the run')
+        seeds = train_seeds(num_envs, (self.seed, self.number, next(self._made)))
+        options = {'num_threads': self._num_threads, **options}
+        return _Counted(self, self.ids.index(id), id, num_envs, seed=seeds, **options)
+
+    def spend(self, task: int, count: int) -> None:
+        """Counts samples in an environment.
+
+        Raises:
+          BudgetExceededError: more than are left, or after the end of the stage; none are counted.
+        """
+        if self._over:
+            raise BudgetExceededError(
+                f'stage {self.number} ({self.id}) has ended; expected steps in train only'
+            )
+        if count > self.left:
+            raise BudgetExceededError(
+                f'stage {self.number} ({self.id}): {count} more samples; expected at most '
+                f'{self.left}, since {self.budget - self.left} of {self.budget} are taken'
+            )
+        self.samples[task] += count
+
+    def finish(self) -> None:
+        """Ends the stage: its simulations refuse further steps."""
+        self._over = True
+
+    def record(self, task: int, returns: np.ndarray) -> None:
+        """Records the scores of episodes of the environment to be learnt, (k,)."""
+        if task == self.number:
+            now = int(self.samples.sum())
+            self._returns += [(now, float(each)) for each in returns]
+
+    def curve(self) -> list[float | None]:
+        """Returns the learning curve: scores of training episodes, with exploration noise.
+
+        `POINTS` numbers, the mean over episodes that ended in each part of the budget, None where
+        none did. Only episodes of the environment to be learnt count.
+        """
+        parts: list[list[float]] = [[] for _ in range(POINTS)]
+        for samples, score in self._returns:
+            parts[min(POINTS * (samples - 1) // self.budget, POINTS - 1)].append(score)
+        return [float(np.mean(part)) if part else None for part in parts]
+
+
+class _Counted(VectorEnvironment):
+    """Simulations whose steps a stage counts."""
+
+    def __init__(self, stage: Stage, task: int, id: str, num_envs: int, **options: Any) -> None:
+        self._stage, self._number = stage, task
+        self._sums = np.zeros(num_envs)
+        super().__init__(id, num_envs, **options)
+
+    def step(self, action: np.ndarray, env_ids: np.ndarray | Numbers[int] | None = None) -> Step:
+        count = self.num_envs if env_ids is None else len(self._numbers(env_ids))
+        self._stage.spend(self._number, count)
+        step = super().step(action, env_ids)
+        self._sums += step.reward
+        ended = step.terminated | step.truncated
+        if ended.any():
+            self._stage.record(self._number, self._sums[ended] / (self.spec.step_limit or 1))
+            self._sums[ended] = 0
+        return step
+
+    def reset(
+        self,
+        env_ids: np.ndarray | Numbers[int] | None = None,
+        seed: int | Numbers[int] | None = None,
+    ) -> Any:
+        observation = super().reset(env_ids, seed)
+        self._sums[self._numbers(env_ids)] = 0
+        return observation
+
+    def seed(
+        self,
+        seed: int | Numbers[int] | None,
+        env_ids: np.ndarray | Numbers[int] | None = None,
+    ) -> None:
+        """Reseeds as `VectorEnvironment.seed`; one seed for all gives `train_seeds`.
+
+        Raises:
+          ValueError: None, or a seed for tests.
+        """
+        if seed is None:
+            raise ValueError('seed is None; expected seeds, so that the run can be repeated')
+        # A NumPy integer is one seed, too.
+        seeds = seed if np.ndim(seed) else train_seeds(self.num_envs, int(np.asarray(seed)))
+        if np.max(seeds) >= FIRST_TEST_SEED:
+            raise ValueError(
+                f'seed {np.max(seeds)} is for tests; expected training seeds, below {FIRST_TEST_SEED}'
+            )
+        super().seed(seeds, env_ids)
