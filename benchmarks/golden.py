@@ -443,8 +443,8 @@ def summary(id_, seed, nudge=0.0, environment=None):
     """Returns the rewards and a weighted sum of each observation block of a few early steps.
 
     Args:
-      id_: of the environment.
-      seed: of the environment and of the actions.
+      id_: id of the environment.
+      seed: seed of the environment and of the actions.
       nudge: size of random changes of the actions.
       environment: made by `summarised(id_)`, for repeated use.
     """

@@ -65,9 +65,9 @@ class Map:
         turns.
 
         Args:
-          cost: of the nodes, per m.
-          goal: of the path, relative to the centre, (2,) m; if it is outside the map, the cost of
-            the last part is estimated.
+          cost: cost of the nodes, per m.
+          goal: goal of the path, relative to the centre, (2,) m; if it is outside the map, the
+            cost of the last part is estimated.
         """
         n = len(self.places)
         if np.abs(goal).max() < REACH:

@@ -124,7 +124,7 @@ def advantages(
     """Generalised advantage estimation (Schulman et al. 2016, arXiv:1506.02438).
 
     Args:
-      reward: of each step; all arrays are (time, simulations).
+      reward: reward of each step; all arrays are (time, simulations).
       value: estimated before the step.
       following: estimated after the step; of the final state for a truncated episode, 0 after a
         failure.
@@ -674,7 +674,7 @@ def command_line(
     """Parses the command line of a training program.
 
     Args:
-      description: of the program.
+      description: description of the program.
       sample: what its samples are.
 
     Returns:

@@ -96,7 +96,7 @@ class Bench:
           character: one with a gait.
           num_envs: number of simulations.
           action_offset: parameters at action 0, (P,), which are used without rounding.
-          terrain: of all simulations.
+          terrain: terrain of all simulations.
           substeps: physics steps per control step.
           threads: number of threads that step the physics.
         """
@@ -123,7 +123,7 @@ class Bench:
 
         Args:
           vectors: gait parameters of each simulation, (n, P).
-          seeds: of the starts, (n,).
+          seeds: seeds of the starts, (n,).
           horizon: s.
           friction: coefficient of sliding friction of ground and character, (n,).
         """

@@ -95,14 +95,14 @@ def assert_rows_are_singles(
     time, and what it did before must not matter either.
 
     Args:
-      id_: of the environment.
+      id_: id of the environment.
       n: simulations.
-      steps: of all simulations; those that end begin anew.
+      steps: number of steps; a simulation whose episode ends starts the next one.
       step_limit: after which episodes are cut.
-      options: of the task.
-      scale: of the random actions, a number or one for each simulation, (n, 1).
-      seed: of the simulations.
-      num_threads: of the simulations.
+      options: options of the task.
+      scale: scale of the random actions, a number or one for each simulation, (n, 1).
+      seed: seed of the simulations.
+      num_threads: number of threads.
 
     Returns:
       What the simulations returned, a list of `Step`, and how many episodes ended.

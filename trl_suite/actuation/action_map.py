@@ -102,9 +102,10 @@ class Drive(NamedTuple):
       offset: control at action 0, (k,).
       scale: change per unit action, (k,).
       first: address of the first control.
-      torque_balls, torque_limits: of a `TorqueMap` the indices of ball joints' torques, (B, 3), and
-        the largest norm of each, (B,); otherwise empty.
-      angles, angle_balls, hinges: of an `AngleAxisMap`, (B,), (B, 3) and (2, H); otherwise empty.
+      torque_balls: indices of the torques of each ball joint, (B, 3), if the map is a `TorqueMap`.
+      torque_limits: largest norm of the torque of each ball joint, (B,), likewise.
+      angles, angle_balls, hinges: fields of an `AngleAxisMap`, (B,), (B, 3) and (2, H). Fields of
+        another type of map are empty.
     """
 
     offset: np.ndarray

@@ -67,7 +67,7 @@ class SuiteEnv(gymnasium.Env[Any, np.ndarray]):
           environment: id, alias, `EnvSpec`, or an environment that is not used elsewhere.
           flat_observation: return all blocks concatenated as one vector, else a dict of blocks.
           task_kwargs: as for `suite.load`.
-          dtype: of observations and actions, float32 or float64.
+          dtype: dtype of observations and actions, float32 or float64.
           max_episode_steps: truncate after this number of steps, instead of the step limit of the id;
             -1 for never. If `task_kwargs` has a 'step_limit', the smaller one counts.
           render_mode: 'rgb_array', or None for no rendering.
@@ -164,7 +164,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
           num_envs: number of simulations.
           num_threads: threads that step the physics; 0 for all cores.
           autoreset_mode: 'NextStep', 'SameStep', 'Disabled', or Gymnasium's constants.
-          dtype: of observations, actions and rewards.
+          dtype: dtype of observations, actions and rewards.
         """
         modes = {mode.value: mode for mode in AutoresetMode}
         mode = getattr(autoreset_mode, 'value', autoreset_mode)

@@ -212,9 +212,11 @@ def pose(
 
     Args:
       count: number of pieces.
-      level, ends, edges: of the pieces.
-      vertical: of the profile.
-      angle: of the pieces, see `angles`.
+      level: whether all pieces are level.
+      vertical: the vertical edges of the profile.
+      ends: vertices at both ends of each piece, see `Pieces`.
+      edges: positions of the pieces' edges.
+      angle: angle of each piece, see `angles`.
       boxes: at least `count` boxes.
     """
     if not level:

@@ -19,7 +19,7 @@ class Look(NamedTuple):
     Attributes:
       ground: light and dark squares.
       sky: above, and at the horizon.
-      light: of the camera's lamp, which adds to the sun that follows each character.
+      light: light of the camera's lamp, which adds to the sun that follows each character.
     """
 
     ground: tuple[Colour, Colour]

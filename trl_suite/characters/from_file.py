@@ -90,7 +90,7 @@ def from_file(
       joints: parameters of joints by name, which replace those derived from the file.
       stumble_exempt: bodies that may touch the ground without a stumble; by default the end
         effectors.
-      name: of the character; by default the file's.
+      name: name of the character; by default the file's.
       description: one line.
 
     Raises:

@@ -45,10 +45,11 @@ KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
 
 
 def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Returns the direction (2,) that something looks along, or None if nothing tells it.
+    """Returns the facing direction (2,) of a character, or None if no names of bodies tell it.
 
     Args:
-      places: of its bodies by name, (3,) m; those named left or right are taken to lie there.
+      places: positions of the bodies by name, (3,) m. The direction follows from pairs of bodies
+        that are named left and right.
     """
     aside = np.zeros(3)
     for left, place in places.items():
@@ -56,7 +57,7 @@ def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
         if right is not None:
             aside += place - places[right]
     length = np.linalg.norm(aside[:2])
-    # Of what lies on its side, x and y say nothing.
+    # If the character lies on its side, x and y tell nothing.
     if length < FACING * np.linalg.norm(aside) or not length:
         return None
     return np.array([aside[1], -aside[0]]) / length

@@ -132,13 +132,13 @@ def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> in
 def turned(
     file: pathlib.Path, spec: mujoco.MjSpec, root: str, rotation: np.ndarray
 ) -> mujoco.MjModel:
-    """Turns all that a body holds, and the body back: its axes become those of the world.
+    """Rotates the children of a body, so that the axes of the body are those of the world.
 
     Args:
-      file: for messages.
-      spec: is changed.
+      file: path of the file, for messages.
+      spec: the file as read, which is changed.
       root: name of the body, a child of the world.
-      rotation: of what it holds, unit quaternion wxyz.
+      rotation: rotation of its children, unit quaternion wxyz.
 
     Returns:
       The compiled file.

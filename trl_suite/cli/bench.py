@@ -89,7 +89,7 @@ def vector(id: str, num_envs: int, threads: int, seconds: float = SECONDS) -> di
     """Measures the vector environment, and MuJoCo alone with the same models and threads.
 
     Args:
-      id: of the environment.
+      id: id of the environment.
       num_envs: number of simulations.
       threads: number of threads; 0 for all cores.
       seconds: duration for the environment, and the same for the raw batch.

@@ -84,7 +84,7 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     Args:
       environment: the environment; it is reset.
       policy: time step -> action.
-      title: of the window.
+      title: title of the window.
 
     Raises:
       RuntimeError: no window can be opened.

@@ -66,7 +66,7 @@ class Environment(composer.Environment):
         self._flat_observation = flat_observation
         self._step_limit = step_limit
         self._steps = 0
-        self.one_thread = arguments.OneThread()  # entered by all that touches the simulation
+        self.one_thread = arguments.OneThread()  # entered by methods that use the simulation
         self.recipe: tuple[Callable[..., Environment], tuple[Any, ...]] | None = None
         super().__init__(
             task,
@@ -75,12 +75,12 @@ class Environment(composer.Environment):
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
         )
-        # The constructor has compiled the model; composer would compile it again at the first
+        # The model is compiled already. Otherwise, composer would compile it again at the first
         # reset.
         self._mjcf_never_compiled = False
         self._parts = tuple(task.blocks.items())
         self._action_map = task.action_map
-        # Whether an entity or the user has hooks around a step; calling none of them saves time.
+        # Whether there are hooks to call before or after a step. Checking them takes time.
         self._hooked = bool(
             self._hooks._before_step.entity_hooks or self._hooks._after_step.entity_hooks
         )
@@ -161,16 +161,16 @@ class Environment(composer.Environment):
         return dm_env.TimeStep(step_type, float(task.reward[0]), float(not failed), observation)
 
     def close(self) -> None:
-        """Frees the simulation and the task; may be called twice."""
+        """Frees the simulation and the task. A second call does nothing."""
         with self.one_thread:
             if self._physics is not None:
                 super().close()
-                # All of them lead to arrays in the model and its data, which would stay with them.
+                # These refer to arrays of the model and its data, and would keep them in memory.
                 del self._task, self._hooks, self._observation_updater
 
     @property
     def task(self) -> Task:
-        """The rules, with arrays of one simulation.
+        """The task, bound to one simulation.
 
         Raises:
           RuntimeError: after `close`.

@@ -35,14 +35,14 @@ class Capture:
     """A motion of any skeleton of ball joints, in the frame of trl_suite.
 
     Attributes:
-      name: of the file.
-      times: of the frames, s, (n,), starting at 0.
+      name: name of the file.
+      times: times of the frames, s, (n,), starting at 0.
       joints: names, parents before children, the root first; J of them.
       parents: index of each joint's parent, -1 for the root.
       rest: positions of joints relative to the root in the rest pose, m, (J, 3).
-      positions: of the root, m, (n, 3).
-      rotations: of each joint's bones from their rest pose, in world axes, unit quaternions wxyz,
-        (n, J, 4).
+      positions: positions of the root, m, (n, 3).
+      rotations: rotations of each joint's bones from their rest pose, in world axes, unit
+        quaternions wxyz, (n, J, 4).
     """
 
     name: str
@@ -64,7 +64,7 @@ def read_bvh(
 
     Args:
       path: the file. Joints have three rotation channels each, the root three positions too.
-      unit: of lengths, m.
+      unit: unit of lengths in m.
       forward: axis that the rest pose faces: 'x', 'y' or 'z', with a - before it if negative.
       up: axis that points up.
 
@@ -126,7 +126,7 @@ def read_amc(
       path: the motion, an .amc file.
       skeleton: the .asf file that belongs to it.
       rate: frames per second.
-      unit: of lengths, m, before multiplication by the file's factor.
+      unit: unit of lengths in m, before multiplication by the file's factor.
       forward, up: as for `read_bvh`.
 
     Raises:

@@ -124,7 +124,7 @@ class Mirror:
         """Prepares the exchange.
 
         Args:
-          layout: of the poses and velocities.
+          layout: layout of the poses and velocities.
           pairs: names of joints to swap, (right, left) in either order. Other joints keep their
             columns.
 

@@ -61,7 +61,8 @@ class Steps:
         heading, positive to the swing side) of each step, shape (k, 3): the landing place of the
         swing foot relative to the stance foot. The same for mirrored steps.
       previous: labels of the step before each, shape (k, 3): start place of the swing foot.
-      features: of each clip at its start, with its own landing place as the plan, shape (k, 7).
+      features: features of each clip at its start, with its own landing place as the plan,
+        shape (k, 7).
       description: one line.
 
     Raises:
@@ -167,7 +168,8 @@ class Steps:
 
         Args:
           query: features of the current state and the plan, shape (n, 7); see `features`.
-          weights: of the features, shape (7,). Distance is the norm of the weighted difference.
+          weights: weights of the features, shape (7,). Distance is the norm of the weighted
+            difference.
 
         Returns:
           Indices, shape (n,).

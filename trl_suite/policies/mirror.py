@@ -104,7 +104,7 @@ def blocks(index: np.ndarray, signs: tuple[float, ...]) -> tuple[np.ndarray, np.
 
     Args:
       index: source block of each block, (b,).
-      signs: of the columns of a block, c of them.
+      signs: signs of the columns of a block, c of them.
 
     Returns:
       Index and sign, both (b * c,).

@@ -32,7 +32,7 @@ class Convolution:
 
     Attributes:
       line: number of inputs that form the line, l.
-      strides: of each layer, in positions of its input.
+      strides: strides of each layer, in positions of its input.
       weights: per layer (width, channels, filters), float32, like all arrays read-only; the first has
         one channel, each other as many as the one before has filters.
       biases: per layer (filters,).
@@ -121,7 +121,7 @@ class Policy:
       clip: bound of the normalised observation.
       weights: per layer (inputs, outputs).
       biases: per layer (outputs,).
-      activation: of all layers but the last, convolutions included, one of `ACTIVATIONS`.
+      activation: activation of all layers but the last, convolutions included, one of `ACTIVATIONS`.
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was trained; a JSON object.
       mirror: the reflection of left stance to right stance; None for none.

@@ -35,11 +35,11 @@ class Fault:
 
     Attributes:
       frame: its index, from 0.
-      time: of the frame, s.
+      time: time of the frame, s.
       kind: one of `KINDS`.
-      name: of the joint or link.
+      name: name of the joint or link.
       amount: excess over a limit, depth below the ground, or sliding distance.
-      unit: of the amount.
+      unit: unit of the amount.
     """
 
     frame: int
@@ -55,10 +55,10 @@ class Report:
     """Measurements in n frames.
 
     Attributes:
-      name: of the clip.
-      times: of the frames, s, (n,).
+      name: name of the clip.
+      times: times of the frames, s, (n,).
       excess: by joint, rad beyond the limits (m for a slide), 0 within them, (n,).
-      units: of every joint's excess, 'rad' or 'm'.
+      units: units of every joint's excess, 'rad' or 'm'.
       depth: by link, m of its lowest corner below the ground, 0 above it, (n,).
       slide: by foot, distance in m of a corner in contact from the place where its contact began,
         the largest of all corners, 0 without contact, (n,).

@@ -157,7 +157,7 @@ def counterparts(
 
     Args:
       motion: the motion.
-      joints: of the character.
+      joints: joints of the character.
       joint_map: from the character's joints, and 'root', to the motion's; by default `guess_map`.
 
     Raises:
@@ -326,8 +326,8 @@ def _poses(
       figure: the character.
       motion: source of joint rotations, if it is a clip.
       chosen: the joint map.
-      path: of the root, (n, 3).
-      turns: of the root, (n, 4).
+      path: path of the root, (n, 3).
+      turns: rotations of the root, (n, 4).
       links: target orientations of links, for a capture; None for a clip.
     """
     layout, n = figure.layout, len(path)
@@ -393,8 +393,8 @@ def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> C
 
     Args:
       clip: a clip that does not loop.
-      start: of the cycle, s.
-      end: of the cycle, s.
+      start: start of the cycle, s.
+      end: end of the cycle, s.
 
     Raises:
       ValueError: times that are not in the clip, one without the other, or a clip that is too short.

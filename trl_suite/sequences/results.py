@@ -48,7 +48,7 @@ def read(path: str | os.PathLike[str], complete: bool = True) -> dict[str, Any]:
     """Reads and checks a result.
 
     Args:
-      path: of the file.
+      path: path of the file.
       complete: whether the run must have ended.
 
     Raises:

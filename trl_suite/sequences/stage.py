@@ -31,7 +31,7 @@ class Stage:
       ids: all environments of the sequence, in order.
       number: 0 to T - 1.
       budget: samples that may be taken, in all environments together.
-      seed: of the run.
+      seed: seed of the run.
       samples: samples taken so far in each environment, (T,) int.
     """
 

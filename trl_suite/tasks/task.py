@@ -31,15 +31,15 @@ MAX_JOINT_SPEED = 200.0  # rad/s; above it a simulation counts as diverged
 
 
 class Marker(NamedTuple):
-    """A shape that a task adds to rendered images; it has no effect on the physics.
+    """A shape that a task adds to rendered images. It has no effect on the physics.
 
     Attributes:
       shape: 'box', 'cylinder', 'sphere', 'ellipsoid', or 'arrow', which points along its yaw.
-      position: centre, or for an arrow its tail, m.
-      size: as in MuJoCo, m: half sizes, radii, or for a cylinder radius and half height; for an
-        arrow radius, radius and length.
-      colour: red, green, blue, opacity.
-      yaw: rad.
+      position: position of the centre, or of an arrow's tail, m.
+      size: size as in MuJoCo, m: half sizes of a box, radii of a sphere or an ellipsoid, radius
+        and half height of a cylinder; for an arrow: radius, radius, length.
+      colour: red, green, blue and opacity, in [0, 1].
+      yaw: rotation about the vertical axis, rad.
     """
 
     shape: str
@@ -114,24 +114,25 @@ class Task(composer.Task):
     `trl_suite.util.compiled`); the task holds the arrays that they use and calls loops over
     simulations. A custom task may do the same with plain NumPy.
 
-    An environment calls `bind` once, `reset` for simulations that begin an episode, and `step` for
-    those that take a step. A step consists of
+    An environment calls `bind` once, `reset` for simulations in which an episode starts, and `step`
+    for the others. A step consists of
 
-    1. `apply_action`: clips actions, writes controls, and moves ground windows if necessary;
+    1. `apply_action`: clips the actions, sets the controls, and moves ground windows if necessary;
     2. `simulate`: advances the physics;
-    3. `finish_step`: clock, divergence, measurement, reward, failure, observation, in this order.
+    3. `finish_step`: updates the clock, checks for divergence, measures the character, and computes
+       reward, failure and observation, in this order.
 
-    Threads call `reset` and `step` for parts of the simulations: each call may only change the
-    simulations that it is given. The composer hooks below are the case n = 1, so that a plain
-    `composer.Environment` can run the task, unless its steps have a variable duration: such a task
-    overrides `simulate`.
+    Several threads call `reset` and `step`, each for some of the simulations. A call may change
+    only the simulations that it is given. The composer hooks below call the same methods for one
+    simulation, so that a plain `composer.Environment` can run the task. The exception are tasks
+    whose steps vary in duration; these override `simulate`.
 
     Attributes:
       world: the simulations; set by `bind`.
       action_map: the map from actions to physical units.
       blocks: name -> slice of the observation, in order, terrain first.
       outcome: observation, reward and failure of each simulation.
-      saved: tuples of arrays (n, ...) that are the state of the task, including `outcome`.
+      saved: the state of the task: tuples of arrays (n, ...), of which `outcome` is one.
       info_arrays: the arrays (n, ...) that `info` returns, by name, or dicts of such arrays;
         updated in place.
     """
@@ -144,8 +145,8 @@ class Task(composer.Task):
     info_arrays: dict[str, Any]
     CONFIG: Any = None  # options: a subclass of `Config`, or a dict of them by `spec.spatial`
     fields: tuple[str, ...] = ()  # further fields of MjData to bind, see `World`
-    in_parts = True  # whether threads may call the task for parts of the simulations
-    _begun = False  # whether no step was taken since composer's reset
+    in_parts = True  # whether several threads may call the task, each for some simulations
+    _begun = False  # whether composer has reset the task, and no step has followed yet
 
     # Methods that a subclass implements.
 
@@ -155,16 +156,21 @@ class Task(composer.Task):
 
     @abc.abstractmethod
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        """Begins episodes in some simulations: draws terrain and initial state, and observes.
+        """Starts episodes: draws terrain and initial states, and computes the observations.
 
         Args:
-          env_ids: numbers of m simulations.
-          random_states: random streams of these simulations, m of them.
+          env_ids: ids of the m simulations in which an episode starts.
+          random_states: random states of these simulations, m of them.
         """
 
     @abc.abstractmethod
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        """Applies the actions of some simulations; `action`: of all, (n, k), in [-1, 1]."""
+        """Applies the actions of some simulations.
+
+        Args:
+          action: actions of all simulations, (n, k), in [-1, 1].
+          env_ids: ids of the simulations whose actions are applied.
+        """
 
     @abc.abstractmethod
     def finish_step(self, env_ids: np.ndarray) -> None:
@@ -262,7 +268,7 @@ class Task(composer.Task):
         self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
     ) -> None:
         if self._begun:
-            # After a reset by a plain composer.Environment, the velocities of actuators are zero.
+            # A plain composer.Environment leaves actuator velocities of zero after a reset.
             self.world.forward(self.world.all_ids)
             self._begun = False
         self.apply_action(np.asarray(action, dtype=float)[None], self.world.all_ids)
@@ -280,7 +286,7 @@ class Task(composer.Task):
         return bool(self.failed[0])
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
-        # Bounds of each number, as dm_control's own have them.
+        # One bound per number, as in dm_control's own action specs.
         bound = np.ones(len(self.action_map))
         return specs.BoundedArray(
             bound.shape, float, -bound, bound, name='\t'.join(self.action_map.names)

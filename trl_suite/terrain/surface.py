@@ -66,7 +66,7 @@ def from_function(
       function: x (k,) -> heights (k,), m, of planar ground; or x, y (k, m) -> heights (k, m) of
         three-dimensional ground. It gets arrays, and must be deterministic. For use in other
         processes it must be importable.
-      name: of the terrain and of its type; by default the function's.
+      name: name of the terrain and of its type; by default the function's.
       start_span: episodes start at random from -start_span to start_span, m, along x and, in three
         dimensions, along y: the ground is shifted so that this place is at the origin. In three
         dimensions it is shifted by whole cells.

@@ -49,7 +49,7 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
     """Checks that an argument is a whole number between two bounds.
 
     Args:
-      name: of the argument.
+      name: name of the argument.
       value: may be any number that is whole.
       low, high: bounds, which are allowed.
       why: where a bound comes from, for the message.
@@ -66,7 +66,7 @@ def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
     """Returns a copy of options by name; none for None.
 
     Args:
-      name: of the argument that holds them.
+      name: name of the argument that holds them.
       value: what is given.
 
     Raises:

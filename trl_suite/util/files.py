@@ -65,7 +65,7 @@ def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> N
     """Checks how many bytes a file has, before it is read.
 
     Args:
-      path: of the file.
+      path: path of the file.
       largest: bytes.
       size: bytes once it is read, if not those of the file.
 

@@ -77,7 +77,7 @@ class Browser:
         Args:
           spec: an id, an alias, or what `suite.combine` returns.
           policy: 'best', one of `named_policies.POLICIES`, or an .npz file.
-          seed: of the environment, and of random actions.
+          seed: seed of the environment, and of random actions.
           host: address to listen on; '0.0.0.0' lets every machine of the network in.
           port: the first that is tried, then the next ones.
 

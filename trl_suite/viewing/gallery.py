@@ -262,7 +262,7 @@ def moment(id: str, time: float, size: tuple[int, int] = STRIP_SIZE) -> np.ndarr
     """Renders one frame of such an episode.
 
     Args:
-      id: of the environment.
+      id: id of the environment.
       time: since the start of the episode, s.
       size: height and width, pixels.
     """

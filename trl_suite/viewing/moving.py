@@ -48,7 +48,7 @@ class Shot(NamedTuple):
     """An episode to be drawn.
 
     Attributes:
-      states: of the environment, `FRAME` apart.
+      states: states of the environment, `FRAME` apart.
       root: where the character's root was, (moments, 3) m.
       lasted: whether the episode did not fail.
     """
@@ -64,7 +64,7 @@ def moving_picture(
     """Draws an environment under its best policy; see `named_policies.best`.
 
     Args:
-      id: of the environment.
+      id: id of the environment.
       seconds: how long; less if all episodes that are tried fail before.
       size: height and width, pixels.
 

@@ -1,4 +1,4 @@
-"""An environment under a policy, advanced frame by frame: what viewers show."""
+"""Steps an environment with a policy, one frame at a time, for the viewers."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 Policy = Callable[[dm_env.TimeStep], np.ndarray]
 
-FRAME = 1 / 30  # s; the longest time between two frames
-HISTORY = 300  # frames: 10 s
-PUSHES: Mapping[str, tuple[float, float, float]] = {  # axes of the world
+FRAME = 1 / 30  # s of simulated time, at most, between two frames
+HISTORY = 300  # frames in the plots: 10 s
+PUSHES: Mapping[str, tuple[float, float, float]] = {  # directions, in world axes
     'back': (-1, 0, 0), 'forward': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'up': (0, 0, 1),
 }  # fmt: skip
-_ENDS = ('fell', 'stuck', 'diverged')  # of an episode, in the info
+_ENDS = ('fell', 'stuck', 'diverged')  # info keys that say why an episode ended
 
 
 class Moment(NamedTuple):
-    """What is plotted of a frame.
+    """The values that are plotted for one frame.
 
     Attributes:
-      time: since the session began, s.
+      time: simulated time since the session began, s.
       rewards: the reward, then its terms, in the order of `Session.reward_names`.
-      torques: of the actuators on each joint axis, (k,) N m.
+      torques: actuator torque on each joint axis, (k,) N m.
     """
 
     time: float
@@ -41,26 +41,27 @@ class Moment(NamedTuple):
 
 
 class Session:
-    """An environment, a policy, and what has happened so far.
+    """An environment and a policy, with the plotted values of the last frames.
 
     Attributes:
-      environment: may be looked at, but not stepped.
-      policy: may be replaced.
-      time_step: the last one.
-      history: the last `HISTORY` moments.
+      environment: the environment. Read from it, but do not step it.
+      policy: the policy. It may be replaced at any time.
+      time_step: the latest time step.
+      history: the `Moment`s of the last `HISTORY` frames.
       reward_names: 'reward', then the names of its terms.
-      joint_axes: names of the joint axes that torques act on.
-      episode: number of episodes begun.
-      steps, total: control steps and return of this episode.
+      joint_axes: names of the joint axes, in the order of `Moment.torques`.
+      episode: number of episodes started since the last seed was set.
+      steps: number of control steps of the current episode.
+      total: return of the current episode.
     """
 
     def __init__(self, environment: Environment, policy: Policy, seed: int | None = None) -> None:
-        """Begins an episode.
+        """Starts the first episode.
 
         Args:
-          environment: nothing else may step it.
-          policy: time step -> action.
-          seed: of the episodes from now on; None goes on in the environment's own stream.
+          environment: the environment, which nothing else may step.
+          policy: function of a time step that returns an action.
+          seed: seed of the environment's random state; None leaves the random state as it is.
         """
         self.environment, self.policy = environment, policy
         self._frames: Any = environment
@@ -81,7 +82,11 @@ class Session:
         self.reset(seed)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begins an episode; arguments are those of the constructor."""
+        """Starts an episode.
+
+        Args:
+          seed: as in the constructor. With a seed, the counts and the plots start again, too.
+        """
         if seed is not None:
             self.environment.random_state.seed(seed)
             self.episode = 0
@@ -91,16 +96,16 @@ class Session:
         self._begin()
 
     def _begin(self) -> None:
-        """Counts from the start of an episode."""
+        """Resets the counts for a new episode."""
         self.episode += 1
         self.steps, self.total = 0, 0.0
         self._push = np.zeros(3)  # m/s
 
     def advance(self) -> float:
-        """Goes on by a frame, after the end of an episode to the start of the next one.
+        """Simulates until the next frame; after the end of an episode, starts the next one.
 
         Returns:
-          The simulated time that has passed, s; 0 at a start.
+          The simulated time that has passed, s; 0 if an episode was started.
         """
         physics = self.environment.physics
         before = physics.data.time
@@ -128,18 +133,18 @@ class Session:
 
     @property
     def is_between_steps(self) -> bool:
-        """Whether a control step has ended, so that the next frame asks the policy."""
+        """Whether the next frame starts a control step, with a new action of the policy."""
         return not (isinstance(self._frames, Frames) and self._frames.is_within_step)
 
     def push(self, direction: str, speed: float) -> None:
-        """Gives the whole body a speed at once, before the next step that is simulated.
+        """Adds a velocity to the character's root before the next control step.
 
         Args:
-          direction: one of `PUSHES`; what is planar is not pushed to the side.
-          speed: m/s.
+          direction: one of `PUSHES`. 'left' and 'right' have no effect on a planar character.
+          speed: magnitude of the velocity, m/s.
 
         Raises:
-          ValueError: an unknown direction.
+          ValueError: if the direction is unknown.
         """
         if direction not in PUSHES:
             raise ValueError(errors.unknown('direction', direction, PUSHES))
@@ -155,18 +160,18 @@ class Session:
         self._push = np.zeros(3)
 
     def status(self) -> dict[str, str]:
-        """Returns how the episode goes, by name."""
+        """Returns the texts of the status display, by name."""
         info = self.environment.info
-        found = {
+        texts = {
             'episode': str(self.episode), 'step': str(self.steps),
             'time': f'{self.environment.physics.data.time:.1f} s', 'return': f'{self.total:.2f}',
         }  # fmt: skip
         if 'distance' in info:
-            found['distance'] = f'{info["distance"]:.2f} m'
+            texts['distance'] = f'{info["distance"]:.2f} m'
         if self.time_step.last():
-            cut = 'was cut' if self.time_step.discount else 'failed'
-            found['end'] = next((end for end in _ENDS if info.get(end)), cut)
-        return found
+            default = 'was cut' if self.time_step.discount else 'failed'
+            texts['end'] = next((end for end in _ENDS if info.get(end)), default)
+        return texts
 
     def _rewards(self) -> np.ndarray:
         terms = self.environment.info.get('reward_terms', {})
@@ -175,7 +180,7 @@ class Session:
 
 
 def _root_dofs(environment: Any) -> tuple[set[int], int]:
-    """Returns the numbers of all velocities of the character's root, and the first of them."""
+    """Returns the dof ids of the character's root joints, and the first of them."""
     model, figure = environment.physics.model, environment.task.figure
     joint = int(np.flatnonzero(model.jnt_qposadr == figure.pose_qpos[0])[0])
     first = int(model.jnt_dofadr[joint])
@@ -184,7 +189,7 @@ def _root_dofs(environment: Any) -> tuple[set[int], int]:
 
 
 def _axis_name(model: Any, dof: int) -> str:
-    """Returns the name of a joint, of a ball joint with the letter of an axis."""
+    """Returns the joint's name of a dof; for a ball joint, with the letter of the axis."""
     joint = int(model.dof_jntid[dof])
     name = (model.id2name(joint, 'joint') or f'joint {joint}').rpartition('/')[2]
     if model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_BALL):

@@ -1,4 +1,4 @@
-"""Tracking a clip in the plane: compiled functions of one simulation."""
+"""Rules of planar imitation: compiled functions of one simulation."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ POSE, VELOCITY, END_EFFECTOR, COM, ROOT = range(len(rewards.IMITATION_TERMS))
 
 
 class ImitationState(NamedTuple):
-    """Phase of each simulation in the clip, (n,).
+    """Clip time of each simulation, (n,).
 
     Attributes:
-      phase: phase in [0, 1).
-      cycles: time in periods of the clip: the phase, not wrapped.
+      phase: phase of the clip, in [0, 1).
+      cycles: number of clip periods, with fraction: the phase before it is wrapped.
       start: `cycles` at the start of the episode.
     """
 
@@ -54,12 +54,14 @@ class ImitationState(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Columns of the clip's table, and of the observation (-1: not observed).
+    """First columns of features in the clip's table, and of blocks in the observation.
 
     Attributes:
-      angles, rates, effectors, com_velocity, height, positions, phase: first columns of features.
-      strain_block, phase_block, reference_block: first columns of these blocks.
-      reference: number of columns in the reference block.
+      angles, rates, effectors, com_velocity, height, positions, phase: first column of each
+        feature in the clip's table.
+      strain_block, phase_block, reference_block: first column of each block in the observation,
+        -1 if the block is not observed.
+      reference: number of columns of the reference block.
     """
 
     angles: int
@@ -79,14 +81,14 @@ _FEATURES = Layout._fields[:7]  # fields that are columns of the clip's table
 
 
 class Rules(NamedTuple):
-    """Data for the compiled functions of imitation.
+    """Data of the compiled functions of imitation.
 
     Attributes:
-      ctrl: controls of the physics, (n, ...).
-      weights: weights of pitch and joints in the errors of pose and velocity, (1 + J,).
+      ctrl: controls of the physics, (n, controls).
+      weights: weights of pitch and joints in the pose and velocity errors, (1 + J,).
       term_weights, term_scales: weights and error scales of the reward terms, (5,).
-      rest, scale: of every muscle, tendon length at which the strain is 0, and length of unit
-        strain, m.
+      rest: tendon length of each muscle at zero strain, m.
+      scale: change of tendon length of each muscle per unit of strain, m.
     """
 
     engine: native.Engine
@@ -107,12 +109,12 @@ class Rules(NamedTuple):
     outcome: Outcome
 
 
-# A step of simulation i, in order.
+# The step of simulation i. Functions are in the order in which they are called.
 
 
 @compiled
 def finish_step(i: int, rules: Rules) -> None:
-    """Computes reward, failure and observation, after the physics was advanced."""
+    """Computes reward, failure and observation after the physics step."""
     advance_clock(i, rules.clip, rules.state)
     if breaks_down(i, rules):
         conclude(i, True, rules.outcome)
@@ -188,7 +190,7 @@ def observe(i: int, rules: Rules) -> None:
         observation[i, layout.reference_block + k] = feature(phase, layout.height + k, clip)
 
 
-# Loops over simulations; they take packs.
+# Loops over simulations. `rules` is passed as one pointer (`trl_suite.util.pack`).
 
 
 @compiled_loop

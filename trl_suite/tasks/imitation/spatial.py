@@ -157,10 +157,10 @@ class SpatialImitation(SpatialTask):
     Observation blocks, in this order (N links; heading frame: x along the root's heading, y to the
     left, z up; heights are relative to the ground under the root):
       terrain: the 32 x 32 map of `Surroundings.height_map`, m, with the option terrain_observation.
-      pose: height of the root, then of every link the position of its centre relative to the root
+      pose: height of the root, then for every link the position of its centre relative to the root
         (3), m, and its orientation (4) as a quaternion wxyz with w not negative; 7N + 1.
-      velocity: of every link the velocity of its centre (3), m/s, relative to the ground under the
-        root, and its angular velocity (3), rad/s; 6N.
+      velocity: for every link the velocity of its centre (3), m/s, relative to the ground under
+        the root, and its angular velocity (3), rad/s; 6N.
       phase: phase in [0, 1), then the one-hot of its quarter; 5. Or instead
       reference: height of the reference's root, then its link positions relative to its root, then
         its link velocities, in the reference's heading frame; 6N + 1.

@@ -193,7 +193,7 @@ def check_new(
     """Checks that a terrain type may be registered.
 
     Args:
-      type_name: of the type.
+      type_name: name of the type.
       known: the function that is registered already, if any.
       function: the one that is to be.
       replace: whether the user wants it replaced in any case.

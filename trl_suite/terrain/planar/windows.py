@@ -23,7 +23,7 @@ class PlanarWindows(NamedTuple):
       start: number of the first vertex of a window, (n,); NaN before the first episode.
       centre: middle of the range of character positions for which a window is valid, (n,) m.
       reach: distance of the character from the centre beyond which a window is refilled, m.
-      heights: of the vertices, (n, W) m.
+      heights: heights of the vertices, (n, W) m.
       rises: from each vertex to the next, (n, W) m; the last is 0.
       vertical: whether the cell before a vertex is a vertical face, (n, W) bool.
       wide: heights of vertices, the first of them W before the window, (n, 3 W + 1) m.

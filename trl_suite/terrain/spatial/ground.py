@@ -120,7 +120,7 @@ class SpatialGround:
         Args:
           x, y: m, of one shape.
           movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
-          direction: of the moving boxes, 1 or -1, (k,); their initial ones if None.
+          direction: direction of the moving boxes, 1 or -1, (k,); their initial ones if None.
 
         Raises:
           ValueError: as `height`.
@@ -234,7 +234,7 @@ class SpatialGround:
           random: source of randomness.
           root: where the character is, (2,) m.
           rule: one of `RULES`.
-          distance: of the nearest goal of `step`, m.
+          distance: distance of the nearest goal of `step`, m.
           movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
 
         Returns:

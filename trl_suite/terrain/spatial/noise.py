@@ -82,7 +82,7 @@ def grid(
       x, y: coordinates of the grid lines, m, shapes (k,) and (m,).
       offset: position of (0, 0) in the tile, (2,).
       frequency: tiles per m of the first octave.
-      amplitude: of the first octave, m.
+      amplitude: amplitude of the first octave, m.
 
     Returns:
       Heights in m, shape (k, m), in single precision.

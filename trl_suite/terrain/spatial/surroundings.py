@@ -72,12 +72,12 @@ class Surroundings:
     Attributes:
       arrays: the windows, for the compiled functions of one simulation in
         `trl_suite.terrain.spatial.windows`.
-      grounds: of each character.
+      grounds: grounds of each character.
       boxes: in each window, in order of x.
       centre: centres of the windows, m, (n, 2).
       distance: distances of moving boxes from the start of their paths, m, (n, M).
       direction: 1 where they move towards the end, -1 towards the start, (n, M).
-      start, axis, length, half_size, speed: of the paths and the moving boxes; see `Movers`.
+      start, axis, length, half_size, speed: fields of the moving boxes and their paths; see `Movers`.
     """
 
     def __init__(self, n: int, capacity: Capacity) -> None:
@@ -110,7 +110,7 @@ class Surroundings:
 
         Args:
           env_id: number of the simulation.
-          ground: of a terrain that fits the capacity given to the constructor.
+          ground: ground whose terrain fits the capacity given to the constructor.
           xy: position of the character, m.
 
         Raises:

@@ -27,11 +27,11 @@ class Trail:
     surrounding ground is above its mean, the least width of the path is larger.
 
     Attributes:
-      start, end: of the existing segments, m, (k, 2).
-      heading: rad, (k,).
-      width: m, (k,).
-      height: m, (k,).
-      offset: of the noise around the trail, (2,).
+      start, end: end points of the existing segments, m, (k, 2).
+      heading: heading of each segment, rad, (k,).
+      width: width of each segment, m, (k,).
+      height: height of each segment, m, (k,).
+      offset: offset of the noise around the trail, (2,).
     """
 
     def __init__(self, parameters: dict[str, float], rng: np.random.Generator) -> None:

@@ -59,16 +59,16 @@ class SpatialWindows(NamedTuple):
     are changed in place and never replaced.
 
     Attributes:
-      level: of the plane, (n,) m; -inf if there is none.
+      level: level of the plane, (n,) m; -inf if there is none.
       centre: centres of the windows, (n, 2) m.
       grid: heights of vertices, along x, then along y, (n, VERTICES**2) m, single precision.
       boxes: values in the columns above, (n, B, 8); HALF_X is -1 where there is no box.
-      box_velocity: of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
+      box_velocity: velocity of belts, (n, B, 2) m/s; (n, 0, 2) if there are none.
       bins: begin and end of each bin in bin_boxes, (n, bins along x, along y, 2) int32.
       bin_boxes: for every bin the indices of the boxes that touch it, (n, k) int32.
       mover_start: where the path of a moving box starts, (n, M, 2) m.
       mover_axis: unit vector along the path, (n, M, 2).
-      mover_length: of the path, (n, M) m.
+      mover_length: length of the path, (n, M) m.
       mover_half_size: (n, M, 2) m; -1 where there is no box.
       mover_top: (n, M) m.
       mover_speed: (n, M) m/s.
@@ -246,7 +246,7 @@ def keep_moving(
     Args:
       i: number of the simulation.
       x, y: position of its character, m.
-      qpos, qvel: of all simulations; qvel is written.
+      qpos, qvel: positions and velocities of all simulations; qvel is written.
       ground: windows of all simulations.
 
     Returns:
