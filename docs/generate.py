@@ -548,6 +548,9 @@ def solved() -> str:
             next(run for run in entry['runs'] if run['seed'] == entry['shipped'])['evaluation']
             for entry in entries
         ]
+        found += [
+            stored('shared')[spec.id]['evaluation'] for spec in specs if spec.id in stored('shared')
+        ]
         middle = {
             name: statistics.median(each[name] for each in found)
             for name in ('normalized_return', 'completion_rate', 'distance')
@@ -560,11 +563,11 @@ def solved() -> str:
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
-        'Medians over the trained policies of each family, each evaluated without noise in 50 '
-        'episodes (gaits: 200): the return divided by its maximum, the share of episodes that lasted '
-        'to the end, and the mean distance.'
+        'Medians over the environments of each family that have a policy, each evaluated without noise '
+        'in 50 episodes (gaits: 200): the return divided by its maximum, the share of episodes that '
+        'lasted to the end, and the mean distance.'
     )
-    header = ('family', 'trained', 'return', 'complete', 'distance')
+    header = ('family', 'with a policy', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
 
 

@@ -88,8 +88,10 @@ class Settings:
 
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 57344},
-    'FSM_Hopper2D_*': {'relief': 2.0},
-    'FSM_Goat2D_*': {'relief': 1.6},
+    'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
+    'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
+    'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
+    'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
 }
 CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hold as float32
 CLIP = 5.0  # bound of the networks' inputs, in standard deviations

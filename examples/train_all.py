@@ -61,11 +61,16 @@ ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # of the table of runs
 MEMORY = 1.5e9  # bytes that a run may use
 GAITS = (  # that are compared with their default gaits
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
-    'FSM_Biped2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Gaps-v0',
+    'FSM_Biped2D_Terrain_Gaps-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
+    'FSM_Hopper2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Mixed_Easy-v0',
+    'FSM_Goat2D_Terrain_Variable_Steps-v0',
 )  # fmt: skip
 
 
-LEARNT = ('FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0')  # not searched
+LEARNT = (  # not searched
+    'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
+    'FSM_Hopper2D_Terrain_Mixed_Easy-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0',
+)  # fmt: skip
 
 
 def compared(spec: catalogue.EnvSpec) -> bool:
