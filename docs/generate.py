@@ -161,6 +161,7 @@ def home() -> str:
                 ('[Make your own: clips](make_your_own_clips.md)', 'custom clips from motion files'),
                 ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
                 ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
+                ('[Clusters](cluster.md)', 'Ray: evaluation, sequences and training on several machines'),
                 ('[Reliability](reliability.md)', 'guarantees, threads, untrusted files, random tests'),
                 ('[Results](results.md)', 'evaluation of the shipped policies'),
                 ('[Comparison with the papers](findings.md)', 'claims of the papers, and results obtained here'),

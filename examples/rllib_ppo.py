@@ -1,8 +1,9 @@
 """Trains a policy with RLlib's PPO: each runner is a process that steps many simulations.
 
-This also works on several machines: install the same packages on all, run `ray start --head` on
-one, and the command that it prints on the others. This program, run on the first machine, uses all
-of them, and `--runners` may be the total number of their cores. Runner i has the seed s + i, so
+    python examples/rllib_ppo.py --environment PD_Biped2D_Flat-v0 --runners 2
+
+On several machines (`docs/cluster.md` describes how to start a cluster) the runners are spread over
+all of them; `--runners` may be the total number of cores less one. Runner i has the seed s + i, so
 runners have different terrain. An episode has at most 256 steps of reward at most 1. Needs
 `pip install 'trl_suite[rllib]'`.
 """
@@ -23,8 +24,8 @@ NOISE = (
 )
 
 
-def configuration(id_, runners=2, num_envs=32, seed=0):
-    """Returns PPO whose runners step `num_envs` simulations on one core each."""
+def on_runners(algorithm, id_, runners=2, num_envs=32, seed=0):
+    """Returns an `AlgorithmConfig` whose runners step `num_envs` simulations on one core each."""
 
     def less_noise(algorithm, **_):
         algorithm.learner_group.foreach_learner(
@@ -37,26 +38,32 @@ def configuration(id_, runners=2, num_envs=32, seed=0):
         )
 
     return (
-        PPOConfig()
+        algorithm
         .environment(f'trl_suite.gym:trl_suite/{id_}', env_config={'num_threads': 1})
         .env_runners(
             num_env_runners=runners, num_envs_per_env_runner=num_envs, rollout_fragment_length=STEPS,
             gym_env_vectorize_mode=VectorizeMode.VECTOR_ENTRY_POINT,
             env_to_module_connector=lambda env, spaces, device: MeanStdFilter(),
         )
-        .training(
-            train_batch_size_per_learner=STEPS * num_envs * runners, minibatch_size=512, num_epochs=5,
-            lr=3e-4, gamma=0.95, lambda_=0.95, clip_param=0.2, use_kl_loss=False, grad_clip=0.5,
-            vf_loss_coeff=0.5, vf_clip_param=math.inf,
-        )
         .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[256, 256], free_log_std=True))
         .callbacks(on_algorithm_init=less_noise)
+        .fault_tolerance(restart_failed_env_runners=True)
         .debugging(seed=seed, log_level='ERROR')
     )  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def configuration(id_, runners=2, num_envs=32, seed=0):
+    """Returns PPO, which updates when all runners have taken `STEPS` steps."""
+    return on_runners(PPOConfig(), id_, runners, num_envs, seed).training(
+        train_batch_size_per_learner=STEPS * num_envs * runners, minibatch_size=512, num_epochs=5,
+        lr=3e-4, gamma=0.95, lambda_=0.95, clip_param=0.2, use_kl_loss=False, grad_clip=0.5,
+        vf_loss_coeff=0.5, vf_clip_param=math.inf,
+    )  # fmt: skip
+
+
+def main(configuration, description):
+    """Trains as the command line says, and prints returns."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument('--environment', default='PD_Biped2D_Flat-v0', help='id')
     parser.add_argument('--runners', type=int, default=2, help='at most the number of cores')
     parser.add_argument('--updates', type=int, default=50)
@@ -67,11 +74,13 @@ def main() -> None:
     ).build_algo()
     for _ in range(arguments.updates):
         found = algorithm.train()['env_runners']
-        steps, mean = found['num_env_steps_sampled_lifetime'], found['episode_return_mean']
+        # APPO's first report may come before the first samples.
+        steps = found.get('num_env_steps_sampled_lifetime', 0)
+        mean = found.get('episode_return_mean', math.nan)
         print(f'{steps:8.0f} steps, return {mean:5.1f}', flush=True)
     algorithm.stop()
 
 
 if __name__ == '__main__':
     begin_script()
-    main()
+    main(configuration, __doc__.splitlines()[0])

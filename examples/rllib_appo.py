@@ -1,0 +1,33 @@
+"""Trains a policy with RLlib's APPO: asynchronous PPO, whose learner waits for no runner.
+
+    python examples/rllib_appo.py --environment PD_Biped2D_Flat-v0 --runners 16 --updates 200
+
+For clusters with many or unequal nodes: samples of slow runners are a little older, which V-trace,
+as in IMPALA (Espeholt et al. 2018, arXiv:1802.01561), corrects, and a lost runner delays nobody. Runners and
+simulations are those of `rllib_ppo.py`. An update is what RLlib reports at least every 5 s. Needs
+`pip install 'trl_suite[rllib]'`.
+"""
+
+import rllib_ppo
+from ray.rllib.algorithms.appo import APPOConfig
+
+from trl_suite.util.program import begin_script
+
+REPORT = 5  # s between reports
+
+
+def configuration(id_, runners=2, num_envs=32, seed=0):
+    """Returns APPO, whose batch has `STEPS` steps of all simulations of one runner."""
+    return (
+        rllib_ppo.on_runners(APPOConfig(), id_, runners, num_envs, seed)
+        .training(
+            train_batch_size_per_learner=rllib_ppo.STEPS * num_envs, lr=3e-4, gamma=0.95,
+            clip_param=0.2, use_kl_loss=False, grad_clip=0.5, vf_loss_coeff=0.5, entropy_coeff=0.0,
+        )
+        .reporting(min_time_s_per_iteration=REPORT)
+    )  # fmt: skip
+
+
+if __name__ == '__main__':
+    begin_script()
+    rllib_ppo.main(configuration, __doc__.splitlines()[0])
