@@ -19,7 +19,7 @@ key, if it has
 * a key that its type does not use (of another type, or misspelt), or the same key twice;
 * a value that is not a finite number;
 * a range whose Min is above its Max, be they given or defaults;
-* a negative spacing, width or count, or a value beyond `generators.LIMITS`. Zero is allowed: every
+* a negative spacing, width or count, or a value beyond `checks.LIMITS`. Zero is allowed: every
   feature has at least one vertex, so every generator terminates.
 
 The presets are the original's terrain files under their original names (planar ones in PRESETS,
@@ -46,7 +46,8 @@ import types
 from collections.abc import Mapping
 from typing import Any
 
-from trl_suite.terrain.planar.generators import GENERATORS, check
+from trl_suite.terrain.checks import check
+from trl_suite.terrain.planar.generators import GENERATORS
 from trl_suite.terrain.spatial.generators import GENERATORS3D
 from trl_suite.terrain.spatial.layout import GRID
 from trl_suite.util.errors import unknown

@@ -27,8 +27,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trl_suite.terrain.checks import Parameters, check_new
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import GENERATORS, Parameters, check_new, register_line
+from trl_suite.terrain.planar.generators import GENERATORS, register_line
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util.compiled import compiled_loop

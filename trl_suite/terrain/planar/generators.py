@@ -1,17 +1,10 @@
-"""The planar terrain generators: random features in sequence, optionally on rolling ground.
+"""Generators of planar terrain: their results, and the registry of terrain types.
 
 A planar terrain is a polyline with vertices SPACING apart. A generator is a function of
 (parameters, length in m, random generator) that returns a `Profile`: the vertices to append to the
 existing ground, whose last vertex is at height 0. It repeats its feature until the length is
-reached, so it overshoots by up to one feature. All features consist of two primitives:
-
-* a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
-  flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m wide at its crest
-  and 0.225 m at its foot. The level of the ground is unchanged.
-* a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
-
-The random processes are those of the original's terrain generator (Terrain RL Simulator, 2018):
-equal in distribution, not draw by draw. `register` adds a generator:
+reached, so it overshoots by up to one feature. `features.py` has the original's terrain types.
+`register` adds a type:
 
     @register('var2d_saw', {'ToothW': 1.0, 'ToothHMin': 0.1, 'ToothHMax': 0.2})
     def saw(parameters, length, rng):
@@ -26,67 +19,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
 import types
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.util import random
-from trl_suite.util.compiled import compiled, compiled_inline
+from trl_suite.terrain.checks import NO_PARAMETERS, Parameters, check, check_new
 from trl_suite.util.errors import unknown
 
 SPACING = 0.025  # m between vertices
 STEEP = 3.0  # rise per m; steeper cells of a line are vertical faces
-LEDGE = 0.1  # m; tread of the intermediate ledges of a cliff
 LONGEST = 1e6  # m; largest length of a stretch, and largest |x| of a query
-
-# Defaults of the parameters, by feature (those of the original).
-GAPS = {'GapSpacingMin': 4, 'GapSpacingMax': 7, 'GapWMin': 0.5, 'GapWMax': 2,
-        'GapHMin': -2, 'GapHMax': -2}  # fmt: skip
-WALLS = {'WallSpacingMin': 6, 'WallSpacingMax': 8, 'WallWMin': 0.2, 'WallWMax': 0.2,
-         'WallHMin': 0.25, 'WallHMax': 0.5}  # fmt: skip
-STEPS = {'StepSpacingMin': 5, 'StepSpacingMax': 7, 'StepH0Min': 0.1, 'StepH0Max': 0.4,
-         'StepH1Min': -0.4, 'StepH1Max': -0.1}  # fmt: skip
-NARROW_GAPS = {'NarrowGapSpacingMin': 3, 'NarrowGapSpacingMax': 6,
-               'NarrowGapDistMin': 0.1, 'NarrowGapDistMax': 0.4,
-               'NarrowGapWMin': 0.15, 'NarrowGapWMax': 0.5,
-               'NarrowGapDepthMin': -2, 'NarrowGapDepthMax': -2,
-               'NarrowGapCountMin': 1, 'NarrowGapCountMax': 4}  # fmt: skip
-CLIFFS = {'CliffSpacingMin': 5, 'CliffSpacingMax': 7, 'CliffH0Min': 0.1, 'CliffH0Max': 0.4,
-          'CliffH1Min': -0.4, 'CliffH1Max': -0.1, 'CliffMiniCountMax': 0}  # fmt: skip
-BUMPS = {'BumpHMin': 0, 'BumpHMax': 0.03}
-SLOPES = {'SlopeDeltaRange': 0.25, 'SlopeDeltaMin': -0.35, 'SlopeDeltaMax': 0.35}
-
-# Valid values, by name without Min or Max: lengths and counts are not negative, and upper bounds
-# limit the memory of a stretch of ground. Names not listed here may be any number.
-_LENGTH, _COUNT, _HEIGHT, _SLOPE = (0.0, 1e3), (0.0, 100.0), (-1e3, 1e3), (-100.0, 100.0)
-LIMITS = {
-    **dict.fromkeys(('GapSpacing', 'WallSpacing', 'StepSpacing', 'CliffSpacing'), _LENGTH),
-    **dict.fromkeys(('NarrowGapSpacing', 'NarrowGapDist'), _LENGTH),
-    **dict.fromkeys(('GapW', 'WallW', 'NarrowGapW'), _LENGTH),
-    **dict.fromkeys(('NarrowGapCount', 'CliffMiniCount'), _COUNT),
-    **dict.fromkeys(('GapH', 'WallH', 'StepH0', 'StepH1', 'BumpH'), _HEIGHT),
-    **dict.fromkeys(('CliffH0', 'CliffH1', 'NarrowGapDepth'), _HEIGHT),
-    **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange'), _SLOPE),
-    # Three-dimensional ground.
-    **dict.fromkeys(('PathWidth0', 'PathWidth1', 'PathWidthDeltaStdev', 'PathTurnLength'), _LENGTH),
-    **dict.fromkeys(('ConveyorStripLength', 'ConveyorSpacing'), _LENGTH),
-    **dict.fromkeys(('ObstacleWidth0', 'ObstacleWidth1'), (0.0, 40.0)),
-    **dict.fromkeys(('ObstacleHeight0', 'ObstacleHeight1'), (0.0, 1e3)),
-    **dict.fromkeys(('ObstacleSpeed0', 'ObstacleSpeed1'), (1e-6, 100.0)),
-    **dict.fromkeys(('PathHeight0', 'PathHeight1', 'StepHeight'), (-20.0, 20.0)),
-    **dict.fromkeys(('NumObstacles', 'ConveyorNumStrips', 'ConveyorNumSlices'), _COUNT),
-    'PathLength': (0.2, 1e3),
-    'PathMaxTurnDelta': (0.0, 2.0),
-    'TrailStepProb': (0.0, 1.0),
-    'ObstacleDensity': (0.0, 2.0),
-    'ObstacleSpeedLerpPow': (0.0, 100.0),
-    'Slope': (-10.0, 10.0),
-    # Ground that is a function of x, or of x and y.
-    'StartSpan': (0.0, 1e5),
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,8 +47,6 @@ class Profile:
     vertical: np.ndarray
 
 
-Parameters = Mapping[str, float]
-_NONE: Parameters = types.MappingProxyType({})
 Function = Callable[[Parameters, float, np.random.Generator], Profile]
 
 
@@ -124,46 +66,8 @@ _generators: dict[str, Generator] = {}
 GENERATORS: Mapping[str, Generator] = types.MappingProxyType(_generators)
 
 
-def check(
-    where: str, values: Mapping[str, object], defaults: Parameters = _NONE
-) -> dict[str, float]:
-    """Returns parameter values as floats.
-
-    Args:
-      where: the owner of the values, for the message.
-      values: name -> number.
-      defaults: values of the parameters that are not given.
-
-    Raises:
-      ValueError: a value is not a finite number or is outside LIMITS, or a Min is above its Max.
-    """
-    checked = {}
-    for key, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise ValueError(f'{where}: {key} must be a number, not {value!r}')
-        low, high = LIMITS.get(key.removesuffix('Min').removesuffix('Max'), (-math.inf, math.inf))
-        try:
-            checked[key] = float(value)
-        except OverflowError:
-            checked[key] = math.inf
-        if not math.isfinite(checked[key]):
-            raise ValueError(f'{where}: {key} must be finite, not {value!r}')
-        if not low <= checked[key] <= high:
-            raise ValueError(f'{where}: {key} must be from {low:g} to {high:g}, not {value!r}')
-    complete = {**defaults, **checked}
-    for key in complete:
-        top = key.removesuffix('Min') + 'Max'
-        if key.endswith('Min') and complete[key] > complete.get(top, math.inf):
-            bottom, top = (
-                f'{name} {complete[name]:g}{"" if name in checked else " (the default)"}'
-                for name in (key, top)
-            )
-            raise ValueError(f'{where}: {bottom} is above {top}; a range runs from Min to Max')
-    return checked
-
-
 def register(
-    type_name: str, defaults: Parameters = _NONE, *, replace: bool = False
+    type_name: str, defaults: Parameters = NO_PARAMETERS, *, replace: bool = False
 ) -> Callable[[Function], Function]:
     """Decorates a function as the generator of a new terrain type.
 
@@ -185,34 +89,6 @@ def register(
         return function
 
     return add
-
-
-def check_new(
-    type_name: str, known: Callable[..., Any] | None, function: Callable[..., Any], replace: bool
-) -> None:
-    """Checks that a terrain type may be registered.
-
-    Args:
-      type_name: name of the type.
-      known: the function that is registered already, if any.
-      function: the one that is to be.
-      replace: whether the user wants it replaced in any case.
-
-    Raises:
-      ValueError: the name belongs to a function that is written elsewhere. Of a lambda nobody knows
-        where it is written.
-    """
-    if known is None or known is function or replace:
-        return
-    places = [
-        (getattr(each, '__module__', ''), getattr(each, '__qualname__', '<lambda>'))
-        for each in (known, function)
-    ]
-    if places[0] != places[1] or places[0][1].endswith('<lambda>'):
-        raise ValueError(
-            f'terrain type {type_name!r} exists; pass replace=True to replace it, or choose another '
-            'name'
-        )
 
 
 def register_line(type_name: str, line: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -266,264 +142,3 @@ def draw(
 def cells(length: float) -> int:
     """Returns the number of cells of a length in m: rounded up, except for rounding errors."""
     return math.ceil(length / SPACING - 1e-9)
-
-
-# Features: each function draws one and writes it as runs of equal height, (number of vertices,
-# height), in order. Heights are relative to the ground before the feature; the last run is the
-# ground after it.
-
-
-class Runs(NamedTuple):
-    """Preallocated arrays for runs of equal height."""
-
-    counts: np.ndarray
-    levels: np.ndarray
-
-
-# Features, and the index of their first parameter among those of the type. A Max follows its Min.
-_GAP, _STEP, _WALL, _MIXED, _NARROW_GAPS, _CLIFF = range(6)
-_MIXTURE: Parameters = {**GAPS, **WALLS, **STEPS}
-_SPACING, _WIDTH, _TOP = (list(GAPS).index(f'Gap{name}Min') for name in ('Spacing', 'W', 'H'))
-_RISES = list(STEPS).index('StepH0Min'), list(STEPS).index('StepH1Min')
-_DISTANCE, _NARROW_WIDTH, _DEPTH, _COUNTS = (
-    list(NARROW_GAPS).index(f'NarrowGap{name}Min') for name in ('Dist', 'W', 'Depth', 'Count')
-)
-_LEDGES = list(CLIFFS).index('CliffMiniCountMax')
-_FIRST_WALL, _FIRST_STEP = len(GAPS), len(GAPS) + len(WALLS)
-_NAMES = tuple(tuple(names) for names in (GAPS, STEPS, WALLS, _MIXTURE, NARROW_GAPS, CLIFFS))
-_MOST_RUNS = 3 * round(_COUNT[1]) + 3  # of a feature
-
-
-@compiled_inline
-def _cells(length: float) -> int:
-    return math.ceil(length / SPACING - 1e-9)
-
-
-@compiled_inline
-def _uniform(of: int, parameters: np.ndarray, bits: int) -> float:
-    """Draws from the range of a parameter."""
-    return parameters[of] + (parameters[of + 1] - parameters[of]) * random.draw(bits)
-
-
-@compiled_inline
-def _integer(low: float, high: float, bits: int) -> int:
-    """Draws an integer, both ends included; interpolated counts are truncated only here."""
-    first, last = int(low), int(high)
-    return first + int((last - first + 1) * random.draw(bits))
-
-
-@compiled_inline
-def _add(number: int, count: int, level: float, runs: Runs) -> int:
-    """Appends a run; returns the new number of runs."""
-    runs.counts[number], runs.levels[number] = count, level
-    return number + 1
-
-
-@compiled
-def _box(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """Adds a gap or a wall, whose parameters begin at index `first`; returns the number of runs."""
-    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
-    width = _cells(_uniform(first + _WIDTH, parameters, bits))
-    number = _add(number, spacing, 0.0, runs)
-    number = _add(number, width, _uniform(first + _TOP, parameters, bits), runs)
-    return _add(number, 1, 0.0, runs)
-
-
-@compiled
-def _rise_range(first: int, parameters: np.ndarray, bits: int) -> int:
-    """Chooses one of the two ranges of a signed rise.
-
-    A range whose ends are both 0 is switched off; of two active ranges, each has probability 1/2.
-    The sign of the rise is that of the range: with two positive ranges the ground only ascends.
-    """
-    low, high = first + _RISES[0], first + _RISES[1]
-    down = parameters[high] != 0.0 or parameters[high + 1] != 0.0
-    if (parameters[low] != 0.0 or parameters[low + 1] != 0.0) != down:
-        _integer(0.0, 0.0, bits)
-        return high if down else low
-    return high if _integer(0.0, 1.0, bits) else low
-
-
-@compiled
-def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    rise = _rise_range(first, parameters, bits)
-    spacing = _cells(_uniform(first + _SPACING, parameters, bits))
-    number = _add(number, spacing, 0.0, runs)
-    return _add(number, 1, _uniform(rise, parameters, bits), runs)
-
-
-@compiled
-def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """A cluster of gaps with stepping stones; all gap depths are below the same surface."""
-    spacing = first + _SPACING
-    low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
-    for _ in range(_integer(low, high, bits)):
-        number = _add(number, _cells(_uniform(spacing, parameters, bits)), 0.0, runs)
-        width = _cells(_uniform(first + _NARROW_WIDTH, parameters, bits))
-        number = _add(number, width, _uniform(first + _DEPTH, parameters, bits), runs)
-        number = _add(number, 1, 0.0, runs)
-        spacing = first + _DISTANCE
-    return number
-
-
-@compiled
-def _cliff(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """One tall riser, broken by up to CliffMiniCountMax ledges at random heights."""
-    rise = _rise_range(first, parameters, bits)
-    tread = _uniform(first + _SPACING, parameters, bits)
-    total, level = _uniform(rise, parameters, bits), 0.0
-    for _ in range(_integer(0.0, parameters[first + _LEDGES], bits)):
-        number = _add(number, _cells(tread), level, runs)
-        level += (total - level) * random.draw(bits)
-        number = _add(number, 1, level, runs)
-        tread = LEDGE
-    number = _add(number, _cells(tread), level, runs)
-    return _add(number, 1, total, runs)
-
-
-@compiled
-def _draw_feature(kind: int, number: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    first = 0
-    if kind == _MIXED:
-        kind = _integer(float(_GAP), float(_WALL), bits)
-        first = _FIRST_STEP if kind == _STEP else _FIRST_WALL if kind == _WALL else 0
-    if kind == _STEP:
-        return _step(number, first, parameters, bits, runs)
-    if kind == _NARROW_GAPS:
-        return _narrow_gaps(number, first, parameters, bits, runs)
-    if kind == _CLIFF:
-        return _cliff(number, first, parameters, bits, runs)
-    return _box(number, first, parameters, bits, runs)
-
-
-@compiled
-def _draw_features(
-    kind: int, missing: int, number: int, parameters: np.ndarray, bits: int, counts: np.ndarray,
-    levels: np.ndarray,
-) -> tuple[int, int]:  # fmt: skip
-    """Draws features until no vertices are missing, or the arrays are full.
-
-    Returns:
-      The number of runs, and the number of vertices that are still missing.
-    """
-    runs = Runs(counts, levels)
-    base = levels[number - 1] if number else 0.0
-    while missing > 0 and number + _MOST_RUNS <= len(counts):
-        before, number = number, _draw_feature(kind, number, parameters, bits, runs)
-        for k in range(before, number):
-            levels[k] += base
-            missing -= counts[k]
-        base = levels[number - 1]
-    return number, missing
-
-
-@compiled
-def _spread(
-    number: int, counts: np.ndarray, levels: np.ndarray, heights: np.ndarray, vertical: np.ndarray
-) -> None:
-    """Writes the vertices of runs; where a run begins at another height, the cell is vertical."""
-    i, before = 0, 0.0
-    for k in range(number):
-        for j in range(i, i + counts[k]):
-            heights[j], vertical[j] = levels[k], False
-        if i < len(vertical):  # a run may have no vertices
-            vertical[i] = levels[k] != before
-        i, before = i + counts[k], levels[k]
-
-
-def _repeat(kind: int, parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Repeats a feature until the length is reached; every feature has at least one vertex."""
-    wanted = missing = cells(length)
-    values = np.array([parameters[name] for name in _NAMES[kind]], float)
-    bits, number = random.address(rng), 0
-    counts, levels = np.empty(_MOST_RUNS + missing, int), np.empty(_MOST_RUNS + missing)
-    while True:
-        number, missing = _draw_features(kind, missing, number, values, bits, counts, levels)
-        if missing <= 0:
-            break
-        counts, levels = np.resize(counts, 2 * len(counts)), np.resize(levels, 2 * len(levels))
-    heights, vertical = np.empty(wanted - missing), np.empty(wanted - missing, bool)
-    _spread(number, counts, levels, heights, vertical)
-    return Profile(heights, vertical)
-
-
-# Overlays: added to the heights of a stretch.
-
-
-def _sloped(profile: Profile, parameters: Parameters, rng: np.random.Generator) -> Profile:
-    """Adds a mean-reverting random walk of the slope, which starts at slope 0 in every stretch.
-
-    Per vertex the slope changes by up to SlopeDeltaRange: down with a probability that grows
-    from 0 to 1 as the slope crosses the band from SlopeDeltaMin to SlopeDeltaMax, else up.
-    A band of width 0 adds nothing.
-    """
-    low, high = parameters['SlopeDeltaMin'], parameters['SlopeDeltaMax']
-    if low == high:
-        return profile
-    count = len(profile.heights)
-    changes, thresholds = rng.random((2, count))
-    changes *= abs(parameters['SlopeDeltaRange'])
-    thresholds = low + (high - low) * thresholds
-    heights = np.empty(count)
-    _walk(profile.heights, changes, thresholds, heights)
-    return Profile(heights, profile.vertical)
-
-
-@compiled
-def _walk(
-    heights: np.ndarray, changes: np.ndarray, thresholds: np.ndarray, sloped: np.ndarray
-) -> None:
-    """Adds a random walk of the slope to heights."""
-    slope = offset = 0.0
-    for k in range(len(heights)):
-        slope = slope - changes[k] if slope > thresholds[k] else slope + changes[k]
-        offset += slope
-        sloped[k] = heights[k] + offset * SPACING
-
-
-@register('var2d_flat')
-def flat(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Level ground."""
-    count = cells(length)
-    return Profile(np.zeros(count), np.zeros(count, dtype=bool))
-
-
-@register('var2d_bumps', BUMPS)
-def bumps(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Level ground with white noise: every vertex but the last is moved up or down."""
-    profile = flat(parameters, length, rng)
-    sizes, coins = rng.random((2, len(profile.heights) - 1))
-    low, high = parameters['BumpHMin'], parameters['BumpHMax']
-    profile.heights[:-1] = np.where(coins < 0.5, 1, -1) * (low + (high - low) * sizes)
-    return profile
-
-
-@register('var2d_slopes', SLOPES)
-def slopes(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Rolling ground."""
-    return _sloped(flat(parameters, length, rng), parameters, rng)
-
-
-@register('var2d_cliffs', CLIFFS)
-def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-    """Tall risers broken by ledges."""
-    return _repeat(_CLIFF, parameters, length, rng)
-
-
-def _register_feature(name: str, kind: int, defaults: Parameters) -> None:
-    """Registers a feature twice: on level ground and on rolling ground."""
-
-    @register(f'var2d_{name}', defaults)
-    def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-        return _repeat(kind, parameters, length, rng)
-
-    @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
-    def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
-        return _sloped(level(parameters, length, rng), parameters, rng)
-
-
-_register_feature('gaps', _GAP, GAPS)
-_register_feature('walls', _WALL, WALLS)
-_register_feature('steps', _STEP, STEPS)
-_register_feature('mixed', _MIXED, _MIXTURE)
-_register_feature('narrow_gaps', _NARROW_GAPS, NARROW_GAPS)

@@ -11,15 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from trl_suite.terrain.parameters import Terrain
-from trl_suite.terrain.planar.generators import (
-    GENERATORS,
-    LONGEST,
-    SPACING,
-    STEEP,
-    cells,
-    draw,
-    flat,
-)
+from trl_suite.terrain.planar.features import flat
+from trl_suite.terrain.planar.generators import GENERATORS, LONGEST, SPACING, STEEP, cells, draw
 from trl_suite.util.compiled import compiled
 
 STRETCH = 20.0  # m; nominal length generated at once; slopes restart in every stretch

@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.terrain.planar.generators import _NONE, Parameters, check, check_new
+from trl_suite.terrain.checks import NO_PARAMETERS, Parameters, check, check_new
 from trl_suite.terrain.spatial import noise
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, GridFunction, Layout, Movers, boxes
 from trl_suite.terrain.spatial.trail import AMPLITUDE, FREQUENCY, Trail
@@ -90,7 +90,7 @@ GENERATORS3D: Mapping[str, Generator3D] = types.MappingProxyType(_generators)
 
 
 def register3d(
-    type_name: str, defaults: Parameters = _NONE, *, replace: bool = False
+    type_name: str, defaults: Parameters = NO_PARAMETERS, *, replace: bool = False
 ) -> Callable[[Function3D], Function3D]:
     """Decorates a function as the generator of a new three-dimensional terrain type.
 
