@@ -213,7 +213,8 @@ def _picture(
         for number, each in enumerate(axes):
             panel(each, number, first)
         axes[0].set_ylabel(label)
-        axes[0].legend(fontsize=6)
+        handles, names = axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, fontsize=8, loc='outside lower center', ncols=len(names))
         with files.replacing(path) as part:
             figure.savefig(part, metadata={'Date': None})
         pyplot.close(figure)
