@@ -5,6 +5,7 @@ import io
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import textwrap
@@ -15,9 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
+from numba.core import event
 
 import trl_suite
 from trl_suite.util import compiled as module
+from trl_suite.util import interrupts
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
 PACKAGE = pathlib.Path(trl_suite.__file__).parent
@@ -149,6 +152,77 @@ class FunctionTest(parameterized.TestCase):
                     with announcer.compiling():
                         time.sleep(each)
             self.assertLen(stream.getvalue().splitlines(), lines)
+
+
+@compiled
+def double(x):
+    return 2.0 * x
+
+
+class InterruptTest(parameterized.TestCase):
+    """Signals that arrive while Numba compiles; see `trl_suite.util.interrupts`."""
+
+    def setUp(self):
+        super().setUp()
+        self.enter_context(unittest.mock.patch.object(module, 'cache_folder', lambda: None))
+
+    def _compile_and_signal(self, number, kind='numba:run_pass'):
+        """Returns a function that calls another; a signal arrives while it is compiled."""
+        outer = compiled(lambda x: double(x) + 1.0)
+        after = []
+
+        class Sender(event.Listener):
+            def on_start(self, _):
+                if not after:
+                    signal.raise_signal(number)
+                    after.append('still running')
+
+            def on_end(self, _):
+                pass
+
+        module._numba()
+        with event.install_listener(kind, Sender()):
+            try:
+                outer(1.0)
+            finally:
+                self.assertEqual(after, ['still running'])
+        return outer
+
+    @parameterized.parameters('numba:run_pass', 'numba:compile')
+    def test_an_interrupt_waits_for_the_end_of_a_pass(self, kind):
+        before = signal.getsignal(signal.SIGINT)
+        with self.assertRaises(KeyboardInterrupt):
+            self._compile_and_signal(signal.SIGINT, kind)
+        self.assertIs(signal.getsignal(signal.SIGINT), before)
+        self.assertEqual(compiled(lambda x: 3.0 * x)(2.0), 6.0)
+
+    @parameterized.parameters(*interrupts.SIGNALS)
+    def test_a_users_handler_is_called_once(self, number):
+        received = []
+        before = signal.signal(number, lambda number, frame: received.append(number))
+        try:
+            self.assertEqual(self._compile_and_signal(number)(2.0), 5.0)
+        finally:
+            signal.signal(number, before)
+        self.assertEqual(received, [number])
+
+    def test_an_interrupted_function_compiles_at_the_next_call(self):
+        function = compiled(lambda x: x - 1.0)
+
+        class Sender(event.Listener):
+            def on_start(self, _):
+                signal.raise_signal(signal.SIGINT)
+
+            def on_end(self, _):
+                pass
+
+        module._numba()
+        with (
+            event.install_listener('numba:run_pass', Sender()),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            function(1.0)
+        self.assertEqual(function(1.0), 0.0)
 
 
 class CacheTest(FolderTest):

@@ -41,6 +41,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from trl_suite.util import interrupts
+
 PATIENCE = 2.0  # s; if compiling takes longer, a message is printed on a terminal
 UNUSED = 30 * 86400.0  # s; folders of other source versions that were unused for longer are removed
 _PREFIX = 'trl_suite-'
@@ -158,9 +160,11 @@ _setting = threading.Lock()
 
 @functools.cache
 def _numba() -> Any:
-    """Imports Numba and registers the type of `Compiled` objects in compiled functions."""
+    """Imports Numba, postpones interrupts while it compiles, and registers the type of `Compiled`."""
     import numba
     from numba.extending import typeof_impl
+
+    interrupts.postpone_while_compiling()
 
     @typeof_impl.register(Compiled)
     def type_of(value: Compiled, _: Any) -> Any:
