@@ -4,13 +4,15 @@
 
 Prints the seconds of every repetition, and of processors if this runs in a control group of its own (for
 example by `systemd-run --scope`), and their medians. Variants alternate. The start of Ray is measured by
-itself. Repeat once more: the first run compiles. Needs `pip install 'trl_suite[train,cluster]'`.
+itself. Repeat once more: the first run compiles. `projection` computes how long all runs would take on more
+nodes, from the durations in trained/. Needs `pip install 'trl_suite[train,cluster]'`.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import heapq
 import os
 import pathlib
 import pickle
@@ -19,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from ray import cluster_utils
@@ -27,10 +29,13 @@ from ray import cluster_utils
 from trl_suite import evaluation, policies
 from trl_suite.adapters.ray import RayExecutor
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import train_all
+
 LONG = 'PD_Biped2D_Flat-v0'  # the run whose overhead is measured
 MANY = 'PD_Biped2D_[FI]*'  # four runs, one of which follows another
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
+PARTS = 'start', 'overhead', 'nodes', 'evaluation', 'projection'
 
 
 class Spent(NamedTuple):
@@ -82,7 +87,7 @@ def train(pattern: str, samples: float, *words: str) -> Spent:
     """Runs train_all with one run at a time and node."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
-            sys.executable, ROOT / 'examples' / 'train_all.py', '--filter', pattern, '--seeds', '1',
+            sys.executable, train_all.__file__, '--filter', pattern, '--seeds', '1',
             '--jobs', '1', f'--samples={samples}', '--runs', f'{folder}/runs', *words,
         ]  # fmt: skip
         begin = now()
@@ -108,6 +113,35 @@ def training(pattern: str, samples: float, repeats: int, most: int) -> None:
 
     variants = {f'{n} node' + 's' * (n > 1): on(n) for n in range(1, most + 1)}
     compare({'without Ray': local, **variants}, repeats)
+
+
+def projection(counts: Sequence[int]) -> None:
+    """Prints how long all entered runs would take on nodes of one core each, from their own durations.
+
+    Jobs start in the order of train_all as nodes and the policies that they use become available. Starts
+    of processes, evaluations and transfers are left out.
+    """
+    seconds = {
+        (id_, run['seed']): sum(run['curve'][-1]['seconds'].values())
+        for id_ in policies.available()
+        for run in train_all.entries(id_)
+    }
+    waiting_at_first = [job for job in train_all.jobs('*') if job in seconds]
+    for count in counts:
+        waiting, ends, running = list(waiting_at_first), {}, []
+        clock = 0.0
+        while waiting or running:
+            for job in list(waiting):
+                uses = [(other, 1) for other in train_all.needed(job[0]) if (other, 1) in seconds]
+                if len(running) < count and all(
+                    ends.get(each, clock + 1.0) <= clock for each in uses
+                ):
+                    waiting.remove(job)
+                    heapq.heappush(running, (clock + seconds[job], job))
+            clock, job = heapq.heappop(running)
+            ends[job] = clock
+        print(f'  {count:3} nodes: {clock / 3600.0:5.1f} h')
+    print(f'  {len(seconds)} runs, longest {max(seconds.values()) / 3600.0:.1f} h')
 
 
 def evaluate(episodes: int, repeats: int) -> None:
@@ -156,7 +190,7 @@ def compare(variants: dict[str, Callable[[], Spent]], repeats: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('parts', nargs='+', choices=('start', 'overhead', 'nodes', 'evaluation'))
+    parser.add_argument('parts', nargs='+', choices=PARTS)
     parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--samples', type=float, default=2e5, help='of the run of `overhead`')
     parser.add_argument('--few', type=float, default=5e4, help='of each run of `nodes`')
@@ -175,6 +209,8 @@ def main() -> None:
             training(LONG, chosen.samples, chosen.repeats, 1)
         elif part == 'nodes':
             training(MANY, chosen.few, chosen.repeats, 2)
+        elif part == 'projection':
+            projection((1, 2, 16))
         else:
             evaluate(chosen.episodes, chosen.repeats)
 
