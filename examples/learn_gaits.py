@@ -87,7 +87,7 @@ class Settings:
 
 
 OVERRIDES: dict[str, dict[str, Any]] = {
-    'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 57344},
+    'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
     'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
     'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
