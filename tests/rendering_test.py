@@ -14,10 +14,11 @@ import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer
+from dm_control import mujoco as dm_mujoco
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.rendering import overlays
+from trl_suite.rendering import cameras, overlays
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -91,6 +92,63 @@ class FrameTest(parameterized.TestCase):
         self.assertEqual(rendering.frame(environment, 48, 64, camera=-1).shape, (48, 64, 3))
         with self.assertRaisesRegex(ValueError, 'the task NullTask has no reference clip'):
             rendering.frame(environment, 48, 64, camera=-1, ghost=True)
+
+
+class CameraTest(absltest.TestCase):
+    """A camera that follows 3 m behind along y; a wall from y = -4 to -2, and a ball as character."""
+
+    XML = """
+    <mujoco><worldbody>
+      <geom name="wall" type="box" pos="0 -3 0" size="1 1 1"/>
+      <body><freejoint/><geom type="sphere" size=".2"/>
+        <camera name="follows" mode="trackcom" pos="0 -3 0" xyaxes="1 0 0 0 0 1" fovy="40"/>
+      </body>
+    </worldbody></mujoco>"""
+
+    def physics(self):
+        physics = dm_mujoco.Physics.from_xml_string(self.XML)
+        physics.forward()
+        return physics
+
+    def place(self, physics, at):
+        return cameras.free_place(physics.model.ptr, physics.data.ptr, 1, np.array(at, float))
+
+    def test_place_in_a_wall_is_moved_in_front_of_it(self):
+        physics = self.physics()
+        np.testing.assert_allclose(
+            self.place(physics, [0, -3, 0]), [0, -2 + cameras.MARGIN, 0], atol=1e-3
+        )
+
+    def test_place_in_the_open_or_behind_the_wall_is_kept(self):
+        physics = self.physics()
+        for at in ([0, -1, 0], [0, 3, 0], [0, -5, 0], [0, 0, 5]):
+            np.testing.assert_array_equal(self.place(physics, at), at)
+
+    def test_place_is_not_closer_than_the_smallest_distance(self):
+        physics = self.physics()
+        physics.data.qpos[1] = -1.7
+        physics.forward()
+        np.testing.assert_allclose(
+            self.place(physics, [0, -3, 0]), [0, -1.7 - cameras.NEAREST, 0], atol=1e-3
+        )
+
+    def test_character_keeps_its_size_in_the_picture(self):
+        physics = self.physics()
+        camera = physics.model.ptr.cam_fovy
+        with cameras.outside_obstacles(physics, 0):
+            away = -physics.data.cam_xpos[0, 1]
+            self.assertAlmostEqual(
+                away * np.tan(np.deg2rad(camera[0]) / 2), 3 * np.tan(np.deg2rad(20)), places=6
+            )
+        self.assertEqual(camera[0], 40)
+        np.testing.assert_array_equal(physics.data.cam_xpos[0], [0, -3, 0])
+
+    def test_cameras_of_frames_are_in_no_block(self):
+        environment = suite.make('PD_Biped3D_HLC_LargeBlocks-v0', task_kwargs={'random': 3})
+        environment.reset()
+        with mock.patch.object(cameras, 'free_place', wraps=cameras.free_place) as moved:
+            rendering.frame(environment, 48, 64, 'back')
+        moved.assert_called_once()
 
 
 class GhostTest(parameterized.TestCase):

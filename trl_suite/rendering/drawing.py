@@ -83,7 +83,7 @@ def _frame(
     ):
         if not 0 < operator.index(size) <= limit:
             raise ValueError(f'{name} is {size}; expected 1 to {limit} pixels')
-    from trl_suite.rendering import overlays
+    from trl_suite.rendering import cameras, overlays
 
     drawn = overlays.of_task(environment.task, ghost)
     camera_id = _camera(physics, camera)
@@ -93,7 +93,8 @@ def _frame(
         for overlay in drawn:
             overlay(physics, scene)
 
-    return physics.render(height, width, camera_id, scene_callback=add if drawn else None)
+    with cameras.outside_obstacles(physics, camera_id):
+        return physics.render(height, width, camera_id, scene_callback=add if drawn else None)
 
 
 def frames(

@@ -359,10 +359,10 @@ def height_map(
     image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
     # A sample is at the centre of its square.
     behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
-    env_id = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
+    line = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
     column = round(0.5 * SAMPLES * MAP_PIXELS)
     mark = MAP_PIXELS // 2
-    image[env_id - mark : env_id + mark, column - mark : column + mark] = ROOT_COLOUR
+    image[line - mark : line + mark, column - mark : column + mark] = ROOT_COLOUR
     if path is not None:
         _write_png(image, path)
     return image
