@@ -12,10 +12,9 @@ from trl_suite.kinematics.spatial import (
     SpatialBody,
     SpatialMeasurement,
     SpatialState,
-    write_body,
-    write_terrain,
 )
 from trl_suite.kinematics.spatial import measure as measure_body
+from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,

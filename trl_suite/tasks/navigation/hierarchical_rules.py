@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.spatial import polar, write_body, write_terrain
+from trl_suite.kinematics.spatial import polar
 from trl_suite.tasks.components.ball import (
     BallRules,
     dribble,
@@ -20,6 +20,7 @@ from trl_suite.tasks.components.footstep_plan import (
     update_stance,
 )
 from trl_suite.tasks.components.goals import Goals
+from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
     SpatialRules,
