@@ -284,20 +284,28 @@ def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> P
     return _repeat(_CLIFF, parameters, length, rng)
 
 
-def _register_feature(name: str, kind: int, defaults: Parameters) -> None:
-    """Registers a feature twice: on level ground and on rolling ground."""
+def _register_feature(name: str, kind: int, defaults: Parameters, words: str) -> None:
+    """Registers a feature twice: on level ground and on rolling ground.
 
-    @register(f'var2d_{name}', defaults)
+    Args:
+      words: the feature, for the descriptions of both types.
+    """
+
     def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _repeat(kind, parameters, length, rng)
 
-    @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
     def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _sloped(level(parameters, length, rng), parameters, rng)
 
+    level.__doc__, rolling.__doc__ = f'{words} on level ground.', f'{words} on rolling ground.'
+    register(f'var2d_{name}', defaults)(level)
+    register(f'var2d_slopes_{name}', {**defaults, **SLOPES})(rolling)
 
-_register_feature('gaps', _GAP, GAPS)
-_register_feature('walls', _WALL, WALLS)
-_register_feature('steps', _STEP, STEPS)
-_register_feature('mixed', _MIXED, _MIXTURE)
-_register_feature('narrow_gaps', _NARROW_GAPS, NARROW_GAPS)
+
+_register_feature('gaps', _GAP, GAPS, 'Gaps')
+_register_feature('walls', _WALL, WALLS, 'Walls')
+_register_feature('steps', _STEP, STEPS, 'Steps')
+_register_feature('mixed', _MIXED, _MIXTURE, 'Gaps, walls and steps')
+_register_feature(
+    'narrow_gaps', _NARROW_GAPS, NARROW_GAPS, 'Clusters of gaps with stepping stones between them'
+)
