@@ -31,12 +31,6 @@ from trl_suite.util import files, resources
 from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
-FAMILIES = {
-    'imitation': 'Imitation: tracking a clip on flat ground, or in three dimensions',
-    'plaid': 'PLAiD: tracking a clip over terrain',
-    'terrainrl': 'TerrainRL: gaits whose parameters an action sets for one cycle',
-    'deeploco': 'DeepLoco: tracking and planning footsteps',
-}
 NAMES = (  # parts of ids
     ('`FSM`', 'a finite state machine drives the joints; an action sets its parameters'),
     (
@@ -87,7 +81,7 @@ def pages() -> dict[str, str]:
             environments[key] = suite.build_environment(spec, {}, {})
         found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
     found['environments/README.md'] = environment_index()
-    for domain in FAMILIES:
+    for domain in catalogue.FAMILIES:
         found[f'families/{domain}.md'] = family_page(domain)
     for name in characters.CHARACTERS:
         found[f'characters/{name}.md'] = character_page(name)
@@ -253,7 +247,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
 
 def family_page(domain: str) -> str:
     specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
-    title, _, about = FAMILIES[domain].partition(': ')
+    title, _, about = catalogue.FAMILIES[domain].partition(': ')
     cells = (
         (
             f'[{spec.id}](../environments/{spec.id}.md)<br>{spec.description}',
@@ -272,7 +266,7 @@ def family_page(domain: str) -> str:
 def environment_index() -> str:
     shipped = policies.available()
     parts = []
-    for domain, title in FAMILIES.items():
+    for domain, title in catalogue.FAMILIES.items():
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         cells = [
             (
@@ -285,7 +279,7 @@ def environment_index() -> str:
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Environments',
-        f'{len(catalogue.SPECS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
+        f'{len(catalogue.SPECS)} environments in {len(catalogue.FAMILIES)} families; a trained policy is shipped '
         f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
         'character, actuation, terrain or tag, and `trl-suite info ID` prints the content of a page. The ids '
         'are those of the original, including its misspellings.',
@@ -520,7 +514,7 @@ def readme() -> str:
 def solved() -> str:
     """Returns the scores of the shipped policies by family."""
     cells = []
-    for domain in FAMILIES:
+    for domain in catalogue.FAMILIES:
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         entries = filter(None, (gallery.record(spec.id) for spec in specs))
         found = [

@@ -76,8 +76,8 @@ class CommandTest(parameterized.TestCase):
 class ListTest(CommandTest):
     def test_lists_everything_on_one_line_each(self):
         lines = self.output('list').splitlines()
-        self.assertEqual(lines[-1], '118 environments')
-        self.assertLen(lines, 120)
+        self.assertEqual(lines[-1], f'{len(suite.ALL_IDS)} environments')
+        self.assertLen(lines, len(suite.ALL_IDS) + 2)
         self.assertEqual([line.split()[0] for line in lines[1:-1]], list(suite.ALL_IDS))
         listed = [tuple(line.split()[1].split('/')) for line in lines[1:-1]]
         self.assertEqual(listed, list(suite.ALL_TASKS))
