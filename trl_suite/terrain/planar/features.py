@@ -1,14 +1,14 @@
-"""The planar terrain types of the original: random features in sequence, also on rolling ground.
+"""The planar terrain types: random features in sequence, also on rolling ground.
 
-All features consist of two primitives:
+The features of the original consist of two primitives:
 
 * a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
   flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m wide at its crest
   and 0.225 m at its foot. The level of the ground is unchanged.
 * a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
 
-The random processes are those of the original's terrain generator (Terrain RL Simulator, 2018):
-equal in distribution, not draw by draw.
+Their random processes are those of its terrain generator (Terrain RL Simulator, 2018): equal in
+distribution, not draw by draw.
 """
 
 from __future__ import annotations
