@@ -15,6 +15,7 @@ from trl_suite.viewing.playback import Playback
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
 
 Policy = Callable[[dm_env.TimeStep], np.ndarray]
 
@@ -38,6 +39,15 @@ class Moment(NamedTuple):
     time: float
     rewards: np.ndarray
     torques: np.ndarray
+
+
+class Loaded(NamedTuple):
+    """An environment with all policies that fit it, and which of them acts."""
+
+    spec: EnvSpec
+    environment: Environment
+    policies: dict[str, Policy]
+    policy: str
 
 
 class Session:
