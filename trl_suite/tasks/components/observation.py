@@ -12,21 +12,25 @@ from trl_suite.util.compiled import compiled
 
 @compiled
 def write_body(
-    i: int, pose: int, velocity: int, found: SpatialMeasurement, observation: np.ndarray
+    i: int, pose: int, velocity: int, measurement: SpatialMeasurement, observation: np.ndarray
 ) -> None:
     """Writes the blocks pose and velocity to an observation, from these columns on."""
-    for k in range(found.pose.shape[1]):
-        observation[i, pose + k] = found.pose[i, k]
-    for k in range(found.velocity.shape[1]):
-        observation[i, velocity + k] = found.velocity[i, k]
+    for k in range(measurement.pose.shape[1]):
+        observation[i, pose + k] = measurement.pose[i, k]
+    for k in range(measurement.velocity.shape[1]):
+        observation[i, velocity + k] = measurement.velocity[i, k]
 
 
 @compiled
 def write_terrain(
-    i: int, column: int, ground: SpatialWindows, found: SpatialMeasurement, observation: np.ndarray
+    i: int,
+    column: int,
+    ground: SpatialWindows,
+    measurement: SpatialMeasurement,
+    observation: np.ndarray,
 ) -> None:
     """Writes the height map around a character to an observation, unless the column is negative."""
     if column >= 0:
         block = observation[i, column : column + SAMPLES * SAMPLES]
-        x, y = found.root[i, 0], found.root[i, 1]
-        spatial_ground.height_map(i, x, y, found.heading[i], ground, block)
+        x, y = measurement.root[i, 0], measurement.root[i, 1]
+        spatial_ground.height_map(i, x, y, measurement.heading[i], ground, block)
