@@ -588,7 +588,7 @@ class ObservableTest(parameterized.TestCase):
         np.testing.assert_array_equal(ours[0][:, : theirs[0].shape[1]], theirs[0])
         np.testing.assert_array_equal(ours[1], theirs[1])
 
-    def test_flat(self):
+    def test_flat_observation(self):
         environment = self.build(flat_observation=True)
         observation = environment.reset().observation
         self.assertEqual(list(observation), ['observations'])
@@ -742,7 +742,7 @@ class ThreadsTest(parameterized.TestCase):
         self.assertLen(found, 1)
         calls[0]()  # one after the other is fine
 
-    def test_single(self):
+    def test_methods_of_a_single_environment(self):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         state = environment.get_state()
@@ -752,7 +752,7 @@ class ThreadsTest(parameterized.TestCase):
             lambda: rendering.frame(environment),
         ))  # fmt: skip
 
-    def test_vector(self):
+    def test_methods_of_a_vector_environment(self):
         environments = VectorEnvironment(GAPS, 2, 1, seed=0)
         environments.reset()
         state = environments.get_state()
