@@ -91,8 +91,8 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     """
     from trl_suite.viewing.window import Window
 
-    frames: Any = environment
+    shown: Any = environment
     if hasattr(environment.task, 'watch'):
-        playback = Playback(environment, policy)
-        policy = playback.policy
-    Window(environment, title).launch(frames, policy)
+        shown = Playback(environment, policy)
+        policy = shown.policy
+    Window(environment, title).launch(shown, policy)
