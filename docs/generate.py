@@ -13,7 +13,6 @@ import argparse
 import functools
 import json
 import pathlib
-import re
 import statistics
 import sys
 import textwrap
@@ -27,16 +26,11 @@ from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
+from trl_suite.terrain import checks
 from trl_suite.util import files, resources
 from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
-FAMILIES = {
-    'imitation': 'Imitation: tracking a clip on flat ground, or in three dimensions',
-    'plaid': 'PLAiD: tracking a clip over terrain',
-    'terrainrl': 'TerrainRL: gaits whose parameters an action sets for one cycle',
-    'deeploco': 'DeepLoco: tracking and planning footsteps',
-}
 NAMES = (  # parts of ids
     ('`FSM`', 'a finite state machine drives the joints; an action sets its parameters'),
     (
@@ -68,17 +62,6 @@ MACHINE = (  # of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
-# Units of terrain parameters other than lengths in m, by a part of the name.
-UNITS = {
-    'LerpPow': '1, exponent', 'Speed': 'm/s', 'Density': '1/m²', 'Count': '1, number',
-    'NumObstacles': '1, number', 'NumStrips': '1, number', 'NumSlices': '1, number',
-    'Prob': '1, probability', 'TurnDelta': 'rad', 'Slope': '1, rise per m',
-}  # fmt: skip
-ON_ROLLING = re.compile('var2d_slopes_(.*)')
-FEATURES = {
-    'gaps': 'Gaps', 'walls': 'Walls', 'steps': 'Steps', 'mixed': 'Gaps, walls and steps',
-    'narrow_gaps': 'Clusters of gaps with stepping stones between them',
-}  # fmt: skip
 
 
 def pages() -> dict[str, str]:
@@ -98,7 +81,7 @@ def pages() -> dict[str, str]:
             environments[key] = suite.build_environment(spec, {}, {})
         found[f'environments/{spec.id}.md'] = environment_page(spec, environments[key])
     found['environments/README.md'] = environment_index()
-    for domain in FAMILIES:
+    for domain in catalogue.FAMILIES:
         found[f'families/{domain}.md'] = family_page(domain)
     for name in characters.CHARACTERS:
         found[f'characters/{name}.md'] = character_page(name)
@@ -264,7 +247,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
 
 def family_page(domain: str) -> str:
     specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
-    title, _, about = FAMILIES[domain].partition(': ')
+    title, _, about = catalogue.FAMILIES[domain].partition(': ')
     cells = (
         (
             f'[{spec.id}](../environments/{spec.id}.md)<br>{spec.description}',
@@ -283,7 +266,7 @@ def family_page(domain: str) -> str:
 def environment_index() -> str:
     shipped = policies.available()
     parts = []
-    for domain, title in FAMILIES.items():
+    for domain, title in catalogue.FAMILIES.items():
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         cells = [
             (
@@ -296,7 +279,7 @@ def environment_index() -> str:
         parts += [f'## {title}', table(header, cells)]
     return page(
         'Environments',
-        f'{len(catalogue.SPECS)} environments in {len(FAMILIES)} families; a trained policy is shipped '
+        f'{len(catalogue.SPECS)} environments in {len(catalogue.FAMILIES)} families; a trained policy is shipped '
         f'for {len(shipped)} of them. On the command line, `trl-suite list` selects by family (`--domain`), '
         'character, actuation, terrain or tag, and `trl-suite info ID` prints the content of a page. The ids '
         'are those of the original, including its misspellings.',
@@ -369,7 +352,7 @@ def terrain_page(name: str) -> str:
     titles = ['value'] if len(sets) == 1 else [f'set {i}' for i in range(len(sets))]
     cells = [
         (
-            key, 'no effect' if key in terrain.IDLE.get(ground.type, ()) else unit(ground.type, key),
+            key, 'no effect' if key in terrain.IDLE.get(ground.type, ()) else checks.unit(ground.type, key),
             *(f'{values.get(key, default):g}' for values in sets), f'{default:g}',
         )
         for key, default in defaults.items()
@@ -401,18 +384,7 @@ def generator(ground: terrain.Terrain) -> Any:
 
 def meaning(ground: terrain.Terrain) -> str:
     """Returns the description of a terrain type: the first line of its generator's docstring."""
-    said = (generator(ground).function.__doc__ or '').partition('\n')[0]
-    if said:
-        return said
-    rolling = ON_ROLLING.fullmatch(ground.type)
-    feature = rolling[1] if rolling else ground.type.removeprefix('var2d_')
-    return f'{FEATURES[feature]} on {"rolling" if rolling else "level"} ground.'
-
-
-def unit(type_name: str, key: str) -> str:
-    if type_name == 'var3d_checkers':
-        return 'm'
-    return next((unit for part, unit in UNITS.items() if part in key), 'm')
+    return (generator(ground).function.__doc__ or '').partition('\n')[0]
 
 
 def terrain_index() -> str:
@@ -542,7 +514,7 @@ def readme() -> str:
 def solved() -> str:
     """Returns the scores of the shipped policies by family."""
     cells = []
-    for domain in FAMILIES:
+    for domain in catalogue.FAMILIES:
         specs = [spec for spec in catalogue.SPECS if spec.domain == domain]
         entries = filter(None, (gallery.record(spec.id) for spec in specs))
         found = [

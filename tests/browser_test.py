@@ -202,7 +202,7 @@ class ReplayTest(FolderTest):
         recording = rendering.replay(environment, zero(environment), steps=3)
         self.assertStartsWith(recording._repr_html_(), '<iframe srcdoc="&lt;!')
 
-    def test_refusals(self):
+    def test_invalid_arguments_of_a_replay_are_rejected(self):
         environment = suite.make(GOAT, {'random': 1})
         environment.reset()
         with self.assertRaisesRegex(ValueError, "unknown suffix '.mp4'; expected .html"):

@@ -847,7 +847,7 @@ class AngleAxisTest(parameterized.TestCase):
         self.assertAlmostEqual(mapping.action_offset[i], zero)
         self.assertAlmostEqual(mapping.action_scale[i], per_unit)
 
-    def test_conversion(self):
+    def test_controls_are_rotations_about_normalised_axes(self):
         """Against the definition: theta about a normalised axis, in the source's frame."""
         mapping = self.make('biped3d_mocap').map
         action = np.random.default_rng(5).uniform(-1, 1, (40, 22))

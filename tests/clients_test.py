@@ -111,7 +111,7 @@ class TorchRLTest(parameterized.TestCase):
             )
         )
 
-    @parameterized.product(env_ids=(0, 3), flat_observation=(True, False))
+    @parameterized.product(num_envs=(0, 3), flat_observation=(True, False))
     def test_specs(self, num_envs, flat_observation):
         from torchrl.envs import check_env_specs
 

@@ -104,7 +104,7 @@ class ClipsTest(parameterized.TestCase):
         self.assertGreater(report.planted, 0.3)  # otherwise the check above is not effective
 
     @each_clip
-    def test_pace(self, name):
+    def test_speed_and_period(self, name):
         speed, period = PACES[name]
         self.assertAlmostEqual(motion.load(name).speed, speed, places=3)
         self.assertAlmostEqual(motion.load(name).duration, period)
@@ -137,7 +137,7 @@ class ClipsTest(parameterized.TestCase):
 
 class LibraryTest(parameterized.TestCase):
     @each_library
-    def test_labels(self, name):
+    def test_turns_of_the_steps_are_symmetric(self, name):
         library = motion.load_steps(name)
         self.assertLen(library, LIBRARIES[name])
         if name in WALKS:
@@ -329,7 +329,7 @@ class RecipesTest(parameterized.TestCase):
             },
         ),
     )
-    def test_step(self, previous, this, expected):
+    def test_generated_angles_of_a_step(self, previous, this, expected):
         u = np.arange(5) / 4
         made = figure3d.figure('biped3d_mocap')
         found = curves(step3d.step(made, step3d.SHAPES['biped3d_mocap'], previous, this, u))
@@ -338,7 +338,7 @@ class RecipesTest(parameterized.TestCase):
                 found[name][: len(values)], values, atol=1.1e-4, err_msg=name
             )
 
-    def test_run(self):
+    def test_generated_angles_of_the_run(self):
         found = curves(run3d.bodies(fit3d.START, np.arange(4) / 4, passes=6))
         for name, values in {
             'x': (-0.0166, 0.5448, 1.1334, 1.6948),

@@ -198,7 +198,7 @@ class RecipesTest(parameterized.TestCase):
             },
         ),
     )
-    def test_generator(self, name, expected):
+    def test_generated_angles_at_quarters_of_a_cycle(self, name, expected):
         start = fit.STARTS[name]
         columns = ('x', 'z', 'pitch', *run.build(start.character).joints)
         poses = run.poses(start, np.arange(4) / 4, passes=4)

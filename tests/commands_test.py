@@ -49,7 +49,7 @@ class TryTest(CommandTest):
         self.assertIn('actuators: 3 in the file, 2 kept, 1 left out', out)
         self.assertTrue(pathlib.Path('a.png').exists())
 
-    def test_bad_files(self):
+    def test_invalid_files_are_rejected(self):
         pathlib.Path('two.urdf').write_text(own_test.URDF)
         self.assert_refused('spatial=True or spatial=False', 'try', 'two.urdf')
         self.assert_refused("no such file; did you mean 'two.urdf'", 'try', 'tow.urdf')
@@ -98,14 +98,14 @@ class DoctorTest(CommandTest):
         ),
         ((1, '', 'ImportError: mujoco'), (), 'see failures above'),
     )
-    def test_remedies(self, end, works, remedy):
+    def test_failures_name_a_remedy(self, end, works, remedy):
         with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):
             *_, found = doctor.self_test(works)
         self.assertEqual(found.state, doctor.FAILED)
         self.assertIn(end[2], found.text)
         self.assertIn(remedy, found.remedy)
 
-    def test_backends(self):
+    def test_rendering_backends_are_reported(self):
         ends = {'egl': (0, 'llvmpipe', ''), 'osmesa': (1, '', 'no library'), 'glfw': (0, '', '')}
         with (
             mock.patch.object(doctor, '_start', lambda code, name: name),

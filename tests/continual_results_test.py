@@ -58,7 +58,7 @@ class ResultsTest(absltest.TestCase):
         path.write_text(json.dumps(result))
         return path
 
-    def test_numbers(self):
+    def test_stages_that_all_runs_have_are_compared(self):
         """Two stages of five are compared: one run has no more."""
         self.store('Scratch', 0, [[0.5, 0.1, 0, 0, 0], [0.3, 0.4, 0, 0, 0]], 0.2)
         self.store('Plaid', 0, [[0.5, 0.2, 0, 0, 0], [0.6, 0.7, 0, 0, 0], [0.9] * 5], 0.6)

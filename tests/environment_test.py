@@ -12,7 +12,7 @@ import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 from dm_env import test_utils
-from helpers import KINDS, links_on_ground
+from helpers import KINDS, advance, assert_goes_on, assert_rows_are_singles, links_on_ground
 
 from trl_suite import characters, motion, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
@@ -249,6 +249,25 @@ def every_environment(id_):
             actions = random_actions(blocks, 1 if gait else 3 if high else 20)
             for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
                 np.testing.assert_array_equal(ours, theirs)
+
+        if id_ in KINDS:  # with other options: in the test of each task
+
+            def test_simulations_equal_single_environments(self):
+                steps = 2 if gait else 4 if high else 12
+                scale = 0.3 if gait else 1.0
+                assert_rows_are_singles(id_, 2, steps, max(steps - 3, 1), scale=scale)
+
+            def test_a_restored_state_continues_exactly(self):
+                steps = 1 if gait else 2 if high else 5
+
+                def go(environment, seed):
+                    return advance(environment, seed, steps, 0.3)
+
+                environment, other = (suite.make(id_, {'random': seed}) for seed in (6, 9))
+                for each in (environment, other):
+                    each.reset()
+                    go(each, 0)
+                assert_goes_on(environment, other, go)
 
         # Gaits and planners step their physics in the task: see gait_test, and below.
         if not gait and not high and id_ in KINDS:
@@ -569,7 +588,7 @@ class ObservableTest(parameterized.TestCase):
         np.testing.assert_array_equal(ours[0][:, : theirs[0].shape[1]], theirs[0])
         np.testing.assert_array_equal(ours[1], theirs[1])
 
-    def test_flat(self):
+    def test_flat_observation(self):
         environment = self.build(flat_observation=True)
         observation = environment.reset().observation
         self.assertEqual(list(observation), ['observations'])
@@ -723,7 +742,7 @@ class ThreadsTest(parameterized.TestCase):
         self.assertLen(found, 1)
         calls[0]()  # one after the other is fine
 
-    def test_single(self):
+    def test_methods_of_a_single_environment(self):
         environment = suite.make(GAPS, {'random': 0})
         environment.reset()
         state = environment.get_state()
@@ -733,7 +752,7 @@ class ThreadsTest(parameterized.TestCase):
             lambda: rendering.frame(environment),
         ))  # fmt: skip
 
-    def test_vector(self):
+    def test_methods_of_a_vector_environment(self):
         environments = VectorEnvironment(GAPS, 2, 1, seed=0)
         environments.reset()
         state = environments.get_state()

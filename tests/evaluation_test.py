@@ -71,7 +71,7 @@ class EvaluateTest(parameterized.TestCase):
         )
         self.assertEqual((found['returns'], found['lengths']), (returns, lengths))
 
-    def test_gaits(self):
+    def test_steps_of_different_durations(self):
         """Simulations whose steps differ in duration."""
         spec = dataclasses.replace(suite.find('FSM_Biped2D_Terrain_Gaps-v0'), step_limit=12)
         found = evaluation.evaluate(spec, evaluation.zero, 3, 5, factory=True)
@@ -156,7 +156,7 @@ class EvaluateTest(parameterized.TestCase):
         self.assertEqual((again['lengths'], again['fell']), (found['lengths'][:1], [True]))
         self.assertEqual(again['completion_rate'], 0)
 
-    def test_summary(self):
+    def test_means_and_intervals(self):
         found = evaluation.evaluate('plaid/biped_gaps', make(GAPS), 5, 3)
         self.assertEqual((found['id'], found['episodes'], found['seed']), (GAPS, 5, 3))
         self.assertEqual(json.loads(json.dumps(found, allow_nan=False)), found)

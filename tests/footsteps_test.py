@@ -388,7 +388,7 @@ class RewardTest(parameterized.TestCase):
                 self.assertEqual(scale, SCALES[name])
         self.assertAlmostEqual(sum(w for w, _ in task.TERMS.values()), 1, delta=1e-12)
 
-    def test_heading(self):
+    def test_factor_of_the_heading_error(self):
         angles = (0.0, np.pi / 2, np.pi, -np.pi / 2, np.pi / 3, 2 * np.pi)
         found = [rewards.facing(angle) for angle in angles]
         np.testing.assert_allclose(found, [1, 1 / 16, 0, 1 / 16, 0.75**4, 1], atol=1e-12)

@@ -191,8 +191,8 @@ class TableTest(parameterized.TestCase):
         for name, peak in (('plain', 6000), ('run', 5692.86906)):
             with suite.make(id_, task_kwargs={'random': 1, 'muscle_set': name}) as environment:
                 model = environment.physics.model
-                env_id = model.name2id('raptor/right_VAS', 'actuator')
-                self.assertAlmostEqual(model.actuator_gainprm[env_id, 2], peak, delta=0.01)
+                muscle = model.name2id('raptor/right_VAS', 'actuator')
+                self.assertAlmostEqual(model.actuator_gainprm[muscle, 2], peak, delta=0.01)
 
     @parameterized.parameters(*COUNTS)
     def test_muscles_pull_every_joint_both_ways(self, name):

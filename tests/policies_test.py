@@ -75,14 +75,14 @@ def plain(policy, observation):
         for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
     ]
     if line is not None:
-        env_ids = [[value] for value in x[: line.line]]
+        samples = [[value] for value in x[: line.line]]
         for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
             width, channels, filters = weight.shape
-            env_ids = [
+            samples = [
                 [
                     hidden(
                         sum(
-                            env_ids[start + w][c] * float(weight[w, c, o])
+                            samples[start + w][c] * float(weight[w, c, o])
                             for w in range(width)
                             for c in range(channels)
                         )
@@ -90,9 +90,9 @@ def plain(policy, observation):
                     )
                     for o in range(filters)
                 ]
-                for start in range(0, len(env_ids) - width + 1, stride)
+                for start in range(0, len(samples) - width + 1, stride)
             ]
-        x = [value for row in env_ids for value in row] + x[line.line :]
+        x = [value for row in samples for value in row] + x[line.line :]
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         x = [
             sum(x[j] * float(weight[j, o]) for j in range(len(x))) + float(bias[o])

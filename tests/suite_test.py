@@ -152,8 +152,9 @@ class CatalogueTest(parameterized.TestCase):
     def test_the_originals_are_tagged(self):
         tagged = {id_ for id_ in imitation_ids() if 'original' in suite.find(id_).tags}
         self.assertEqual(tagged, set(ORIGINAL))
-        for id_ in imitation_ids():
-            self.assertLen(suite.find(id_).tags & {'original', 'completion'}, 1, id_)
+        for id_ in suite.ALL_IDS:
+            origins = suite.find(id_).tags & {'original', 'completion', 'addition'}
+            self.assertLen(origins, 1, id_)
         tagged = [id_ for id_ in ids_of('gait') if 'original' in suite.find(id_).tags]
         self.assertCountEqual(tagged, list(GAITS)[:32])
 

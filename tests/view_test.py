@@ -12,7 +12,7 @@ from absl.testing import absltest, parameterized
 from trl_suite import suite
 from trl_suite.cli import view
 from trl_suite.environments.environment import Environment
-from trl_suite.viewing import frames
+from trl_suite.viewing import playback
 
 GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
@@ -85,7 +85,7 @@ class CommandTest(cli_test.CommandTest):
             )
 
 
-class FramesTest(parameterized.TestCase):
+class PlaybackTest(parameterized.TestCase):
     @parameterized.parameters(DOG, PLANS)
     def test_long_steps_frame_by_frame(self, id_):
         environment, expected = (suite.make(id_, {'random': 2}) for _ in range(2))
@@ -95,7 +95,7 @@ class FramesTest(parameterized.TestCase):
             asked.append(random.uniform(-0.1, 0.1, expected.action_spec().shape))
             return asked[-1]
 
-        played = frames.Frames(environment, policy)
+        played = playback.Playback(environment, policy)
         time_step, end, times = played.reset(), expected.reset(), [0.0]
         for step in range(3):
             while len(asked) <= step or played._left:
@@ -113,7 +113,7 @@ class FramesTest(parameterized.TestCase):
         self.assertLess(passed.max(), FRAME + 1e-9)
 
     def test_a_reset_within_a_step(self):
-        played = frames.Frames(suite.make(DOG, {'random': 2}), lambda time_step: np.zeros(29))
+        played = playback.Playback(suite.make(DOG, {'random': 2}), lambda time_step: np.zeros(29))
         time_step = played.reset()
         for _ in range(3):
             time_step = played.step(played.policy(time_step))
@@ -124,7 +124,7 @@ class FramesTest(parameterized.TestCase):
         self.assertLess(played.step(np.zeros(29)) and played.physics.data.time, 1.01 * FRAME)
 
     def test_only_long_steps(self):
-        for id_, kind in ((DOG, frames.Frames), (GAPS, Environment)):
+        for id_, kind in ((DOG, playback.Playback), (GAPS, Environment)):
             environment = suite.make(id_)
             with mock.patch.object(window, 'Window') as shown:
                 view.view(environment, lambda time_step: np.zeros(29), 'a title')

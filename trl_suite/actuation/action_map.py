@@ -68,14 +68,14 @@ class ActionMap:
         """Maps controls (..., k) to the actions that yield them; not clipped."""
         return (control - self.action_offset) / self.action_scale
 
-    def checked(self, action: npt.ArrayLike, *env_ids: int) -> np.ndarray:
+    def checked(self, action: npt.ArrayLike, *num_envs: int) -> np.ndarray:
         """Returns an action as floats, (k,), or the actions of some simulations, (simulations, k).
 
         Raises:
           ValueError: another shape, or NaN or infinity; the message names simulation and joint.
         """
-        shape = (*env_ids, len(self))
-        are, have = ('actions are', 'actions have') if env_ids else ('action is', 'action has')
+        shape = (*num_envs, len(self))
+        are, have = ('actions are', 'actions have') if num_envs else ('action is', 'action has')
         try:
             action = np.asarray(action)
             if action.dtype.kind not in 'fiubO':  # NumPy would turn dates and strings into numbers

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from trl_suite import rendering
 from trl_suite.cli import engine
 from trl_suite.environments import named_policies as acting
-from trl_suite.viewing.frames import Frames
+from trl_suite.viewing.playback import Playback
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
@@ -91,8 +91,8 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     """
     from trl_suite.viewing.window import Window
 
-    frames: Any = environment
+    shown: Any = environment
     if hasattr(environment.task, 'watch'):
-        frames = Frames(environment, policy)
-        policy = frames.policy
-    Window(environment, title).launch(frames, policy)
+        shown = Playback(environment, policy)
+        policy = shown.policy
+    Window(environment, title).launch(shown, policy)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from trl_suite.registry.build import character_of, task_type
 from trl_suite.registry.spec import EnvSpec
 
-COMPLETION = 'not registered in the original: a combination that its papers name or imply'
+ORIGINS = {  # by tag
+    'completion': 'not registered in the original: a combination that its papers name or imply',
+    'addition': 'not part of the original',
+}
 ACTUATION = {
     'position': 'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
     'torque': 'joints have passive damping and an armature of 0.01 kg m^2; action 1 is 0.75 of the limit',
@@ -40,7 +43,7 @@ TERRAIN = {
 def differences_of(spec: EnvSpec) -> list[str]:
     """Returns the sentences that apply to an environment."""
     type_ = task_type(spec)
-    found = [COMPLETION] if 'completion' in spec.tags else []
+    found = [text for tag, text in ORIGINS.items() if tag in spec.tags]
     if type_ is not None:
         found += [each.text for each in type_.differences if each.applies(spec)]
     found += [*spec.differences, *character_of(spec).differences.get(spec.actuation, ())]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import numbers
 import threading
 from collections.abc import Iterable, Mapping
@@ -78,21 +77,3 @@ def check_state(state: Any, owner: str, keys: Iterable[str]) -> None:
     missing = [key for key in keys if key not in state]
     if missing:
         raise ValueError(f'the state lacks {", ".join(map(repr, missing))}')
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether options are equal; unlike ==, also where they hold arrays."""
-    if one is other:
-        return True
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        return np.array_equal(one, other)
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if type(one) is not type(other):
-        return bool(one == other)
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(same, one, other))
-    if dataclasses.is_dataclass(one):
-        names = [field.name for field in dataclasses.fields(one)]
-        return all(same(getattr(one, name), getattr(other, name)) for name in names)
-    return bool(one == other)

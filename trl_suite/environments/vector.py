@@ -25,6 +25,7 @@ from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
 from trl_suite.util import errors
+from trl_suite.util.options import equal
 
 MOST_ENVS = 2**20  # simulations of one batch
 MOST_THREADS = 4096
@@ -384,10 +385,7 @@ class VectorEnvironment:
             if self._fresh or other._fresh:
                 raise RuntimeError('copy_from before the first reset')
             assert self._world is not None and other._world is not None
-            if not (
-                arguments.same(other.spec, self.spec)
-                and arguments.same(other._task_kwargs, self._task_kwargs)
-            ):
+            if not (equal(other.spec, self.spec) and equal(other._task_kwargs, self._task_kwargs)):
                 raise ValueError(
                     f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options '
                     'differ'

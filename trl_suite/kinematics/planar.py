@@ -120,7 +120,7 @@ def must_wait(i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindow
 @compiled
 def measure(
     i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, observation: np.ndarray,
-    found: PlanarMeasurement,
+    measurement: PlanarMeasurement,
 ) -> None:  # fmt: skip
     """Writes the blocks terrain, pose and velocity, and the other measurements.
 
@@ -133,7 +133,7 @@ def measure(
     root = body.links[0]
     com_x, com_z = state.subtree_com[i, root, 0], state.subtree_com[i, root, 2]
     under = planar_ground.far_height(i, x, ground) if far else planar_ground.height(i, x, ground)
-    found.facing[i], found.under[i], found.height[i] = facing, under, z - under
+    measurement.facing[i], measurement.under[i], measurement.height[i] = facing, under, z - under
 
     speed_x = speed_z = 0.0
     observation[i, body.pose] = z - under
@@ -150,7 +150,7 @@ def measure(
         observation[i, body.pose + 2 + 2 * k] = link_z - z
         observation[i, body.velocity + 2 * k] = v_x * facing
         observation[i, body.velocity + 2 * k + 1] = v_z
-    found.com_velocity[i, 0], found.com_velocity[i, 1] = speed_x, speed_z
+    measurement.com_velocity[i, 0], measurement.com_velocity[i, 1] = speed_x, speed_z
 
     for k in range(len(body.samples)):
         ahead = x + body.samples[k] * facing
@@ -167,8 +167,8 @@ def measure(
             level = planar_ground.far_height(i, place, ground)
         else:
             level = planar_ground.height(i, place, ground)
-        found.effectors[i, k] = place - about
-        found.effectors[i, count + k] = state.xpos[i, body.effectors[k], 2] - level
+        measurement.effectors[i, k] = place - about
+        measurement.effectors[i, count + k] = state.xpos[i, body.effectors[k], 2] - level
 
 
 @compiled
@@ -182,11 +182,15 @@ def has_fallen(i: int, body: PlanarBody, state: PlanarState) -> bool:
 
 @compiled
 def leaves(
-    i: int, body: PlanarBody, state: PlanarState, ground: PlanarWindows, found: PlanarMeasurement
+    i: int,
+    body: PlanarBody,
+    state: PlanarState,
+    ground: PlanarWindows,
+    measurement: PlanarMeasurement,
 ) -> bool:
     """Writes and returns whether a character has left its ground window, which must be moved."""
-    found.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
-    return found.leaving[i]
+    measurement.leaving[i] = planar_ground.has_left(i, state.qpos[i, body.qpos[0]], ground)
+    return measurement.leaving[i]
 
 
 class PlanarFigure:
@@ -276,7 +280,7 @@ class PlanarFigure:
         """The ground of all simulations, for compiled functions."""
         return self.arena.ground
 
-    def measurement(self) -> PlanarMeasurement:
+    def empty_measurement(self) -> PlanarMeasurement:
         """Allocates the results of `measure`."""
         n = self._world.n
         return PlanarMeasurement(

@@ -102,7 +102,7 @@ class SpatialMeasurement(NamedTuple):
     features: np.ndarray
 
 
-def measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
+def empty_measurement(n: int, body: SpatialBody) -> SpatialMeasurement:
     """Allocates the results of `measure` for n characters."""
     links, effectors = len(body.links), len(body.effectors)
     columns = feature_columns(body)
@@ -139,7 +139,7 @@ def feature_columns(body: SpatialBody) -> dict[str, slice]:
 @compiled
 def measure(
     i: int, body: SpatialBody, state: SpatialState, ground: SpatialWindows,
-    found: SpatialMeasurement,
+    measurement: SpatialMeasurement,
 ) -> None:  # fmt: skip
     """Measures the character of simulation i."""
     body_id = body.links[0]
@@ -159,11 +159,11 @@ def measure(
     drift_x = drift_y = 0.0  # velocity of the ground under the root, m/s
     if ground.box_velocity.shape[1] + ground.mover_top.shape[1] > 0:
         drift_x, drift_y = spatial_ground.velocity(i, root_x, root_y, ground)
-    found.root[i, 0], found.root[i, 1], found.root[i, 2] = root_x, root_y, root_z
-    found.com[i, 0], found.com[i, 1], found.com[i, 2] = com_x, com_y, com_z
-    found.heading[i], found.cosine[i], found.sine[i] = heading, cosine, sine
-    found.under[i] = under
-    found.pose[i, 0] = root_z - under
+    measurement.root[i, 0], measurement.root[i, 1], measurement.root[i, 2] = root_x, root_y, root_z
+    measurement.com[i, 0], measurement.com[i, 1], measurement.com[i, 2] = com_x, com_y, com_z
+    measurement.heading[i], measurement.cosine[i], measurement.sine[i] = heading, cosine, sine
+    measurement.under[i] = under
+    measurement.pose[i, 0] = root_z - under
 
     speed_x = speed_y = speed_z = 0.0
     for k in range(len(body.links)):
@@ -184,102 +184,94 @@ def measure(
 
         column = 1 + LINK_POSE * k
         away_x, away_y = centre_x - root_x, centre_y - root_y
-        found.pose[i, column] = cosine * away_x + sine * away_y
-        found.pose[i, column + 1] = cosine * away_y - sine * away_x
-        found.pose[i, column + 2] = centre_z - root_z
+        measurement.pose[i, column] = cosine * away_x + sine * away_y
+        measurement.pose[i, column + 1] = cosine * away_y - sine * away_x
+        measurement.pose[i, column + 2] = centre_z - root_z
         w, x = state.xquat[i, link, 0], state.xquat[i, link, 1]
         y, z = state.xquat[i, link, 2], state.xquat[i, link, 3]
         turned_w, turned_x = half_cosine * w - half_sine * z, half_cosine * x - half_sine * y
         turned_y, turned_z = half_cosine * y + half_sine * x, half_cosine * z + half_sine * w
         if k == 0:
-            found.features[i, 0], found.features[i, 1] = turned_w, turned_x
-            found.features[i, 2], found.features[i, 3] = turned_y, turned_z
+            measurement.features[i, 0], measurement.features[i, 1] = turned_w, turned_x
+            measurement.features[i, 2], measurement.features[i, 3] = turned_y, turned_z
         sign = -1.0 if turned_w < 0.0 else 1.0
-        found.pose[i, column + 3], found.pose[i, column + 4] = sign * turned_w, sign * turned_x
-        found.pose[i, column + 5], found.pose[i, column + 6] = sign * turned_y, sign * turned_z
+        measurement.pose[i, column + 3], measurement.pose[i, column + 4] = (
+            sign * turned_w,
+            sign * turned_x,
+        )
+        measurement.pose[i, column + 5], measurement.pose[i, column + 6] = (
+            sign * turned_y,
+            sign * turned_z,
+        )
         column = LINK_VELOCITY * k
         v_x, v_y = v_x - drift_x, v_y - drift_y
-        found.velocity[i, column] = cosine * v_x + sine * v_y
-        found.velocity[i, column + 1] = cosine * v_y - sine * v_x
-        found.velocity[i, column + 2] = v_z
-        found.velocity[i, column + 3] = cosine * spin_x + sine * spin_y
-        found.velocity[i, column + 4] = cosine * spin_y - sine * spin_x
-        found.velocity[i, column + 5] = spin_z
-    found.com_velocity[i, 0], found.com_velocity[i, 1] = speed_x, speed_y
-    found.com_velocity[i, 2] = speed_z
+        measurement.velocity[i, column] = cosine * v_x + sine * v_y
+        measurement.velocity[i, column + 1] = cosine * v_y - sine * v_x
+        measurement.velocity[i, column + 2] = v_z
+        measurement.velocity[i, column + 3] = cosine * spin_x + sine * spin_y
+        measurement.velocity[i, column + 4] = cosine * spin_y - sine * spin_x
+        measurement.velocity[i, column + 5] = spin_z
+    measurement.com_velocity[i, 0], measurement.com_velocity[i, 1] = speed_x, speed_y
+    measurement.com_velocity[i, 2] = speed_z
 
     features = 4
     for address in body.balls:
-        found.features[i, features] = state.qpos[i, address]
+        measurement.features[i, features] = state.qpos[i, address]
         features += 1
     for address in body.hinges:
-        found.features[i, features] = state.qpos[i, address]
+        measurement.features[i, features] = state.qpos[i, address]
         features += 1
     for k in range(3):
-        found.features[i, features] = found.velocity[i, 3 + k]
+        measurement.features[i, features] = measurement.velocity[i, 3 + k]
         features += 1
     for address in body.joint_dof:
-        found.features[i, features] = state.qvel[i, address]
+        measurement.features[i, features] = state.qvel[i, address]
         features += 1
     middle_x, middle_y = (com_x, com_y) if body.about_com else (root_x, root_y)
     for k in range(len(body.effectors)):
         foot = body.effectors[k]
         foot_x, foot_y = state.xpos[i, foot, 0], state.xpos[i, foot, 1]
         foot_z = state.xpos[i, foot, 2]
-        found.feet[i, k, 0], found.feet[i, k, 1], found.feet[i, k, 2] = foot_x, foot_y, foot_z
+        measurement.feet[i, k, 0], measurement.feet[i, k, 1], measurement.feet[i, k, 2] = (
+            foot_x,
+            foot_y,
+            foot_z,
+        )
         away_x, away_y = foot_x - middle_x, foot_y - middle_y
-        found.features[i, features] = cosine * away_x + sine * away_y
-        found.features[i, features + 1] = cosine * away_y - sine * away_x
-        found.features[i, features + 2] = foot_z - spatial_ground.height(i, foot_x, foot_y, ground)
+        measurement.features[i, features] = cosine * away_x + sine * away_y
+        measurement.features[i, features + 1] = cosine * away_y - sine * away_x
+        measurement.features[i, features + 2] = foot_z - spatial_ground.height(
+            i, foot_x, foot_y, ground
+        )
         features += 3
         touching = 0.0
         for sensor in body.contact[k]:
             if state.sensordata[i, sensor] > 0.0:
                 touching = 1.0
-        found.contact[i, k] = touching
+        measurement.contact[i, k] = touching
     for k in range(3):
-        found.features[i, features + k] = found.com_velocity[i, k]
-    found.features[i, features + 3] = root_z - under
-    found.fallen[i] = False
+        measurement.features[i, features + k] = measurement.com_velocity[i, k]
+    measurement.features[i, features + 3] = root_z - under
+    measurement.fallen[i] = False
     for sensor in body.fall:
         if state.sensordata[i, sensor] != 0.0:
-            found.fallen[i] = True
+            measurement.fallen[i] = True
 
 
 @compiled_inline
-def ahead_and_left(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
+def ahead_and_left(
+    i: int, x: float, y: float, measurement: SpatialMeasurement
+) -> tuple[float, float]:
     """Converts a horizontal vector from world axes to the heading frame."""
-    cosine, sine = found.cosine[i], found.sine[i]
+    cosine, sine = measurement.cosine[i], measurement.sine[i]
     return cosine * x + sine * y, cosine * y - sine * x
 
 
 @compiled_inline
-def polar(i: int, x: float, y: float, found: SpatialMeasurement) -> tuple[float, float]:
+def polar(i: int, x: float, y: float, measurement: SpatialMeasurement) -> tuple[float, float]:
     """Returns bearing (rad to the left) and length of a horizontal vector in world axes."""
-    ahead, left = ahead_and_left(i, x, y, found)
+    ahead, left = ahead_and_left(i, x, y, measurement)
     return math.atan2(left, ahead), math.sqrt(ahead * ahead + left * left)
-
-
-@compiled
-def write_body(
-    i: int, pose: int, velocity: int, found: SpatialMeasurement, observation: np.ndarray
-) -> None:
-    """Writes the blocks pose and velocity to an observation, from these columns on."""
-    for k in range(found.pose.shape[1]):
-        observation[i, pose + k] = found.pose[i, k]
-    for k in range(found.velocity.shape[1]):
-        observation[i, velocity + k] = found.velocity[i, k]
-
-
-@compiled
-def write_terrain(
-    i: int, column: int, ground: SpatialWindows, found: SpatialMeasurement, observation: np.ndarray
-) -> None:
-    """Writes the height map around a character to an observation, unless the column is negative."""
-    if column >= 0:
-        block = observation[i, column : column + SAMPLES * SAMPLES]
-        x, y = found.root[i, 0], found.root[i, 1]
-        spatial_ground.height_map(i, x, y, found.heading[i], ground, block)
 
 
 class Measured(NamedTuple):
@@ -288,14 +280,14 @@ class Measured(NamedTuple):
     body: SpatialBody
     state: SpatialState
     ground: SpatialWindows
-    found: SpatialMeasurement
+    measurement: SpatialMeasurement
 
 
 @compiled_loop
 def measure_all(env_ids: np.ndarray, measured: Measured) -> None:
     """Measures the characters of some simulations; takes a pack."""
     for i in env_ids:
-        measure(i, measured.body, measured.state, measured.ground, measured.found)
+        measure(i, measured.body, measured.state, measured.ground, measured.measurement)
 
 
 class Corners(NamedTuple):
@@ -376,7 +368,7 @@ class SpatialFigure:
     Attributes:
       body: its ids, after `bind`; see `SpatialBody`.
       state: the fields of the physics from which it is measured.
-      found: the last measurement.
+      measurement: the last measurement.
       pose_qpos, pose_dof: addresses of the columns of a pose and of a velocity.
       links: body ids, in link order.
       blocks: sizes of the observation blocks of the body.
@@ -384,7 +376,7 @@ class SpatialFigure:
 
     body: SpatialBody
     state: SpatialState
-    found: SpatialMeasurement
+    measurement: SpatialMeasurement
     fields: tuple[str, ...] = ('xquat',)  # further fields of MjData to bind, see `World`
 
     def __init__(
@@ -454,8 +446,8 @@ class SpatialFigure:
             contact.reshape(len(self._sensors['contact']), len(self.arena.touched)),
         )  # fmt: skip
         self.state = SpatialState(*(getattr(world, name) for name in SpatialState._fields))
-        self.found = measurement(world.n, self.body)
-        self._pack = packed(Measured(self.body, self.state, self.ground, self.found))
+        self.measurement = empty_measurement(world.n, self.body)
+        self._pack = packed(Measured(self.body, self.state, self.ground, self.measurement))
         geoms = world.geom_ids([g.full_identifier for g in character.collision_geoms])
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing='ij'), axis=-1).reshape(8, 3)
         boxes = model.geom_aabb[geoms, None]  # centres and half sizes, in the geoms' frames
@@ -477,9 +469,9 @@ class SpatialFigure:
         return self.body.effectors
 
     def measure(self, env_ids: np.ndarray | None = None) -> SpatialMeasurement:
-        """Measures the characters of some simulations, or of all; returns `found`."""
+        """Measures the characters of some simulations, or of all; returns `measurement`."""
         measure_all(self._world.all_ids if env_ids is None else env_ids, self._pack)
-        return self.found
+        return self.measurement
 
     def place(
         self, env_ids: np.ndarray, poses: np.ndarray, rates: np.ndarray, spawns: np.ndarray

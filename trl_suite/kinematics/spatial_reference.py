@@ -17,9 +17,9 @@ from trl_suite.kinematics.spatial import (
     Measured,
     SpatialBody,
     SpatialState,
+    empty_measurement,
     feature_columns,
     measure_all,
-    measurement,
 )
 from trl_suite.motion import Clip, Steps, quaternion
 from trl_suite.terrain.spatial import windows as spatial_ground
@@ -48,16 +48,16 @@ class TrackTable(NamedTuple):
 
 @compiled_inline
 def moment(share: float, track: int, tracks: TrackTable) -> tuple[int, float]:
-    """Returns the row of the table for a fraction in [0, 1] of a track, and the remainder."""
+    """Returns the row of the table for a share in [0, 1] of a track, and the fraction to the next."""
     u = share * tracks.samples
     sample = min(max(math.floor(u), 0.0), tracks.samples - 1.0)
     return int(sample) + track * (tracks.samples + 1), u - sample
 
 
 @compiled_inline
-def feature(row: int, rest: float, column: int, tracks: TrackTable) -> float:
-    """Returns a feature, interpolated at a row and remainder from `moment`."""
-    return tracks.steps[row, column] * rest + tracks.table[row, column]
+def feature(row: int, fraction: float, column: int, tracks: TrackTable) -> float:
+    """Returns a feature, interpolated at a row and fraction from `moment`."""
+    return tracks.steps[row, column] * fraction + tracks.table[row, column]
 
 
 class SpatialReference:
@@ -90,17 +90,21 @@ class SpatialReference:
         state = _stacked(model, body, poses.reshape(n, -1), rates.reshape(n, -1))
         ground = spatial_ground.empty(n, _LEVEL)
         ground.level[:] = 0.0
-        found = measurement(n, body)
-        measure_all(np.arange(n), packed(Measured(body, state, ground, found)))
+        measurement = empty_measurement(n, body)
+        measure_all(np.arange(n), packed(Measured(body, state, ground, measurement)))
         own = feature_columns(body)
-        heading = np.unwrap(found.heading.reshape(count, -1), axis=1).reshape(-1, 1)
-        features = found.features.reshape(count, samples + 1, -1)
+        heading = np.unwrap(measurement.heading.reshape(count, -1), axis=1).reshape(-1, 1)
+        features = measurement.features.reshape(count, samples + 1, -1)
         parts = {
             'features': _continuous(features, own['rotations']),
             'heading': heading,
-            'root': found.root[:, :2],
-            'positions': found.pose[:, 1:].reshape(n, links, LINK_POSE)[..., :3].reshape(n, -1),
-            'velocities': found.velocity.reshape(n, links, LINK_VELOCITY)[..., :3].reshape(n, -1),
+            'root': measurement.root[:, :2],
+            'positions': measurement.pose[:, 1:]
+            .reshape(n, links, LINK_POSE)[..., :3]
+            .reshape(n, -1),
+            'velocities': measurement.velocity.reshape(n, links, LINK_VELOCITY)[..., :3].reshape(
+                n, -1
+            ),
         }
         table = np.concatenate(list(parts.values()), axis=1)
         self.tracks = TrackTable(table, np.diff(table, axis=0, append=table[-1:]), samples)

@@ -23,6 +23,7 @@ from trl_suite.motion import quaternion
 from trl_suite.motion.layout import LARGEST
 from trl_suite.util import errors
 from trl_suite.util.files import existing, read_text
+from trl_suite.util.libraries import library
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
@@ -77,12 +78,7 @@ def read_bvh(
     axes = frame(forward, up)
     text = read_text(path)
     _check_bvh(path, text)
-    try:
-        import pybvh
-    except ImportError as error:
-        raise ImportError(
-            "pybvh is needed to read BVH and not installed; pip install 'trl_suite[clips]'"
-        ) from error
+    pybvh = library('pybvh', 'trl_suite[clips]')
     with tempfile.TemporaryDirectory() as folder:
         copy = pathlib.Path(folder, 'copy.bvh')  # pybvh reads no other suffix
         copy.write_text(text)

@@ -1,7 +1,7 @@
 """All environments as data: ids as in the papers, aliases, tags, one-line descriptions.
 
-Environments tagged 'original' are registered in the original simulator; those tagged 'completion' are
-combinations that its papers name or imply but that it does not register.
+Every environment has one of the tags 'original' (registered in the original simulator), 'completion'
+(not registered there: a combination that its papers name or imply) and 'addition' (neither).
 """
 
 from __future__ import annotations
@@ -10,7 +10,24 @@ from trl_suite.registry import deeploco, imitation, plaid, terrainrl
 from trl_suite.registry.spec import STEP_LIMIT, EnvSpec
 from trl_suite.util import errors
 
-__all__ = ['ALIASES', 'BY_ID', 'BY_TASK', 'SPECS', 'STEP_LIMIT', 'EnvSpec', 'find', 'spec_of']
+__all__ = [
+    'ALIASES',
+    'BY_ID',
+    'BY_TASK',
+    'FAMILIES',
+    'SPECS',
+    'STEP_LIMIT',
+    'EnvSpec',
+    'find',
+    'spec_of',
+]
+
+FAMILIES = {  # titles of domains, in the order of the documentation
+    'imitation': 'Imitation: tracking a clip on flat ground, or in three dimensions',
+    'plaid': 'PLAiD: tracking a clip over terrain',
+    'terrainrl': 'TerrainRL: gaits whose parameters an action sets for one cycle',
+    'deeploco': 'DeepLoco: tracking and planning footsteps',
+}
 
 SPECS: tuple[EnvSpec, ...] = (
     *plaid.SPECS,

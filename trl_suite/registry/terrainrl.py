@@ -22,9 +22,11 @@ _GAIT_TERRAINS = (
     ('Walls', 'walls', 'walls'),
     ('Steps', 'steps', 'steps up and down'),
 )
-_GAIT_CHARACTERS = {
+_NAMES = {  # in ids
     'biped2d_simbicon': 'Biped2D', 'dog': 'Dog2D', 'raptor': 'Raptor2D', 'hopper': 'Hopper2D',
+    'goat': 'Goat2D',
 }  # fmt: skip
+_ON_ALL_TERRAINS = ('biped2d_simbicon', 'dog', 'raptor', 'hopper')
 _MORE_GAITS = (
     ('dog', 'Narrow_Gaps', 'narrow_gaps', 'clusters of narrow gaps'),
     ('dog', 'Tight_Gaps', 'tight_gaps', 'clusters of closely spaced gaps'),
@@ -40,8 +42,8 @@ _MORE_GAITS = (
 )
 
 
-def _gait(character: str, name: str, preset: str, words: str, original: bool) -> EnvSpec:
-    figure = {**_GAIT_CHARACTERS, 'goat': 'Goat2D'}[character]
+def _gait(character: str, name: str, preset: str, words: str, origin: str) -> EnvSpec:
+    figure = _NAMES[character]
     return EnvSpec(
         id=f'FSM_{figure}_Terrain_{name}-v0',
         domain='terrainrl',
@@ -51,16 +53,16 @@ def _gait(character: str, name: str, preset: str, words: str, original: bool) ->
         terrain=preset,
         task_type='gait',
         description=f'The {figure[:-2].lower()} crosses {words}; an action sets the gait parameters of a cycle.',
-        tags=frozenset({'planar', 'original' if original else 'completion'}),
+        tags=frozenset({'planar', origin}),
         step_limit=STEP_LIMIT,
     )
 
 
 SPECS = (
     *(
-        _gait(character, *terrain, original=True)
-        for character in _GAIT_CHARACTERS
+        _gait(character, *terrain, 'original')
+        for character in _ON_ALL_TERRAINS
         for terrain in _GAIT_TERRAINS
     ),
-    *(_gait(*each, original=False) for each in _MORE_GAITS),
+    *(_gait(*each, 'completion') for each in _MORE_GAITS),
 )

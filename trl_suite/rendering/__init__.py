@@ -2,18 +2,15 @@
 
 from trl_suite.rendering.drawing import Policy, check_gl, frame, frames, no_gl, replay, watching
 from trl_suite.rendering.pictures import (
-    CONTROL_FPS,
     IMAGE_SUFFIXES,
     REPLAY_SUFFIXES,
     STRIP_MARGIN,
-    VIDEO_SUFFIXES,
-    Video,
     film_strip,
     height_map,
     plot_terrain,
     spread,
-    video,
 )
+from trl_suite.rendering.video import CONTROL_FPS, VIDEO_SUFFIXES, Video, video
 
 __all__ = [
     'CONTROL_FPS',

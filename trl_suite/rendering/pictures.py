@@ -1,30 +1,26 @@
-"""Pictures as files, without OpenGL: videos, film strips, plots of terrain, height maps.
+"""Pictures made without OpenGL: film strips, plots of terrain, height maps.
 
 `trl_suite.rendering` also exports these names. Files get their names only when they are complete.
-Videos, PNG files and plots need `pip install 'trl_suite[video]'`.
+PNG files and plots need `pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import subprocess
 from collections.abc import Iterable
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tqdm
 
 from trl_suite import terrain as terrains
+from trl_suite.rendering.video import check_image
 from trl_suite.terrain.spatial.windows import AHEAD, SAMPLES
 from trl_suite.util import errors
 from trl_suite.util.files import Path, check_path, replacing
+from trl_suite.util.libraries import library
 
 if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
 
-CONTROL_FPS = 30.0  # one frame per control step of 1/30 s plays in real time
 STRIP_MARGIN = 4  # pixels of white between the pictures of a film strip
 MAP_PIXELS = 8  # of each sample of a height map, along both axes
 HIGHER, LEVEL, LOWER = (150, 70, 20), (235, 235, 230), (20, 70, 150)  # red, green, blue
@@ -32,135 +28,8 @@ ROOT_COLOUR = (20, 20, 20)  # at the character's position on its height map
 MAX_SPAN = 300.0  # m; of a plot of three-dimensional terrain
 MOST_DRAWS = 100  # in one plot
 MAP_POINTS = 400  # largest number of points along each axis of such a plot
-VIDEO_SUFFIXES = ('.mp4', '.gif')
 IMAGE_SUFFIXES = ('.png',)
 REPLAY_SUFFIXES = ('.html',)
-
-
-def video(frames: Iterable[np.ndarray], path: Path, fps: float = CONTROL_FPS) -> None:
-    """Writes frames as a video; equivalent to `Video`, in one call.
-
-    Args:
-      frames: pictures (h, w, 3) uint8, all of one size; may be a generator such as
-        `rendering.frames`. Their number is shown while writing takes longer than 1 s.
-      path: file to write; .mp4 (h264) or .gif.
-      fps: frames per second; 30 is real time. In a .gif each frame lasts a multiple of 1/100 s.
-
-    Raises:
-      ValueError: another suffix, no pictures, pictures of different sizes, or an odd size for h264.
-      ImportError: the extra 'video' is not installed.
-      OSError: the file cannot be written.
-    """
-    with Video(path, fps) as writer:
-        # disable=None: no bar where stderr is not a terminal; a notebook always has one.
-        for image in tqdm.tqdm(frames, unit='picture', delay=1, disable=None):
-            writer.add(image)
-
-
-class Video:
-    """A video to which frames are added one by one; an .mp4 keeps none of them in memory.
-
-    Used as a context manager; the file is created at the end, and not after an exception.
-    Arguments and errors are those of `video`.
-    """
-
-    _encoder: subprocess.Popen[bytes] | None = None
-
-    def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
-        self._path = check_path(path, VIDEO_SUFFIXES)
-        if not 0 < fps < np.inf:
-            raise ValueError(f'fps is {fps}; expected a positive number')
-        self._fps = fps
-        self._images: list[Any] = []  # of a .gif
-        module = 'imageio_ffmpeg' if self._path.suffix == '.mp4' else 'PIL.Image'
-        self._library = _optional(module)
-        self._shape: tuple[int, ...] | None = None
-        self._files = contextlib.ExitStack()
-
-    def __enter__(self) -> Video:
-        self._part = self._files.enter_context(replacing(self._path))
-        return self
-
-    def add(self, image: np.ndarray) -> None:
-        """Adds a picture, shape (h, w, 3), uint8."""
-        image = _image(image)
-        if self._shape is None:
-            self._shape = image.shape
-            if self._path.suffix == '.mp4' and (image.shape[0] % 2 or image.shape[1] % 2):
-                raise ValueError(
-                    f'{self._path}: frames are {image.shape[1]}x{image.shape[0]} pixels; h264 needs '
-                    'even numbers'
-                )
-        elif image.shape != self._shape:
-            raise ValueError(
-                f'{self._path}: a frame has shape {image.shape}, those before it {self._shape}'
-            )
-        if self._path.suffix != '.mp4':
-            self._images.append(self._library.fromarray(image))
-            return
-        if self._encoder is None:
-            self._encoder = self._started(*image.shape[:2])
-        assert self._encoder.stdin is not None
-        try:
-            self._encoder.stdin.write(np.ascontiguousarray(image).data)
-        except OSError:
-            raise self._failure(self._encoder) from None
-
-    def _started(self, height: int, width: int) -> subprocess.Popen[bytes]:
-        """Starts ffmpeg, whose exit status tells whether all was written; imageio ignores it."""
-        command = [
-            self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
-            '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
-            'yuv420p', '-crf', '15', str(self._part),
-        ]  # fmt: skip
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            start_new_session=True,  # an interrupt from the keyboard is for this process alone
-        )  # fmt: skip
-
-    def _failure(self, encoder: subprocess.Popen[bytes]) -> OSError:
-        """Returns why the encoder ended, which it must have done."""
-        assert encoder.stderr is not None
-        lines = encoder.stderr.read().decode(errors='replace').split('\n')
-        said = next((line.strip() for line in reversed(lines) if line.strip()), '')
-        return OSError(
-            f'{self._path}: the encoder failed: {said or f"exit status {encoder.wait()}"}'
-        )
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            if kind is None:
-                self._finish()
-        except BaseException as failure:
-            kind, error, traceback = type(failure), failure, failure.__traceback__
-            raise
-        finally:
-            if self._encoder is not None:
-                self._encoder.kill()  # nothing, if it has ended
-                with contextlib.suppress(OSError, ValueError):
-                    self._encoder.communicate()
-            self._files.__exit__(kind, error, traceback)  # removes the part after an exception
-
-    def _finish(self) -> None:
-        if self._shape is None:
-            raise ValueError(f'{self._path}: no frames were given')
-        if self._encoder is None:
-            first, *others = self._images
-            first.save(
-                self._part, save_all=True, append_images=others, duration=1000 / self._fps, loop=0
-            )
-            return
-        assert self._encoder.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._encoder.stdin.close()
-        failure = self._failure(self._encoder)
-        if self._encoder.wait():
-            raise failure
 
 
 def film_strip(
@@ -183,7 +52,7 @@ def film_strip(
     """
     if columns < 1:
         raise ValueError(f'columns is {columns}; expected at least 1')
-    images = [_image(image) for image in frames]
+    images = [check_image(image) for image in frames]
     if not images:
         raise ValueError('a film strip needs at least one frame')
     if len({image.shape for image in images}) > 1:
@@ -238,7 +107,7 @@ def plot_terrain(
     if seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or more')
     # `Figure` needs no screen and does not affect the user's pyplot.
-    make = _optional('matplotlib.figure').Figure
+    make = library('matplotlib.figure', 'trl_suite[video]').Figure
     if terrain.spatial:
         figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
         _plot_maps(figure, terrain, draws, length, seed, terrain_level)
@@ -359,36 +228,16 @@ def height_map(
     image = np.repeat(np.repeat(colours.round().astype(np.uint8), MAP_PIXELS, 0), MAP_PIXELS, 1)
     # A sample is at the centre of its square.
     behind = -AHEAD[0] / (AHEAD[1] - AHEAD[0]) * (SAMPLES - 1)
-    line = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
+    middle = round((SAMPLES - 1 - behind + 0.5) * MAP_PIXELS)
     column = round(0.5 * SAMPLES * MAP_PIXELS)
     mark = MAP_PIXELS // 2
-    image[line - mark : line + mark, column - mark : column + mark] = ROOT_COLOUR
+    image[middle - mark : middle + mark, column - mark : column + mark] = ROOT_COLOUR
     if path is not None:
         _write_png(image, path)
     return image
 
 
 def _write_png(image: np.ndarray, path: Path) -> None:
-    picture = _optional('PIL.Image').fromarray(image)
+    picture = library('PIL.Image', 'trl_suite[video]').fromarray(image)
     with replacing(check_path(path, IMAGE_SUFFIXES)) as part:
         picture.save(part)
-
-
-def _image(image: np.ndarray) -> np.ndarray:
-    image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise ValueError(
-            f'a frame has shape {image.shape} and type {image.dtype}; expected (h, w, 3) of uint8'
-        )
-    return image
-
-
-def _optional(name: str) -> Any:
-    """Imports a module of the extra 'video'."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition('.')[0]
-        raise ImportError(
-            f"{package} is needed and not installed; pip install 'trl_suite[video]'"
-        ) from error

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 import io
 import socket
 from collections.abc import Iterable, Iterator
@@ -26,6 +25,7 @@ from trl_suite.arenas.scene import PARKED
 from trl_suite.rendering.overlays import Overlay
 from trl_suite.terrain import SPACING
 from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.util.libraries import library
 
 LIFT = 0.1  # share of a difference in height that the view follows per frame
 ROOM = 2000  # geoms of overlays and decoration
@@ -50,12 +50,7 @@ def load_viser() -> Any:
     Raises:
       ImportError: the extra 'viewer' is not installed.
     """
-    try:
-        return importlib.import_module('viser')
-    except ImportError as error:
-        raise ImportError(
-            "viser is needed for this and missing; pip install 'trl_suite[viewer]'"
-        ) from error
+    return library('viser', 'trl_suite[viewer]')
 
 
 def start_server(host: str, port: int) -> Any:

@@ -251,7 +251,7 @@ class SpatialTask(Task):
             world.engine, figure.body, figure.state, figure.ground, self.joint_map.drive(first),
             world.ctrl, self.period, starts.get('terrain', -1), starts['pose'],
             starts['velocity'], starts.get('phase', -1), self._view(), self.clock, self.travel,
-            figure.found, self._full_observation, np.zeros((n, len(self.joint_map))),
+            figure.measurement, self._full_observation, np.zeros((n, len(self.joint_map))),
             np.zeros(n, bool), self.outcome,
         )  # fmt: skip
 

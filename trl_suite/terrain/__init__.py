@@ -23,6 +23,7 @@ terrain.from_mesh('canyon.glb')  # also from_image, from_heights, from_function
 terrain.save_mesh(forest, 'forest.obj', low=-20, high=20)
 """
 
+from trl_suite.terrain.custom import from_function, from_heights, from_image, from_mesh
 from trl_suite.terrain.mesh import WRITTEN, save_mesh, to_mesh
 from trl_suite.terrain.parameters import PRESETS, PRESETS3D, Terrain, load
 from trl_suite.terrain.planar.generators import GENERATORS, SPACING, Profile, register
@@ -31,7 +32,6 @@ from trl_suite.terrain.spatial.generators import GENERATORS3D, IDLE, register3d
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Belts, Boxes, Grid, Layout, Movers, boxes
 from trl_suite.terrain.spatial.surroundings import Surroundings, capacity
-from trl_suite.terrain.surface import from_function, from_heights, from_image, from_mesh
 
 __all__ = [
     'GENERATORS',

@@ -1,4 +1,4 @@
-"""Valid values of terrain parameters, and valid names of new terrain types."""
+"""Valid values and units of terrain parameters, and valid names of new terrain types."""
 
 from __future__ import annotations
 
@@ -39,6 +39,24 @@ LIMITS = {
     # Ground that is a function of x, or of x and y.
     'StartSpan': (0.0, 1e5),
 }
+# Units of parameters other than lengths in m, by name without Min or Max.
+UNITS = {
+    **dict.fromkeys(('SlopeDelta', 'SlopeDeltaRange', 'Slope'), '1, rise per m'),
+    **dict.fromkeys(('CliffMiniCount', 'NarrowGapCount', 'NumObstacles'), '1, number'),
+    **dict.fromkeys(('ConveyorNumStrips', 'ConveyorNumSlices'), '1, number'),
+    **dict.fromkeys(('ObstacleSpeed0', 'ObstacleSpeed1'), 'm/s'),
+    'ObstacleSpeedLerpPow': '1, exponent',
+    'ObstacleDensity': '1/m²',
+    'PathMaxTurnDelta': 'rad',
+    'TrailStepProb': '1, probability',
+    'var3d_checkers.Slope': 'm',  # the name has another meaning in this type
+}
+
+
+def unit(type_name: str, name: str) -> str:
+    """Returns the unit of a terrain type's parameter."""
+    stem = name.removesuffix('Min').removesuffix('Max')
+    return UNITS.get(f'{type_name}.{stem}', UNITS.get(stem, 'm'))
 
 
 def check(

@@ -1,4 +1,4 @@
-"""Export of generated ground as a mesh, for other programs."""
+"""Mesh files: ground written for other programs, and the triangles and heights of a file."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from trl_suite.terrain.planar.generators import SPACING
 from trl_suite.terrain.planar.ground import PlanarGround
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Boxes
-from trl_suite.terrain.surface import Y_UP, library
-from trl_suite.util.files import check_path, replacing
+from trl_suite.util.compiled import compiled_loop
+from trl_suite.util.files import check_path, check_size, replacing
+from trl_suite.util.libraries import library
 
 if TYPE_CHECKING:
     import trimesh
 
 WRITTEN = ('.obj', '.glb', '.stl')
+READ = ('.obj', '.glb', '.gltf', '.stl', '.ply')
+Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
+MOST_BYTES = 10**9  # of a file that is read
 WIDTH = 2.0  # m; of the band that represents planar ground
 DEPTH = 2.0  # m; of boxes on ground without a level
 LARGEST_SIDE = 500.0  # m; of the exported piece
@@ -143,3 +147,61 @@ def _box(box: Boxes, level: float | None, low: np.ndarray, high: np.ndarray) -> 
         position[1] + sine * along + cosine * across,
         np.where(signs[:, 2] > 0, upper, bottom),
     ], 1), np.asarray(unit.faces)  # fmt: skip
+
+
+def read_triangles(file: os.PathLike[str]) -> np.ndarray:
+    """Returns the corners of a mesh file's triangles, (t, 3, 3), in its own units.
+
+    Raises:
+      ValueError: the file is too large, or not a mesh.
+      ImportError: trimesh is not installed.
+    """
+    trimesh = library('trimesh', 'trimesh')
+    check_size(file, MOST_BYTES)
+    try:
+        # Unprocessed: merging equal corners takes most of the time, and changes no height.
+        mesh = trimesh.load_scene(file, process=False).to_mesh()
+        triangles = np.asarray(mesh.triangles, float)
+    except Exception as error:  # the reader raises types of its own
+        raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
+    if not len(triangles) or not np.isfinite(triangles).all():
+        raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')
+    return triangles
+
+
+def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns the highest points of triangles over a grid, (k, m) m; -inf where there are none.
+
+    Args:
+      triangles: corners, (t, 3, 3) m.
+      x, y: ascending, (k,) and (m,) m.
+    """
+    # Ray casting by trimesh would need another library, and take three times as long.
+    heights = np.full((len(x), len(y)), -np.inf)
+    low, high = (triangles.min(1) - 1e-9).T, (triangles.max(1) + 1e-9).T
+    bounds = [np.searchsorted(x, low[0]), np.searchsorted(x, high[0])]
+    bounds += [np.searchsorted(y, low[1]), np.searchsorted(y, high[1])]
+    spans = np.stack(bounds, 1)
+    _raise_heights(np.ascontiguousarray(triangles), spans, x, y, heights)
+    return heights
+
+
+@compiled_loop
+def _raise_heights(
+    triangles: np.ndarray, spans: np.ndarray, x: np.ndarray, y: np.ndarray, heights: np.ndarray
+) -> None:
+    """Raises heights (k, m) to triangles, each over the points of its span."""
+    for t in range(len(triangles)):
+        corner = triangles[t]
+        px, py, pz = corner[0, 0], corner[0, 1], corner[0, 2]
+        ux, uy, uz = corner[1, 0] - px, corner[1, 1] - py, corner[1, 2] - pz
+        vx, vy, vz = corner[2, 0] - px, corner[2, 1] - py, corner[2, 2] - pz
+        area = ux * vy - uy * vx
+        if abs(area) < 1e-12:  # seen edge on
+            continue
+        for i in range(spans[t, 0], spans[t, 1]):
+            for j in range(spans[t, 2], spans[t, 3]):
+                dx, dy = x[i] - px, y[j] - py
+                along, across = (dx * vy - dy * vx) / area, (ux * dy - uy * dx) / area
+                if along >= -1e-9 and across >= -1e-9 and along + across <= 1 + 1e-9:
+                    heights[i, j] = max(heights[i, j], pz + along * uz + across * vz)

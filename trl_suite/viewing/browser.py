@@ -18,17 +18,16 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 
 from trl_suite import suite
 from trl_suite.environments import named_policies
-from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene
 from trl_suite.viewing import panel
-from trl_suite.viewing.session import FRAME, Policy, Session
+from trl_suite.viewing.session import FRAME, Loaded, Session
 
 HOST, PORT = '127.0.0.1', 8080
 IDLE = 0.01  # s; between two looks at what was asked for
@@ -40,15 +39,6 @@ DECORATION = {  # drawn by MuJoCo
     'joint axes': mujoco.mjtVisFlag.mjVIS_JOINT,
     'centres of mass': mujoco.mjtVisFlag.mjVIS_COM,
 }
-
-
-class Loaded(NamedTuple):
-    """An environment with all policies that fit it, and which of them acts."""
-
-    spec: EnvSpec
-    environment: Environment
-    policies: dict[str, Policy]
-    policy: str
 
 
 class Browser:

@@ -168,7 +168,8 @@ def make(
 
     Args:
       folder: output folder; created if necessary.
-      only: shell-style pattern of paths in the folder; `*` is added on both sides.
+      only: shell-style pattern of paths in the folder, in upper or lower case; `*` is added on both
+        sides.
       again: whether to replace existing pictures.
       progress: whether to show a progress bar.
       moves: make the animated pictures of environments instead of the others.
@@ -184,7 +185,8 @@ def make(
     """
     folder = pathlib.Path(folder)
     choices = moving_items() if moves else items()
-    chosen = [item for item in choices if fnmatch.fnmatch(item.path, f'*{only}*')]
+    pattern = f'*{only}*'.lower()
+    chosen = [item for item in choices if fnmatch.fnmatchcase(item.path.lower(), pattern)]
     if not chosen:
         raise ValueError(
             f'no picture matches {only!r}; expected a part of an id or the name of a character, as '

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import html
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,10 +12,7 @@ from trl_suite import suite
 from trl_suite import terrain as terrains
 from trl_suite.rendering.web_scene import load_viser
 from trl_suite.terrain.checks import LIMITS
-from trl_suite.viewing.session import PUSHES, Session
-
-if TYPE_CHECKING:
-    from trl_suite.viewing.browser import Browser, Loaded
+from trl_suite.viewing.session import PUSHES, Loaded, Session
 
 SPEEDS = {'1/8': 0.125, '1/4': 0.25, '1/2': 0.5, '1': 1.0, '2': 2.0, '4': 4.0}
 PUSH = (0.1, 5.0, 1.0)  # m/s; least, most, and at first
@@ -28,11 +26,31 @@ LEGEND = 8  # most lines of a plot that are named below it
 NOTICE = 8.0  # s; how long a message stays
 
 
-class Panel:
-    """The controls of a `Browser`, built once; `show` fits them to an environment."""
+class Controlled(Protocol):
+    """The viewer that a panel controls; see `trl_suite.viewing.browser.Browser`."""
 
-    def __init__(self, server: Any, browser: Browser) -> None:
-        self._server, self._browser = server, browser
+    seed: int
+    playing: bool
+    speed: float
+    shown: dict[str, bool]
+
+    def play(self, playing: bool) -> None: ...
+    def step(self) -> None: ...
+    def reset(self, seed: int | None = None) -> None: ...
+    def push(self, direction: str, speed: float) -> None: ...
+    def show(self, name: str, shown: bool) -> None: ...
+    def follow(self, followed: bool) -> None: ...
+    def choose_environment(self, spec: str) -> None: ...
+    def choose_terrain(self, terrain: str | Mapping[str, Any]) -> None: ...
+    def choose_policy(self, name: str) -> None: ...
+    def upload_policy(self, name: str, content: bytes) -> None: ...
+
+
+class Panel:
+    """The controls of a viewer, built once; `show` fits them to an environment."""
+
+    def __init__(self, server: Any, viewer: Controlled) -> None:
+        self._server, self._viewer = server, viewer
         gui = server.gui
         gui.set_panel_label('trl_suite')
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -50,36 +68,36 @@ class Panel:
             self._rewards, self._torques = map(self._add_plot, ('rewards', 'joint torques (N m)'))
 
     def _add_run(self) -> None:
-        gui, browser = self._server.gui, self._browser
+        gui, viewer = self._server.gui, self._viewer
         self._environment = gui.add_dropdown('Environment', suite.ALL_IDS)
-        self._when_chosen(self._environment, browser.choose_environment)
+        self._when_chosen(self._environment, viewer.choose_environment)
         self._policy = gui.add_dropdown('Policy', ['zero'])
-        self._when_chosen(self._policy, browser.choose_policy)
+        self._when_chosen(self._policy, viewer.choose_policy)
         upload = gui.add_upload_button('Policy from a file', mime_type='.npz')
-        upload.on_upload(lambda _: browser.upload_policy(upload.value.name, upload.value.content))
-        seed = gui.add_number('Seed', initial_value=browser.seed, min=0, max=2**32 - 1, step=1)
+        upload.on_upload(lambda _: viewer.upload_policy(upload.value.name, upload.value.content))
+        seed = gui.add_number('Seed', initial_value=viewer.seed, min=0, max=2**32 - 1, step=1)
         gui.add_button('First episode of this seed').on_click(
-            lambda _: browser.reset(int(seed.value))
+            lambda _: viewer.reset(int(seed.value))
         )
-        gui.add_button('Next episode').on_click(lambda _: browser.reset())
+        gui.add_button('Next episode').on_click(lambda _: viewer.reset())
         self._play = gui.add_button('Pause')
-        self._play.on_click(lambda _: browser.play(not browser.playing))
-        gui.add_button('One frame').on_click(lambda _: browser.step())
+        self._play.on_click(lambda _: viewer.play(not viewer.playing))
+        gui.add_button('One frame').on_click(lambda _: viewer.step())
         speed = gui.add_button_group('Speed', tuple(SPEEDS))
-        speed.on_click(lambda event: setattr(browser, 'speed', SPEEDS[event.target.value]))
+        speed.on_click(lambda event: setattr(viewer, 'speed', SPEEDS[event.target.value]))
         with gui.add_folder('Push'):
             least, most, first = PUSH
             strength = gui.add_slider('m/s', min=least, max=most, step=0.1, initial_value=first)
             pushes = gui.add_button_group('to', tuple(PUSHES))
-            pushes.on_click(lambda event: browser.push(event.target.value, strength.value))
+            pushes.on_click(lambda event: viewer.push(event.target.value, strength.value))
 
     def _add_show(self) -> None:
-        gui, browser = self._server.gui, self._browser
+        gui, viewer = self._server.gui, self._viewer
         follow = gui.add_checkbox('follow the character', initial_value=True)
-        follow.on_update(lambda event: browser.follow(event.target.value))
-        for name, shown in browser.shown.items():
+        follow.on_update(lambda event: viewer.follow(event.target.value))
+        for name, shown in viewer.shown.items():
             box = gui.add_checkbox(name, initial_value=shown)
-            box.on_update(lambda event, name=name: browser.show(name, event.target.value))
+            box.on_update(lambda event, name=name: viewer.show(name, event.target.value))
 
     def _when_chosen(self, handle: Any, choose: Any) -> None:
         def chosen(event: Any) -> None:
@@ -104,12 +122,12 @@ class Panel:
 
     def _add_terrain(self, terrain: terrains.Terrain) -> None:
         """Adds a choice of presets, and a slider for each parameter of the terrain."""
-        gui, browser = self._server.gui, self._browser
+        gui, viewer = self._server.gui, self._viewer
         presets = tuple(terrains.PRESETS3D if terrain.spatial else terrains.PRESETS)
         name = terrain.name if terrain.name in presets else ''
         choices = presets if name else ('', *presets)
         preset = gui.add_dropdown('Preset', choices, initial_value=name)
-        preset.on_update(lambda event: browser.choose_terrain(event.target.value))
+        preset.on_update(lambda event: viewer.choose_terrain(event.target.value))
         sliders = {}
         for key, value in terrain.parameters().items():
             low, high = slider_range(key, value)
@@ -117,7 +135,7 @@ class Panel:
             sliders[key] = gui.add_slider(key, min=low, max=high, step=step, initial_value=value)
         apply = gui.add_button('Lay this terrain')
         apply.on_click(
-            lambda _: browser.choose_terrain(
+            lambda _: viewer.choose_terrain(
                 {
                     'Type': terrain.type,
                     'Params': [{key: slider.value for key, slider in sliders.items()}],

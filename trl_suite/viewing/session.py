@@ -11,10 +11,11 @@ import mujoco
 import numpy as np
 
 from trl_suite.util import errors
-from trl_suite.viewing.frames import Frames
+from trl_suite.viewing.playback import Playback
 
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
+    from trl_suite.registry.spec import EnvSpec
 
 Policy = Callable[[dm_env.TimeStep], np.ndarray]
 
@@ -38,6 +39,15 @@ class Moment(NamedTuple):
     time: float
     rewards: np.ndarray
     torques: np.ndarray
+
+
+class Loaded(NamedTuple):
+    """An environment with all policies that fit it, and which of them acts."""
+
+    spec: EnvSpec
+    environment: Environment
+    policies: dict[str, Policy]
+    policy: str
 
 
 class Session:
@@ -66,7 +76,7 @@ class Session:
         self.environment, self.policy = environment, policy
         self._frames: Any = environment
         if hasattr(environment.task, 'watch'):
-            self._frames = Frames(environment, lambda time_step: self.policy(time_step))
+            self._frames = Playback(environment, lambda time_step: self.policy(time_step))
         model = environment.physics.model
         root_dofs, self._root_dof = _root_dofs(environment)
         joints = [
@@ -109,7 +119,7 @@ class Session:
         """
         physics = self.environment.physics
         before = physics.data.time
-        act = self._frames.policy if isinstance(self._frames, Frames) else self.policy
+        act = self._frames.policy if isinstance(self._frames, Playback) else self.policy
         if self._push.any() and self.is_between_steps:
             self._apply_push()
         if self.time_step.last():
@@ -134,7 +144,7 @@ class Session:
     @property
     def is_between_steps(self) -> bool:
         """Whether the next frame starts a control step, with a new action of the policy."""
-        return not (isinstance(self._frames, Frames) and self._frames.is_within_step)
+        return not (isinstance(self._frames, Playback) and self._frames.is_within_step)
 
     def push(self, direction: str, speed: float) -> None:
         """Adds a velocity to the character's root before the next control step.

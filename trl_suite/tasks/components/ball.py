@@ -95,17 +95,19 @@ def no_ball(n: int) -> BallRules:
 
 
 @compiled
-def remember(i: int, physics: SpatialState, found: SpatialMeasurement, ball: BallRules) -> None:
+def remember(
+    i: int, physics: SpatialState, measurement: SpatialMeasurement, ball: BallRules
+) -> None:
     """Stores the positions of ball and walker at the beginning of a step."""
     for k in range(3):
         ball.state.begin[i, k] = physics.qpos[i, ball.qpos + k]
-        ball.state.walker[i, k] = found.com[i, k]
+        ball.state.walker[i, k] = measurement.com[i, k]
 
 
 @compiled
 def dribble(
     i: int, first: int, share: float, seconds: float, goal: np.ndarray, physics: SpatialState,
-    found: SpatialMeasurement, ball: BallRules, terms: np.ndarray,
+    measurement: SpatialMeasurement, ball: BallRules, terms: np.ndarray,
 ) -> float:  # fmt: skip
     """Writes the reward terms of a step, and whether the ball is at its goal.
 
@@ -115,7 +117,7 @@ def dribble(
       share: factor of these terms, their share of the reward.
       seconds: duration of the step, s.
       goal: positions of the goals, (n, 3) m.
-      physics, found: state and measurement of all simulations at the end of the step.
+      physics, measurement: state and measurement of all simulations at the end of the step.
       ball: the balls, with positions at the beginning of the step.
       terms: reward terms, (n, k).
 
@@ -127,7 +129,11 @@ def dribble(
     z = physics.qpos[i, ball.qpos + 2]
     gap_x, gap_y = x - walker[i, 0], y - walker[i, 1]
     towards_ball = _speed_along(
-        found.com[i, 0] - walker[i, 0], found.com[i, 1] - walker[i, 1], gap_x, gap_y, seconds
+        measurement.com[i, 0] - walker[i, 0],
+        measurement.com[i, 1] - walker[i, 1],
+        gap_x,
+        gap_y,
+        seconds,
     )
     towards_goal = _speed_along(
         x - begin[i, 0], y - begin[i, 1], goal[i, 0] - begin[i, 0], goal[i, 1] - begin[i, 1],
@@ -163,7 +169,7 @@ def _speed_along(
 
 @compiled
 def observe_ball(
-    i: int, column: int, goal: np.ndarray, physics: SpatialState, found: SpatialMeasurement,
+    i: int, column: int, goal: np.ndarray, physics: SpatialState, measurement: SpatialMeasurement,
     ball: BallRules, observation: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes the blocks goal and ball, in the heading frame of the walker.
@@ -173,17 +179,21 @@ def observe_ball(
     velocity (3), rad/s.
     """
     x, y = physics.qpos[i, ball.qpos], physics.qpos[i, ball.qpos + 1]
-    bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, found)
+    bearing, distance = polar(i, goal[i, 0] - x, goal[i, 1] - y, measurement)
     observation[i, column], observation[i, column + 1] = bearing, distance
-    bearing, distance = polar(i, x - found.root[i, 0], y - found.root[i, 1], found)
+    bearing, distance = polar(
+        i, x - measurement.root[i, 0], y - measurement.root[i, 1], measurement
+    )
     column = ball.column
     observation[i, column], observation[i, column + 1] = bearing, distance
     observation[i, column + 2] = physics.qpos[i, ball.qpos + 2]
-    ahead, left = ahead_and_left(i, physics.qvel[i, ball.dof], physics.qvel[i, ball.dof + 1], found)
+    ahead, left = ahead_and_left(
+        i, physics.qvel[i, ball.dof], physics.qvel[i, ball.dof + 1], measurement
+    )
     observation[i, column + 3], observation[i, column + 4] = ahead, left
     observation[i, column + 5] = physics.qvel[i, ball.dof + 2]
     spin = physics.cvel[i, ball.body]
-    ahead, left = ahead_and_left(i, spin[0], spin[1], found)
+    ahead, left = ahead_and_left(i, spin[0], spin[1], measurement)
     observation[i, column + 6], observation[i, column + 7] = ahead, left
     observation[i, column + 8] = spin[2]
 

@@ -68,72 +68,91 @@ def comparison(
 
 
 @compiled
-def pose_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
+def pose_error(
+    i: int, row: int, fraction: float, comparison: Comparison, measurement: SpatialMeasurement
+) -> float:
     """Weighted sum of squared angles between rotations and squared differences of angles, rad^2."""
-    error, mine = 0.0, found.features
-    count = (by.angles - by.rotations) // 4
+    error, mine = 0.0, measurement.features
+    count = (comparison.angles - comparison.rotations) // 4
     for joint in range(count):
-        column = by.rotations + 4 * joint
+        column = comparison.rotations + 4 * joint
         dot = square = 0.0
         for k in range(column, column + 4):
-            other = feature(row, rest, k, by.tracks)
+            other = feature(row, fraction, k, comparison.tracks)
             dot += mine[i, k] * other
             square += other * other
         angle = 2 * math.acos(min(abs(dot) / math.sqrt(square), 1.0))  # the shortest rotation
-        error += by.pose_weights[joint] * (angle * angle)
-    for joint in range(by.rates - by.angles):
-        off = mine[i, by.angles + joint] - feature(row, rest, by.angles + joint, by.tracks)
-        error += by.pose_weights[count + joint] * (off * off)
+        error += comparison.pose_weights[joint] * (angle * angle)
+    for joint in range(comparison.rates - comparison.angles):
+        off = mine[i, comparison.angles + joint] - feature(
+            row, fraction, comparison.angles + joint, comparison.tracks
+        )
+        error += comparison.pose_weights[count + joint] * (off * off)
     return error
 
 
 @compiled
-def rate_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
+def rate_error(
+    i: int, row: int, fraction: float, comparison: Comparison, measurement: SpatialMeasurement
+) -> float:
     """Weighted sum of squared differences of rates, rad^2/s^2."""
     error = 0.0
-    for k in range(by.effectors - by.rates):
-        off = found.features[i, by.rates + k] - feature(row, rest, by.rates + k, by.tracks)
-        error += by.rate_weights[k] * (off * off)
+    for k in range(comparison.effectors - comparison.rates):
+        off = measurement.features[i, comparison.rates + k] - feature(
+            row, fraction, comparison.rates + k, comparison.tracks
+        )
+        error += comparison.rate_weights[k] * (off * off)
     return error
 
 
 @compiled
 def effector_error(
-    i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement
+    i: int, row: int, fraction: float, comparison: Comparison, measurement: SpatialMeasurement
 ) -> float:
     """Mean over end effectors of the squared distance, m^2."""
-    error, count = 0.0, by.com_velocity - by.effectors
-    for k in range(by.effectors, by.com_velocity):
-        off = found.features[i, k] - feature(row, rest, k, by.tracks)
+    error, count = 0.0, comparison.com_velocity - comparison.effectors
+    for k in range(comparison.effectors, comparison.com_velocity):
+        off = measurement.features[i, k] - feature(row, fraction, k, comparison.tracks)
         error += off * off
     return error / (count // 3)
 
 
 @compiled
 def com_error(
-    i: int, row: int, rest: float, turned: float, by: Comparison, found: SpatialMeasurement
+    i: int,
+    row: int,
+    fraction: float,
+    turned: float,
+    comparison: Comparison,
+    measurement: SpatialMeasurement,
 ) -> float:
     """Scaled squared difference of the velocities of the centre of mass, m^2/s^2.
 
     The velocity of the reference is rotated about z by `turned`, rad.
     """
     cosine, sine = math.cos(turned), math.sin(turned)
-    x = feature(row, rest, by.com_velocity, by.tracks)
-    y = feature(row, rest, by.com_velocity + 1, by.tracks)
-    off_x = found.com_velocity[i, 0] - (cosine * x - sine * y)
-    off_y = found.com_velocity[i, 1] - (sine * x + cosine * y)
-    off_z = found.com_velocity[i, 2] - feature(row, rest, by.com_velocity + 2, by.tracks)
+    x = feature(row, fraction, comparison.com_velocity, comparison.tracks)
+    y = feature(row, fraction, comparison.com_velocity + 1, comparison.tracks)
+    off_x = measurement.com_velocity[i, 0] - (cosine * x - sine * y)
+    off_y = measurement.com_velocity[i, 1] - (sine * x + cosine * y)
+    off_z = measurement.com_velocity[i, 2] - feature(
+        row, fraction, comparison.com_velocity + 2, comparison.tracks
+    )
     return rewards.COM_ERROR_FACTOR * (off_x * off_x + off_y * off_y + off_z * off_z)
 
 
 @compiled
-def height_error(i: int, row: int, rest: float, by: Comparison, found: SpatialMeasurement) -> float:
+def height_error(
+    i: int, row: int, fraction: float, comparison: Comparison, measurement: SpatialMeasurement
+) -> float:
     """Squared difference of the heights of the root, m^2."""
-    off = found.features[i, by.height] - feature(row, rest, by.height, by.tracks)
+    off = measurement.features[i, comparison.height] - feature(
+        row, fraction, comparison.height, comparison.tracks
+    )
     return off * off
 
 
 @compiled
-def term(k: int, error: float, by: Comparison) -> float:
+def term(k: int, error: float, comparison: Comparison) -> float:
     """Returns reward term k for an error."""
-    return rewards.term(error, by.term_weights[k], by.term_scales[k])
+    return rewards.term(error, comparison.term_weights[k], comparison.term_scales[k])

@@ -60,7 +60,9 @@ def footstep_plan(n: int) -> FootstepPlan:
 
 
 @compiled
-def update_stance(i: int, phase: float, found: SpatialMeasurement, plan: FootstepPlan) -> bool:
+def update_stance(
+    i: int, phase: float, measurement: SpatialMeasurement, plan: FootstepPlan
+) -> bool:
     """Switches the stance foot if the phase is in the other half, and writes the landing errors.
 
     Returns:
@@ -70,33 +72,33 @@ def update_stance(i: int, phase: float, found: SpatialMeasurement, plan: Footste
     if stance == plan.stance[i]:
         return False
     plan.stance[i] = stance  # the foot that has just landed
-    x = found.feet[i, stance, 0] - plan.landing[i, 0, 0]
-    y = found.feet[i, stance, 1] - plan.landing[i, 0, 1]
+    x = measurement.feet[i, stance, 0] - plan.landing[i, 0, 0]
+    y = measurement.feet[i, stance, 1] - plan.landing[i, 0, 1]
     plan.landing_error[i] = math.hypot(x, y)
-    plan.heading_error[i] = abs(wrapped(plan.heading[i] - found.heading[i]))
+    plan.heading_error[i] = abs(wrapped(plan.heading[i] - measurement.heading[i]))
     return True
 
 
 @compiled
 def observe_plan(
-    i: int, contact: int, column: int, found: SpatialMeasurement, plan: FootstepPlan,
+    i: int, contact: int, column: int, measurement: SpatialMeasurement, plan: FootstepPlan,
     observation: np.ndarray,
 ) -> None:  # fmt: skip
     """Writes the blocks contact and plan, from these columns on; see `SpatialFootsteps`."""
     for foot in range(2):
-        observation[i, contact + foot] = found.contact[i, foot]
+        observation[i, contact + foot] = measurement.contact[i, foot]
     for k in range(PLAN_SIZE - 1):
         observation[i, column + k] = 0.0
     for which in range(2):
         foot = plan.stance[i] if which else 1 - plan.stance[i]
         ahead, left = ahead_and_left(
-            i, plan.landing[i, which, 0] - found.feet[i, foot, 0],
-            plan.landing[i, which, 1] - found.feet[i, foot, 1], found,
+            i, plan.landing[i, which, 0] - measurement.feet[i, foot, 0],
+            plan.landing[i, which, 1] - measurement.feet[i, foot, 1], measurement,
         )  # fmt: skip
         slot = column + 6 * which + 3 * foot
         observation[i, slot], observation[i, slot + 1] = ahead, left
-        observation[i, slot + 2] = plan.landing[i, which, 2] - found.under[i]
-    off = wrapped(plan.heading[i] - found.heading[i])
+        observation[i, slot + 2] = plan.landing[i, which, 2] - measurement.under[i]
+    off = wrapped(plan.heading[i] - measurement.heading[i])
     observation[i, column + PLAN_SIZE - 1] = off
 
 

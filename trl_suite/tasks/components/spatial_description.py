@@ -61,10 +61,10 @@ _MIRRORED_BLOCKS = {
 
 def blocks(task: Any) -> Meanings:
     """Returns units and meanings of the observation blocks."""
-    found = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
+    meanings = {**BLOCKS, 'ball': BALL_BLOCK, **(_MIRRORED_BLOCKS if task.mirrored else {})}
     if hasattr(task, 'goals') or getattr(task, 'hidden_plan', False):
-        found['goal'] = TARGETS['ball' in task.blocks]
-    return found
+        meanings['goal'] = TARGETS['ball' in task.blocks]
+    return meanings
 
 
 def after(task: Any) -> Iterator[Section]:

@@ -12,10 +12,9 @@ from trl_suite.kinematics.spatial import (
     SpatialBody,
     SpatialMeasurement,
     SpatialState,
-    write_body,
-    write_terrain,
 )
 from trl_suite.kinematics.spatial import measure as measure_body
+from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -112,7 +111,7 @@ class SpatialRules(NamedTuple):
     given: View
     clock: Clock
     travel: Travel
-    found: SpatialMeasurement
+    measurement: SpatialMeasurement
     full: np.ndarray
     action: np.ndarray
     leaving: np.ndarray
@@ -187,17 +186,17 @@ def breaks_down(i: int, rules: SpatialRules) -> bool:
 def measure(i: int, rules: SpatialRules) -> None:
     """Measures the body, relative to the current ground."""
     spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
-    measure_body(i, rules.body, rules.physics, rules.ground, rules.found)
-    x = rules.found.root[i, 0] - rules.travel.origin[i, 0]
-    y = rules.found.root[i, 1] - rules.travel.origin[i, 1]
+    measure_body(i, rules.body, rules.physics, rules.ground, rules.measurement)
+    x = rules.measurement.root[i, 0] - rules.travel.origin[i, 0]
+    y = rules.measurement.root[i, 1] - rules.travel.origin[i, 1]
     rules.travel.distance[i] = np.sqrt(x * x + y * y)
 
 
 @compiled
 def observe_body(i: int, rules: SpatialRules) -> None:
     """Writes the blocks terrain, pose, velocity and phase of the full observation."""
-    write_terrain(i, rules.terrain, rules.ground, rules.found, rules.full)
-    write_body(i, rules.pose, rules.velocity, rules.found, rules.full)
+    write_terrain(i, rules.terrain, rules.ground, rules.measurement, rules.full)
+    write_body(i, rules.pose, rules.velocity, rules.measurement, rules.full)
     if rules.phase >= 0:
         phase = rules.clock.phase[i]
         rules.full[i, rules.phase] = phase

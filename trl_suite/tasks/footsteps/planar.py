@@ -94,7 +94,9 @@ def finish_step(i: int, rules: imitation_rules.Rules, plan: Plan, options: Optio
     if diverged:
         conclude(i, True, rules.outcome)
         return
-    measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+    measure(
+        i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
+    )
     compare(i, rules, plan, options)
     conclude(i, missed or has_fallen(i, rules.body, rules.physics), rules.outcome)
     observe(i, rules, plan, options)
@@ -149,15 +151,15 @@ def put_on_ground(i: int, rules: imitation_rules.Rules, plan: Plan) -> None:
 def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) -> None:
     """Writes the reward terms; in the second half of a step the plan replaces the clip."""
     imitation_rules.compare(i, rules)
-    layout, found, terms = rules.layout, rules.found, rules.outcome.reward_terms
+    layout, measurement, terms = rules.layout, rules.measurement, rules.outcome.reward_terms
     phase, swing = rules.state.phase[i], 1 - plan.stance[i]
     twice = 2 * phase
     late = twice - math.floor(twice) > 0.5
     end_effector = 0.0
-    for k in range(found.effectors.shape[1]):
+    for k in range(measurement.effectors.shape[1]):
         if k == swing and late:
             continue  # compared with the landing place below
-        off = found.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
+        off = measurement.effectors[i, k] - feature(phase, layout.effectors + k, rules.clip)
         end_effector += off * off
     if late:
         foot = rules.body.effectors[swing]
@@ -169,7 +171,7 @@ def compare(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
     terms[i, _END_EFFECTOR] = rewards.term(
         end_effector, weights[_END_EFFECTOR], scales[_END_EFFECTOR]
     )
-    terms[i, _HEADING] = weights[_HEADING] if found.facing[i] > 0.0 else 0.0
+    terms[i, _HEADING] = weights[_HEADING] if measurement.facing[i] > 0.0 else 0.0
 
 
 @compiled
@@ -186,8 +188,8 @@ def observe(i: int, rules: imitation_rules.Rules, plan: Plan, options: Options) 
         foot = 1 - plan.stance[i] if which == 0 else plan.stance[i]
         x = plan.landing[i, which, 0] - physics.xpos[i, body.effectors[foot], 0]
         place = options.plan_block + 6 * which + 3 * foot
-        observation[i, place] = x * rules.found.facing[i]
-        observation[i, place + 2] = plan.landing[i, which, 2] - rules.found.under[i]
+        observation[i, place] = x * rules.measurement.facing[i]
+        observation[i, place + 2] = plan.landing[i, which, 2] - rules.measurement.under[i]
 
 
 @compiled
@@ -221,8 +223,8 @@ def finish_steps(
     """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
         else:
             finish_step(i, rules, plan, options)
@@ -239,11 +241,13 @@ def observe_all(
     """
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
             continue
-        measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+        measure(
+            i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
+        )
         compare(i, rules, plan, options)
         observe(i, rules, plan, options)
         if fresh:

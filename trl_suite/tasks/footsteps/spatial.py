@@ -243,7 +243,7 @@ class SpatialFootsteps(SpatialTask):
         return *pose_of_step(self.steps, self._first, self.phase[env_ids]), spawns
 
     def _begun_on_ground(self, env_ids: np.ndarray) -> None:
-        found, plan, state = self.figure.measure(env_ids), self.plan, self.state
+        measurement, plan, state = self.figure.measure(env_ids), self.plan, self.state
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
         state.push_end[env_ids] = state.excused[env_ids] = 0
@@ -260,9 +260,9 @@ class SpatialFootsteps(SpatialTask):
         places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
         plan.heading[env_ids] = angles
         stance = plan.stance[env_ids]
-        anchors = found.feet[env_ids, stance, :2]
+        anchors = measurement.feet[env_ids, stance, :2]
         if self.goal_given:
-            self._head_for_goals(env_ids, found.root[env_ids, :2])
+            self._head_for_goals(env_ids, measurement.root[env_ids, :2])
         else:
             # The feet land on both sides of a line through the start, at half a width from it.
             line = quaternion.turned(anchors - places, -angles)
@@ -270,7 +270,7 @@ class SpatialFootsteps(SpatialTask):
             anchors = places + quaternion.turned(line, angles)
         for which, foot in enumerate((1 - stance, stance)):
             anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
-        self._put_reference(env_ids, found, np.full(len(env_ids), self._first))
+        self._put_reference(env_ids, measurement, np.full(len(env_ids), self._first))
         if self.hidden_plan:
             for i in env_ids.tolist():
                 place = self.travel.origin[i, :2]
@@ -350,15 +350,15 @@ class SpatialFootsteps(SpatialTask):
     def finish_step(self, env_ids: np.ndarray) -> None:
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
-            found = self.figure.found
-            self._replan(switched, found)
-            self._put_reference(switched, found, self._choose(switched, found))
+            measurement = self.figure.measurement
+            self._replan(switched, measurement)
+            self._put_reference(switched, measurement, self._choose(switched, measurement))
         finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
 
-    def _replan(self, env_ids: np.ndarray, found: SpatialMeasurement) -> None:
+    def _replan(self, env_ids: np.ndarray, measurement: SpatialMeasurement) -> None:
         """Updates the plans of some simulations at a switch of stance."""
         plans, count = self.plans, len(env_ids)
         by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
@@ -372,7 +372,7 @@ class SpatialFootsteps(SpatialTask):
                     sizes[k, which] = ahead, random.uniform(*plans.root_width)
                 continue
             if self.goal_given:
-                root = found.root[i, :2]
+                root = measurement.root[i, :2]
                 if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
                     self.goal[i] = self.arena.goal(i, random, root, 'near')
             elif plans.sharp and random.uniform() < plans.sharp:
@@ -393,30 +393,30 @@ class SpatialFootsteps(SpatialTask):
         if by_root.any():
             going, foot = env_ids[by_root], stance[by_root]
             off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
-            self.heading[going] = found.heading[going] + off
-            places = found.feet[going, foot, :2]
+            self.heading[going] = measurement.heading[going] + off
+            places = measurement.feet[going, foot, :2]
             for which, feet in enumerate((1 - foot, foot)):
                 places = self._lay(going, which, feet, places, sizes[by_root, which])
 
-    def _choose(self, env_ids: np.ndarray, found: SpatialMeasurement) -> np.ndarray:
+    def _choose(self, env_ids: np.ndarray, measurement: SpatialMeasurement) -> np.ndarray:
         """Returns the steps of the library that are nearest to the plans of some simulations."""
-        feet = found.feet[env_ids]
+        feet = measurement.feet[env_ids]
         query = step_features(
-            found.root[env_ids, :2], found.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
+            measurement.root[env_ids, :2], measurement.heading[env_ids], feet[:, RIGHT, :2], feet[:, LEFT, :2],
             self.landing[env_ids, 0, :2], self.heading[env_ids], self.stance[env_ids] == RIGHT,
         )  # fmt: skip
         return self.steps.select(query)
 
     def _put_reference(
-        self, env_ids: np.ndarray, found: SpatialMeasurement, chosen: np.ndarray
+        self, env_ids: np.ndarray, measurement: SpatialMeasurement, chosen: np.ndarray
     ) -> None:
         """Aligns the chosen steps with position and heading of the characters."""
         self.state.track[env_ids] = chosen + len(self.steps) * (self.stance[env_ids] == LEFT)
         columns = self.reference.columns
         now = self.reference.features(self.step_phase[env_ids], self.state.track[env_ids])
-        turned = found.heading[env_ids] - now[:, columns['heading'].start]
+        turned = measurement.heading[env_ids] - now[:, columns['heading'].start]
         self.state.turned[env_ids] = turned
-        self.state.shift[env_ids] = found.root[env_ids, :2] - quaternion.turned(
+        self.state.shift[env_ids] = measurement.root[env_ids, :2] - quaternion.turned(
             now[:, columns['root']], turned
         )
 
@@ -438,12 +438,12 @@ class SpatialFootsteps(SpatialTask):
     def markers(self, env_id: int) -> list[Marker]:
         """Returns markers of the landing places, the planned heading and the goal."""
         root = self.world.xpos[env_id, self.figure.links[0]]
-        found = plan_markers(env_id, root, self.plan)
+        shown = plan_markers(env_id, root, self.plan)
         if self.goal_given:
-            found.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
+            shown.append(Marker('cylinder', self.goal[env_id], (0.15, 0.2, 0.0), GOAL_COLOUR))
         if self.hidden_plan:
-            found.append(flag(self.goal[env_id]))
-        return found
+            shown.append(flag(self.goal[env_id]))
+        return shown
 
     def reference_pose(self, env_id: int) -> np.ndarray:
         """Returns the pose of the aligned reference: root, then joints."""

@@ -104,7 +104,7 @@ def land(i: int, rules: FootstepRules) -> bool:
     if breaks_down(i, common):
         return False
     measure(i, common)
-    plan.landed[i] = update_stance(i, common.clock.phase[i], common.found, plan)
+    plan.landed[i] = update_stance(i, common.clock.phase[i], common.measurement, plan)
     if plan.landed[i] and plan.landing_error[i] > rules.largest_miss:
         state.missed[i] = common.clock.steps[i] > state.excused[i]
     return plan.landed[i]
@@ -118,7 +118,7 @@ def finish(i: int, rules: FootstepRules) -> None:
         conclude(i, True, outcome)
         return
     compare(i, rules)
-    conclude(i, rules.common.found.fallen[i] or rules.state.missed[i], outcome)
+    conclude(i, rules.common.measurement.fallen[i] or rules.state.missed[i], outcome)
     observe(i, rules)
 
 
@@ -131,15 +131,19 @@ def step_phase(phase: float) -> float:
 @compiled
 def compare(i: int, rules: FootstepRules) -> None:
     """Writes the reward terms, from errors to the reference and to the plan."""
-    common, plan, by = rules.common, rules.plan, rules.comparison
-    found, terms, state = common.found, common.outcome.reward_terms, rules.state
+    common, plan, comparison = rules.common, rules.plan, rules.comparison
+    measurement, terms, state = common.measurement, common.outcome.reward_terms, rules.state
     share = step_phase(common.clock.phase[i])
-    row, rest = moment(share, state.track[i], by.tracks)
-    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
-    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
+    row, fraction = moment(share, state.track[i], comparison.tracks)
+    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
+    terms[i, VELOCITY] = term(
+        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
+    )
     # The reference was aligned with the heading of the character at the switch of stance.
-    terms[i, COM] = term(COM, com_error(i, row, rest, state.turned[i], by, found), by)
-    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+    terms[i, COM] = term(
+        COM, com_error(i, row, fraction, state.turned[i], comparison, measurement), comparison
+    )
+    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
 
     swing, late = 1 - plan.stance[i], share > 0.5
     feet = step = 0.0
@@ -147,34 +151,38 @@ def compare(i: int, rules: FootstepRules) -> None:
         for k in range(3):
             # In the second half, x and y of the swing foot are compared with the plan instead.
             if not (late and foot == swing and k < 2):
-                column = by.effectors + 3 * foot + k
-                off = found.features[i, column] - feature(row, rest, column, by.tracks)
+                column = comparison.effectors + 3 * foot + k
+                off = measurement.features[i, column] - feature(
+                    row, fraction, column, comparison.tracks
+                )
                 feet += off * off
     if late:
         for k in range(3):
-            off = plan.landing[i, 0, k] - found.feet[i, swing, k]
+            off = plan.landing[i, 0, k] - measurement.feet[i, swing, k]
             if k == 2:
-                off += feature(row, rest, by.effectors + 3 * swing + 2, by.tracks)
+                off += feature(
+                    row, fraction, comparison.effectors + 3 * swing + 2, comparison.tracks
+                )
             step += off * off
     end = 0.0
     for scale in rules.footstep_scales:
-        end += term(END_EFFECTOR, feet + scale * step, by)
+        end += term(END_EFFECTOR, feet + scale * step, comparison)
     terms[i, END_EFFECTOR] = end / len(rules.footstep_scales)
-    off = abs(rewards.wrapped(plan.heading[i] - found.heading[i]))
+    off = abs(rewards.wrapped(plan.heading[i] - measurement.heading[i]))
     facing = rewards.facing(min(rules.heading_scale * off, math.pi))
-    terms[i, HEADING] = by.term_weights[HEADING] * facing
+    terms[i, HEADING] = comparison.term_weights[HEADING] * facing
 
 
 @compiled
 def observe(i: int, rules: FootstepRules) -> None:
     """Writes the observation."""
-    common, found = rules.common, rules.common.found
+    common, measurement = rules.common, rules.common.measurement
     observe_body(i, common)
-    observe_plan(i, rules.contact, rules.plan_block, found, rules.plan, common.full)
+    observe_plan(i, rules.contact, rules.plan_block, measurement, rules.plan, common.full)
     if rules.goal_block >= 0:
-        x = rules.state.goal[i, 0] - found.root[i, 0]
-        y = rules.state.goal[i, 1] - found.root[i, 1]
-        bearing, distance = polar(i, x, y, found)
+        x = rules.state.goal[i, 0] - measurement.root[i, 0]
+        y = rules.state.goal[i, 1] - measurement.root[i, 1]
+        bearing, distance = polar(i, x, y, measurement)
         common.full[i, rules.goal_block] = bearing
         common.full[i, rules.goal_block + 1] = distance
     publish(i, common)

@@ -145,7 +145,7 @@ class Rules(NamedTuple):
     options: Options
     measured: np.ndarray
     interruption: np.ndarray
-    found: PlanarMeasurement
+    measurement: PlanarMeasurement
     state: GaitTaskState
     outcome: Outcome
 
@@ -192,7 +192,7 @@ def go_on(i: int, watched: bool, rules: Rules) -> int:
     state, options = rules.state, rules.options
     while state.going[i]:
         if state.lasted[i] % _FRAME_STEPS == 0 and leaves(
-            i, rules.body, rules.gait.physics, rules.ground, rules.found
+            i, rules.body, rules.gait.physics, rules.ground, rules.measurement
         ):
             return _GROUND
         gaits.act(i, rules.gait)
@@ -299,7 +299,7 @@ def observe(i: int, rules: Rules) -> None:
     """Writes the observation, with the stance leg first."""
     options, body, physics = rules.options, rules.body, rules.gait.physics
     measured, observation = rules.measured, rules.outcome.observation
-    measure(i, body, physics, rules.ground, measured, rules.found)
+    measure(i, body, physics, rules.ground, measured, rules.measurement)
     stance = rules.gait.state.stance[i]
     for k in range(options.columns.shape[1]):
         observation[i, k] = measured[i, options.columns[stance, k]]
@@ -347,8 +347,8 @@ def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
     """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
         else:
             finish_step(i, rules)
@@ -363,8 +363,8 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
     """
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.gait.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
             continue
         if fresh:

@@ -206,7 +206,7 @@ class GaitTask(Task):
         }
         self.rules = Rules(
             world.engine, figure.body, figure.ground, gait.rules, world.ctrl, options,
-            np.zeros((n, sum(figure.blocks.values()))), np.zeros(n, int), figure.measurement(),
+            np.zeros((n, sum(figure.blocks.values()))), np.zeros(n, int), figure.empty_measurement(),
             self.state, self.outcome,
         )  # fmt: skip
         self._pack = packed(self.rules)
@@ -314,7 +314,7 @@ class GaitTask(Task):
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
         """Draws ground beyond the windows of waiting simulations; returns their numbers."""
-        waiting = env_ids[self.rules.found.waiting[env_ids]]
+        waiting = env_ids[self.rules.measurement.waiting[env_ids]]
         for i in waiting.tolist():
             self.arena.widen(i)
         return waiting

@@ -207,7 +207,7 @@ class PlanarImitation(Task):
         scope = f'{self.character.mjcf_model.model}/'
         controls = world.control_addresses([scope + name for name in self.action_map.names])
         # The controls are consecutive.
-        by = self.action_map.drive(int(controls[0]))
+        drive = self.action_map.drive(int(controls[0]))
         self.reference = Reference(
             self.clip, world.models[0], figure.pose_qpos, figure.pose_dof, figure.links,
             figure.effectors, figure.geoms, PHASE_BINS, self.ABOUT,
@@ -221,12 +221,12 @@ class PlanarImitation(Task):
             'diverged': self.outcome.diverged,
             'distance': world.qpos[:, figure.pose_qpos[0]],
         }
-        self._found = figure.measurement()
+        self._measurement = figure.empty_measurement()
         terms = np.array(list(self.TERMS.values()))
         self.rules = Rules(
             world.engine, figure.body, figure.state, figure.ground, self.reference.clip_table,
-            by, world.ctrl, self._layout(), np.asarray(spec.weights), terms[:, 0].copy(), terms[:, 1].copy(),
-            self._rest, self._scale, self._found, self.state, self.outcome,
+            drive, world.ctrl, self._layout(), np.asarray(spec.weights), terms[:, 0].copy(), terms[:, 1].copy(),
+            self._rest, self._scale, self._measurement, self.state, self.outcome,
         )  # fmt: skip
         self._pack = packed(self.rules)
 
@@ -279,7 +279,7 @@ class PlanarImitation(Task):
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         if apply_actions(env_ids, action, self._pack):
             # Before the physics steps, so that images rendered afterwards are up to date.
-            self.figure.follow(env_ids[self._found.leaving[env_ids]])
+            self.figure.follow(env_ids[self._measurement.leaving[env_ids]])
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         if finish_steps(env_ids, self._pack):
@@ -294,7 +294,7 @@ class PlanarImitation(Task):
 
     def _widened(self, env_ids: np.ndarray) -> np.ndarray:
         """Draws ground beyond the windows of waiting simulations; returns their numbers."""
-        waiting = env_ids[self._found.waiting[env_ids]]
+        waiting = env_ids[self._measurement.waiting[env_ids]]
         for i in waiting.tolist():
             self.arena.widen(i)
         return waiting

@@ -104,7 +104,7 @@ class Rules(NamedTuple):
     term_scales: np.ndarray
     rest: np.ndarray
     scale: np.ndarray
-    found: PlanarMeasurement
+    measurement: PlanarMeasurement
     state: ImitationState
     outcome: Outcome
 
@@ -119,7 +119,9 @@ def finish_step(i: int, rules: Rules) -> None:
     if breaks_down(i, rules):
         conclude(i, True, rules.outcome)
         return
-    measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+    measure(
+        i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
+    )
     compare(i, rules)
     conclude(i, has_fallen(i, rules.body, rules.physics), rules.outcome)
     observe(i, rules)
@@ -147,7 +149,7 @@ def breaks_down(i: int, rules: Rules) -> bool:
 def compare(i: int, rules: Rules) -> None:
     """Writes the reward terms, from errors of pose, velocities and end effectors."""
     body, physics, clip, layout = rules.body, rules.physics, rules.clip, rules.layout
-    phase, found, terms = rules.state.phase[i], rules.found, rules.outcome.reward_terms
+    phase, measurement, terms = rules.state.phase[i], rules.measurement, rules.outcome.reward_terms
     pose = velocity = 0.0
     for k in range(len(rules.weights)):  # pitch, then joints
         angle = physics.qpos[i, body.qpos[2 + k]] - feature(phase, layout.angles + k, clip)
@@ -156,15 +158,15 @@ def compare(i: int, rules: Rules) -> None:
         rate = physics.qvel[i, body.dof[2 + k]] - feature(phase, layout.rates + k, clip)
         pose += rules.weights[k] * (angle * angle)
         velocity += rules.weights[k] * (rate * rate)
-    end_effector, count = 0.0, found.effectors.shape[1]
+    end_effector, count = 0.0, measurement.effectors.shape[1]
     for k in range(count):
-        off = found.effectors[i, k] - feature(phase, layout.effectors + k, clip)
+        off = measurement.effectors[i, k] - feature(phase, layout.effectors + k, clip)
         end_effector += off * off
     com = 0.0
     for k in range(2):
-        off = found.com_velocity[i, k] - feature(phase, layout.com_velocity + k, clip)
+        off = measurement.com_velocity[i, k] - feature(phase, layout.com_velocity + k, clip)
         com += rewards.COM_ERROR_FACTOR * (off * off)
-    height = found.height[i] - feature(phase, layout.height, clip)
+    height = measurement.height[i] - feature(phase, layout.height, clip)
 
     weights, scales = rules.term_weights, rules.term_scales
     terms[i, POSE] = rewards.term(pose, weights[POSE], scales[POSE])
@@ -199,7 +201,7 @@ def apply_actions(env_ids: np.ndarray, action: np.ndarray, rules: Rules) -> int:
     leaving = 0
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
-        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.found)
+        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.measurement)
     return leaving
 
 
@@ -208,8 +210,8 @@ def finish_steps(env_ids: np.ndarray, rules: Rules) -> int:
     """Finishes steps; returns how many simulations are waiting for ground, see `must_wait`."""
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
         else:
             finish_step(i, rules)
@@ -224,11 +226,13 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: Rules) -> int:
     """
     waiting = 0
     for i in env_ids:
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
             continue
-        measure(i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.found)
+        measure(
+            i, rules.body, rules.physics, rules.ground, rules.outcome.observation, rules.measurement
+        )
         compare(i, rules)
         observe(i, rules)
         if fresh:

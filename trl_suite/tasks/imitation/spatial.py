@@ -81,7 +81,7 @@ def finish_step(i: int, rules: ImitationRules) -> None:
         return
     look(i, rules)
     compare(i, rules)
-    conclude(i, common.found.fallen[i], common.outcome)
+    conclude(i, common.measurement.fallen[i], common.outcome)
     observe(i, rules)
 
 
@@ -90,35 +90,41 @@ def look(i: int, rules: ImitationRules) -> None:
     """Measures the body; the distance travelled is that along +x."""
     common = rules.common
     measure(i, common)
-    common.travel.distance[i] = common.found.root[i, 0] - common.travel.origin[i, 0]
+    common.travel.distance[i] = common.measurement.root[i, 0] - common.travel.origin[i, 0]
 
 
 @compiled
 def compare(i: int, rules: ImitationRules) -> None:
     """Writes the reward terms, from errors of pose, velocities and end effectors."""
-    by, found = rules.comparison, rules.common.found
-    row, rest = moment(rules.common.clock.phase[i], 0, by.tracks)
+    comparison, measurement = rules.comparison, rules.common.measurement
+    row, fraction = moment(rules.common.clock.phase[i], 0, comparison.tracks)
     terms = rules.common.outcome.reward_terms
-    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
-    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
-    terms[i, END_EFFECTOR] = term(END_EFFECTOR, effector_error(i, row, rest, by, found), by)
-    terms[i, COM] = term(COM, com_error(i, row, rest, 0.0, by, found), by)
-    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
+    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
+    terms[i, VELOCITY] = term(
+        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
+    )
+    terms[i, END_EFFECTOR] = term(
+        END_EFFECTOR, effector_error(i, row, fraction, comparison, measurement), comparison
+    )
+    terms[i, COM] = term(COM, com_error(i, row, fraction, 0.0, comparison, measurement), comparison)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
 
 
 @compiled
 def observe(i: int, rules: ImitationRules) -> None:
     """Writes the observation."""
-    common, by = rules.common, rules.comparison
+    common, comparison = rules.common, rules.comparison
     observe_body(i, common)
     if rules.reference >= 0:
-        row, rest = moment(common.clock.phase[i], 0, by.tracks)
-        common.full[i, rules.reference] = feature(row, rest, by.height, by.tracks)
+        row, fraction = moment(common.clock.phase[i], 0, comparison.tracks)
+        common.full[i, rules.reference] = feature(
+            row, fraction, comparison.height, comparison.tracks
+        )
         for k in range(6 * rules.links):  # positions and velocities of the links
-            value = feature(row, rest, by.positions + k, by.tracks)
+            value = feature(row, fraction, comparison.positions + k, comparison.tracks)
             common.full[i, rules.reference + 1 + k] = value
-    aside = common.travel.origin[i, 1] - common.found.root[i, 1]
-    bearing, distance = polar(i, GOAL_AHEAD, aside, common.found)
+    aside = common.travel.origin[i, 1] - common.measurement.root[i, 1]
+    bearing, distance = polar(i, GOAL_AHEAD, aside, common.measurement)
     common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
     publish(i, common)
 

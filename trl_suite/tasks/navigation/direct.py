@@ -198,7 +198,7 @@ class DirectNavigation(SpatialTask):
 
     def _draw(self, env_ids: np.ndarray) -> None:
         """Places balls and draws goals again, where they have expired or were reached."""
-        root, count = self.figure.found.root, self.clock.steps
+        root, count = self.figure.measurement.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]
             for i in wanted.tolist():

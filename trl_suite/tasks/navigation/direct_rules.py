@@ -86,18 +86,21 @@ def travel(i: int, rules: DirectRules) -> bool:
     if breaks_down(i, common):
         return False
     measure(i, common)
-    count, found = common.clock.steps[i], common.found
-    follow(i, count, found.com, rules.trace)
+    count, measurement = common.clock.steps[i], common.measurement
+    follow(i, count, measurement.com, rules.trace)
     if rules.with_ball:
         dribble(
-            i, TERMS, BALL_SHARE, CONTROL_TIMESTEP, goals.place, common.physics, found, rules.ball,
+            i, TERMS, BALL_SHARE, CONTROL_TIMESTEP, goals.place, common.physics, measurement, rules.ball,
             common.outcome.reward_terms,
         )  # fmt: skip
         reached = state.at_goal[i]
         state.wanted[i] = count >= state.due[i]
         goals.wanted[i] = count >= goals.due[i]  # a ball's goal is not redrawn when it is reached
     else:
-        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        x, y = (
+            goals.place[i, 0] - measurement.root[i, 0],
+            goals.place[i, 1] - measurement.root[i, 1],
+        )
         reached = x * x + y * y < rules.goal_reached * rules.goal_reached
         goals.wanted[i] = reached or count >= goals.due[i]
     goals.reached[i] += reached
@@ -112,57 +115,61 @@ def finish(i: int, rules: DirectRules) -> None:
         conclude(i, True, common.outcome)
         return
     if rules.with_ball:
-        remember(i, common.physics, common.found, rules.ball)
+        remember(i, common.physics, common.measurement, rules.ball)
     compare(i, rules)
-    conclude(i, common.found.fallen[i], common.outcome)
+    conclude(i, common.measurement.fallen[i], common.outcome)
     observe(i, rules)
 
 
 @compiled
 def compare(i: int, rules: DirectRules) -> None:
     """Writes the reward terms: imitation while walking to the goal, or to the ball."""
-    common, by, found = rules.common, rules.comparison, rules.common.found
-    row, rest = moment(common.clock.phase[i], 0, by.tracks)
+    common, comparison, measurement = rules.common, rules.comparison, rules.common.measurement
+    row, fraction = moment(common.clock.phase[i], 0, comparison.tracks)
     if rules.with_ball:
         x, y = common.physics.qpos[i, rules.ball.qpos], common.physics.qpos[i, rules.ball.qpos + 1]
     else:
         x, y = rules.goals.place[i, 0], rules.goals.place[i, 1]
-    x, y = x - found.root[i, 0], y - found.root[i, 1]
+    x, y = x - measurement.root[i, 0], y - measurement.root[i, 1]
     squared = x * x + y * y
     distance, direction = math.sqrt(squared), math.atan2(y, x)
     near = distance < NEAR
-    com = 0.0 if near else com_error(i, row, rest, direction, by, found)
-    off = 0.0 if near else rewards.wrapped(direction - found.heading[i])
+    com = 0.0 if near else com_error(i, row, fraction, direction, comparison, measurement)
+    off = 0.0 if near else rewards.wrapped(direction - measurement.heading[i])
 
     terms = common.outcome.reward_terms
-    terms[i, POSE] = term(POSE, pose_error(i, row, rest, by, found), by)
-    terms[i, VELOCITY] = term(VELOCITY, rate_error(i, row, rest, by, found), by)
-    terms[i, END_EFFECTOR] = term(END_EFFECTOR, effector_error(i, row, rest, by, found), by)
-    terms[i, COM] = term(COM, com, by)
-    terms[i, ROOT] = term(ROOT, height_error(i, row, rest, by, found), by)
-    terms[i, HEADING] = by.term_weights[HEADING] * rewards.facing(off)
-    terms[i, PROXIMITY] = term(PROXIMITY, squared / (NEAR * NEAR), by)
+    terms[i, POSE] = term(POSE, pose_error(i, row, fraction, comparison, measurement), comparison)
+    terms[i, VELOCITY] = term(
+        VELOCITY, rate_error(i, row, fraction, comparison, measurement), comparison
+    )
+    terms[i, END_EFFECTOR] = term(
+        END_EFFECTOR, effector_error(i, row, fraction, comparison, measurement), comparison
+    )
+    terms[i, COM] = term(COM, com, comparison)
+    terms[i, ROOT] = term(ROOT, height_error(i, row, fraction, comparison, measurement), comparison)
+    terms[i, HEADING] = comparison.term_weights[HEADING] * rewards.facing(off)
+    terms[i, PROXIMITY] = term(PROXIMITY, squared / (NEAR * NEAR), comparison)
     if rules.with_ball:
         for k in range(TERMS):
             terms[i, k] *= 1.0 - BALL_SHARE
-    along = found.com_velocity[i, 0] * x + found.com_velocity[i, 1] * y
+    along = measurement.com_velocity[i, 0] * x + measurement.com_velocity[i, 1] * y
     rules.progress.speed[i] = along / max(distance, 1e-9)
 
 
 @compiled
 def observe(i: int, rules: DirectRules) -> None:
     """Writes the observation."""
-    common, found = rules.common, rules.common.found
+    common, measurement = rules.common, rules.common.measurement
     observe_body(i, common)
     if rules.with_ball:
         place, physics = rules.goals.place, common.physics
-        observe_ball(i, rules.goal, place, physics, found, rules.ball, common.full)
+        observe_ball(i, rules.goal, place, physics, measurement, rules.ball, common.full)
     else:
         x, y = (
-            rules.goals.place[i, 0] - found.root[i, 0],
-            rules.goals.place[i, 1] - found.root[i, 1],
+            rules.goals.place[i, 0] - measurement.root[i, 0],
+            rules.goals.place[i, 1] - measurement.root[i, 1],
         )
-        bearing, distance = polar(i, x, y, found)
+        bearing, distance = polar(i, x, y, measurement)
         common.full[i, rules.goal], common.full[i, rules.goal + 1] = bearing, distance
     publish(i, common)
 
@@ -195,6 +202,6 @@ def observe_all(env_ids: np.ndarray, fresh: bool, rules: DirectRules) -> None:
     for i in env_ids:
         measure(i, rules.common)
         if fresh and rules.with_ball:
-            remember(i, rules.common.physics, rules.common.found, rules.ball)
+            remember(i, rules.common.physics, rules.common.measurement, rules.ball)
         compare(i, rules)
         observe(i, rules)

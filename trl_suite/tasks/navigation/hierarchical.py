@@ -345,21 +345,21 @@ class HierarchicalNavigation(SpatialTask):
         state.lasted[env_ids] = self.goals.reached[env_ids] = 0
         state.speed[env_ids] = state.duration[env_ids] = 0.0
         self.trace.places[env_ids] = np.nan
-        found = self.figure.measure(env_ids)
+        measurement = self.figure.measure(env_ids)
         for i in env_ids.tolist():
             self.begin_goal(i)
         if self.ball:
             self.ball.state.at_goal[env_ids] = False
             self.world.forward(env_ids)
         # Before the first action, the plan is the current positions of the feet.
-        plan.heading[env_ids] = found.heading[env_ids]
+        plan.heading[env_ids] = measurement.heading[env_ids]
         stance = plan.stance[env_ids]
-        plan.landing[env_ids, 0] = found.feet[env_ids, 1 - stance]
-        plan.landing[env_ids, 1] = found.feet[env_ids, stance]
+        plan.landing[env_ids, 0] = measurement.feet[env_ids, 1 - stance]
+        plan.landing[env_ids, 1] = measurement.feet[env_ids, stance]
 
     def begin_goal(self, i: int) -> None:
         """Draws the first goal of an episode, and places the ball, from the last measurement."""
-        place = self.figure.found.root[i, :2]
+        place = self.figure.measurement.root[i, :2]
         if self.ball:
             self.ball.put(i, place, self.clock.steps[i], self._random[i])
         self._draw_goal(i, place)
@@ -431,7 +431,7 @@ class HierarchicalNavigation(SpatialTask):
 
     def _draw(self, env_ids: np.ndarray) -> None:
         """Places balls and draws goals again, where they have expired or were reached."""
-        root, count = self.figure.found.root, self.clock.steps
+        root, count = self.figure.measurement.root, self.clock.steps
         if self.ball:
             wanted = env_ids[self.ball.state.wanted[env_ids]]
             for i in wanted.tolist():

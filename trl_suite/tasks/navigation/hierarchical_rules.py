@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trl_suite.kinematics.spatial import polar, write_body, write_terrain
+from trl_suite.kinematics.spatial import polar
 from trl_suite.tasks.components.ball import (
     BallRules,
     dribble,
@@ -20,6 +20,7 @@ from trl_suite.tasks.components.footstep_plan import (
     update_stance,
 )
 from trl_suite.tasks.components.goals import Goals
+from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
     SpatialRules,
@@ -135,9 +136,9 @@ def begin_step(i: int, rules: PlanningRules) -> None:
     lay_plan(i, rules)
     state.lasted[i] = 0
     for k in range(3):
-        state.begin[i, k] = common.found.com[i, k]
+        state.begin[i, k] = common.measurement.com[i, k]
     if rules.with_ball:
-        remember(i, common.physics, common.found, rules.ball)
+        remember(i, common.physics, common.measurement, rules.ball)
     rules.plan.landed[i] = False
     observe_low(i, rules)
 
@@ -145,15 +146,15 @@ def begin_step(i: int, rules: PlanningRules) -> None:
 @compiled
 def lay_plan(i: int, rules: PlanningRules) -> None:
     """Sets the plan from the action, relative to the root and its heading, if a footstep begins."""
-    plan, found, ground = rules.plan, rules.common.found, rules.common.ground
+    plan, measurement, ground = rules.plan, rules.common.measurement, rules.common.ground
     if not (rules.by_plan or plan.landed[i] or rules.common.clock.steps[i] == 0):
         return
-    heading = found.heading[i]
+    heading = measurement.heading[i]
     cosine, sine = math.cos(heading), math.sin(heading)
     for which in range(2):
         ahead, left = meant(i, 2 * which, rules), meant(i, 2 * which + 1, rules)
-        x = found.root[i, 0] + (cosine * ahead - sine * left)
-        y = found.root[i, 1] + (sine * ahead + cosine * left)
+        x = measurement.root[i, 0] + (cosine * ahead - sine * left)
+        y = measurement.root[i, 1] + (sine * ahead + cosine * left)
         plan.landing[i, which, 0], plan.landing[i, which, 1] = x, y
         plan.landing[i, which, 2] = spatial_ground.height(i, x, y, ground)
     plan.heading[i] = heading + meant(i, 4, rules)
@@ -170,7 +171,7 @@ def observe_low(i: int, rules: PlanningRules) -> None:
     """Writes the observation of the footstep controller."""
     common = rules.common
     observe_body(i, common)
-    observe_plan(i, rules.contact, rules.plan_block, common.found, rules.plan, common.full)
+    observe_plan(i, rules.contact, rules.plan_block, common.measurement, rules.plan, common.full)
 
 
 @compiled
@@ -187,14 +188,14 @@ def finish_control_step(i: int, rules: PlanningRules) -> bool:
         outcome.failed[i] = state.over[i] = True
         return False
     measure(i, common)
-    count, found = common.clock.steps[i], common.found
+    count, measurement = common.clock.steps[i], common.measurement
     if count % SAMPLE_FRAMES == 0:
         state.down[i] *= CONTACT_DECAY
-        state.down[i] += CONTACT_GAIN * found.fallen[i]
+        state.down[i] += CONTACT_GAIN * measurement.fallen[i]
     outcome.failed[i] = state.down[i] > FALL_THRESHOLD
-    if update_stance(i, common.clock.phase[i], found, rules.plan):
+    if update_stance(i, common.clock.phase[i], measurement, rules.plan):
         rules.plan.landed[i] = True
-    follow(i, count, found.com, rules.trace)
+    follow(i, count, measurement.com, rules.trace)
     state.over[i] = (
         rules.plan.landed[i] or outcome.failed[i] or state.lasted[i] >= LONGEST
         or not rules.by_plan
@@ -208,7 +209,7 @@ def finish_control_step(i: int, rules: PlanningRules) -> bool:
 def score(i: int, rules: PlanningRules) -> bool:
     """Writes the reward terms and tests goal and ball; returns whether one must be redrawn."""
     common, goals, state, ball = rules.common, rules.goals, rules.state, rules.ball.state
-    found, terms = common.found, common.outcome.reward_terms
+    measurement, terms = common.measurement, common.outcome.reward_terms
     seconds = CONTROL_TIMESTEP * state.lasted[i]
     state.duration[i] = seconds
     goals.wanted[i] = ball.wanted[i] = False
@@ -216,12 +217,15 @@ def score(i: int, rules: PlanningRules) -> bool:
         return False
     if rules.with_ball:
         state.speed[i] = dribble(
-            i, 0, 1.0, seconds, goals.place, common.physics, found, rules.ball, terms
+            i, 0, 1.0, seconds, goals.place, common.physics, measurement, rules.ball, terms
         )
     else:
         x, y = goals.place[i, 0] - state.begin[i, 0], goals.place[i, 1] - state.begin[i, 1]
         distance = math.hypot(x, y)
-        moved_x, moved_y = found.com[i, 0] - state.begin[i, 0], found.com[i, 1] - state.begin[i, 1]
+        moved_x, moved_y = (
+            measurement.com[i, 0] - state.begin[i, 0],
+            measurement.com[i, 1] - state.begin[i, 1],
+        )
         speed = (moved_x * x + moved_y * y) / max(distance, 1e-9) / seconds
         lack = min(speed - rules.target_speed, 0.0)
         full = distance < rules.goal_reached
@@ -236,7 +240,10 @@ def score(i: int, rules: PlanningRules) -> bool:
         goals.reached[i] += ball.at_goal[i]
         ball.wanted[i], goals.wanted[i] = count >= ball.due[i], late
     else:
-        x, y = goals.place[i, 0] - found.root[i, 0], goals.place[i, 1] - found.root[i, 1]
+        x, y = (
+            goals.place[i, 0] - measurement.root[i, 0],
+            goals.place[i, 1] - measurement.root[i, 1],
+        )
         reached = math.hypot(x, y) < rules.goal_reached
         goals.reached[i] += reached
         goals.wanted[i] = reached or late
@@ -255,20 +262,20 @@ def finish(i: int, rules: PlanningRules) -> None:
 @compiled
 def observe(i: int, rules: PlanningRules) -> None:
     """Writes the observation."""
-    common, found = rules.common, rules.common.found
+    common, measurement = rules.common, rules.common.measurement
     observation = common.outcome.observation
-    write_terrain(i, rules.terrain, common.ground, found, observation)
+    write_terrain(i, rules.terrain, common.ground, measurement, observation)
     if rules.surface >= 0:
         block = observation[i, rules.surface : rules.surface + 2 * SAMPLES * SAMPLES]
-        x, y = found.root[i, 0], found.root[i, 1]
-        spatial_ground.velocity_map(i, x, y, found.heading[i], common.ground, block)
-    write_body(i, rules.pose, rules.velocity, found, observation)
+        x, y = measurement.root[i, 0], measurement.root[i, 1]
+        spatial_ground.velocity_map(i, x, y, measurement.heading[i], common.ground, block)
+    write_body(i, rules.pose, rules.velocity, measurement, observation)
     place = rules.goals.place
     if rules.with_ball:
-        observe_ball(i, rules.goal, place, common.physics, found, rules.ball, observation)
+        observe_ball(i, rules.goal, place, common.physics, measurement, rules.ball, observation)
     else:
-        x, y = place[i, 0] - found.root[i, 0], place[i, 1] - found.root[i, 1]
-        bearing, distance = polar(i, x, y, found)
+        x, y = place[i, 0] - measurement.root[i, 0], place[i, 1] - measurement.root[i, 1]
+        bearing, distance = polar(i, x, y, measurement)
         observation[i, rules.goal], observation[i, rules.goal + 1] = bearing, distance
     if rules.low_level >= 0:
         observe_low(i, rules)

@@ -22,9 +22,8 @@ from trl_suite.kinematics.spatial import (
     SpatialBody,
     SpatialMeasurement,
     SpatialState,
-    write_body,
-    write_terrain,
 )
+from trl_suite.tasks.components.observation import write_body, write_terrain
 from trl_suite.tasks.task import (
     MAX_JOINT_SPEED,
     Outcome,
@@ -64,7 +63,7 @@ class PlanarRules(NamedTuple):
     ground: PlanarWindows
     drive: Drive
     ctrl: np.ndarray
-    found: PlanarMeasurement
+    measurement: PlanarMeasurement
     state: WalkState
     outcome: Outcome
 
@@ -88,7 +87,7 @@ class SpatialRules(NamedTuple):
     pose: int
     velocity: int
     target_heading: int
-    found: SpatialMeasurement
+    measurement: SpatialMeasurement
     state: WalkState
     leaving: np.ndarray
     outcome: Outcome
@@ -101,7 +100,7 @@ class SpatialRules(NamedTuple):
 def look_planar(i: int, rules: PlanarRules) -> None:
     """Measures and observes."""
     observation = rules.outcome.observation
-    planar.measure(i, rules.body, rules.physics, rules.ground, observation, rules.found)
+    planar.measure(i, rules.body, rules.physics, rules.ground, observation, rules.measurement)
     x = rules.physics.qpos[i, rules.body.qpos[0]]
     rules.state.distance[i] = x - rules.state.origin[i, 0]
 
@@ -112,7 +111,7 @@ def act_planar(env_ids: np.ndarray, action: np.ndarray, rules: PlanarRules) -> i
     leaving = 0
     for i in env_ids:
         drive(i, action, rules.drive, rules.ctrl)
-        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.found)
+        leaving += leaves(i, rules.body, rules.physics, rules.ground, rules.measurement)
     return leaving
 
 
@@ -129,8 +128,8 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
             if outcome.diverged[i]:  # keeps the last finite observation
                 conclude(i, True, outcome)
                 continue
-        rules.found.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
-        if rules.found.waiting[i]:
+        rules.measurement.waiting[i] = must_wait(i, rules.body, rules.physics, rules.ground)
+        if rules.measurement.waiting[i]:
             waiting += 1
             continue
         look_planar(i, rules)
@@ -145,15 +144,15 @@ def finish_planar(env_ids: np.ndarray, stepped: bool, rules: PlanarRules) -> int
 @compiled
 def look_spatial(i: int, rules: SpatialRules) -> None:
     """Measures and observes."""
-    found, state, observation = rules.found, rules.state, rules.outcome.observation
+    measurement, state, observation = rules.measurement, rules.state, rules.outcome.observation
     spatial_ground.see_movers(i, rules.physics.qpos, rules.ground)
-    spatial.measure(i, rules.body, rules.physics, rules.ground, found)
-    write_terrain(i, rules.terrain, rules.ground, found, observation)
-    write_body(i, rules.pose, rules.velocity, found, observation)
-    bearing = state.target_heading[i] - found.heading[i]
+    spatial.measure(i, rules.body, rules.physics, rules.ground, measurement)
+    write_terrain(i, rules.terrain, rules.ground, measurement, observation)
+    write_body(i, rules.pose, rules.velocity, measurement, observation)
+    bearing = state.target_heading[i] - measurement.heading[i]
     observation[i, rules.target_heading] = math.cos(bearing)
     observation[i, rules.target_heading + 1] = math.sin(bearing)
-    x, y = found.root[i, 0] - state.origin[i, 0], found.root[i, 1] - state.origin[i, 1]
+    x, y = measurement.root[i, 0] - state.origin[i, 0], measurement.root[i, 1] - state.origin[i, 1]
     state.distance[i] = (
         math.cos(state.target_heading[i]) * x + math.sin(state.target_heading[i]) * y
     )
@@ -190,5 +189,5 @@ def finish_spatial(env_ids: np.ndarray, stepped: bool, rules: SpatialRules) -> i
                 continue
         look_spatial(i, rules)
         if stepped:
-            conclude(i, rules.found.fallen[i], outcome)
+            conclude(i, rules.measurement.fallen[i], outcome)
     return 0

@@ -200,16 +200,16 @@ class Walk(Task):
             rules = SpatialRules(  # type: ignore[call-arg]
                 *common, world.ctrl,
                 *(starts.get(name, -1) for name in ('terrain', 'pose', 'velocity', 'target_heading')),
-                figure.found, self.state, np.zeros(n, bool), self.outcome,
+                figure.measurement, self.state, np.zeros(n, bool), self.outcome,
             )  # fmt: skip
             self._leaving, self._waiting = rules.leaving, np.zeros(n, bool)
             self._act, self._finish = act_spatial, finish_spatial
         else:
-            found = figure.measurement()
+            measurement = figure.empty_measurement()
             rules = PlanarRules(  # type: ignore[call-arg]
-                *common, world.ctrl, found, self.state, self.outcome
+                *common, world.ctrl, measurement, self.state, self.outcome
             )
-            self._leaving, self._waiting = found.leaving, found.waiting
+            self._leaving, self._waiting = measurement.leaving, measurement.waiting
             self._act, self._finish = act_planar, finish_planar
         self._pack = packed(rules)
 

@@ -1,14 +1,14 @@
-"""The planar terrain types of the original: random features in sequence, also on rolling ground.
+"""The planar terrain types: random features in sequence, also on rolling ground.
 
-All features consist of two primitives:
+The features of the original consist of two primitives:
 
 * a box (gap, wall): level ground, the floor or crest, and one vertex back at the old level. Both
   flanks are one cell wide, so a wall of nominal width 0.2 m (8 cells) is 0.175 m wide at its crest
   and 0.225 m at its foot. The level of the ground is unchanged.
 * a rise (step, cliff): level ground, then one vertex at the new level. Heights accumulate.
 
-The random processes are those of the original's terrain generator (Terrain RL Simulator, 2018):
-equal in distribution, not draw by draw.
+Their random processes are those of its terrain generator (Terrain RL Simulator, 2018): equal in
+distribution, not draw by draw.
 """
 
 from __future__ import annotations
@@ -284,20 +284,28 @@ def cliffs(parameters: Parameters, length: float, rng: np.random.Generator) -> P
     return _repeat(_CLIFF, parameters, length, rng)
 
 
-def _register_feature(name: str, kind: int, defaults: Parameters) -> None:
-    """Registers a feature twice: on level ground and on rolling ground."""
+def _register_feature(name: str, kind: int, defaults: Parameters, words: str) -> None:
+    """Registers a feature twice: on level ground and on rolling ground.
 
-    @register(f'var2d_{name}', defaults)
+    Args:
+      words: the feature, for the descriptions of both types.
+    """
+
     def level(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _repeat(kind, parameters, length, rng)
 
-    @register(f'var2d_slopes_{name}', {**defaults, **SLOPES})
     def rolling(parameters: Parameters, length: float, rng: np.random.Generator) -> Profile:
         return _sloped(level(parameters, length, rng), parameters, rng)
 
+    level.__doc__, rolling.__doc__ = f'{words} on level ground.', f'{words} on rolling ground.'
+    register(f'var2d_{name}', defaults)(level)
+    register(f'var2d_slopes_{name}', {**defaults, **SLOPES})(rolling)
 
-_register_feature('gaps', _GAP, GAPS)
-_register_feature('walls', _WALL, WALLS)
-_register_feature('steps', _STEP, STEPS)
-_register_feature('mixed', _MIXED, _MIXTURE)
-_register_feature('narrow_gaps', _NARROW_GAPS, NARROW_GAPS)
+
+_register_feature('gaps', _GAP, GAPS, 'Gaps')
+_register_feature('walls', _WALL, WALLS, 'Walls')
+_register_feature('steps', _STEP, STEPS, 'Steps')
+_register_feature('mixed', _MIXED, _MIXTURE, 'Gaps, walls and steps')
+_register_feature(
+    'narrow_gaps', _NARROW_GAPS, NARROW_GAPS, 'Clusters of gaps with stepping stones between them'
+)

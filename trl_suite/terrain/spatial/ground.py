@@ -184,9 +184,9 @@ class SpatialGround:
         """Heights of the grid at points (k,)."""
         i, j = (np.floor(part / GRID).astype(int) for part in (x, y))
         u, v = x / GRID - i, y / GRID - j
-        columns, env_ids = (np.arange(part.min(), part.max() + 2) for part in (i, j))
-        heights = self.layout.vertices(columns, env_ids)
-        i, j = i - columns[0], j - env_ids[0]
+        along_x, along_y = (np.arange(part.min(), part.max() + 2) for part in (i, j))
+        heights = self.layout.vertices(along_x, along_y)
+        i, j = i - along_x[0], j - along_y[0]
         corners = np.empty((len(x), 2, 2))
         for a in (0, 1):
             for b in (0, 1):

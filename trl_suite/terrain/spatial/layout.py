@@ -161,8 +161,8 @@ class Grid(NamedTuple):
     def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Heights of the vertices (i, j) * GRID, (len(i), len(j))."""
         k, m = self.heights.shape
-        env_ids = np.clip(i - self.first[0], 0, k - 1)
-        return self.heights[np.ix_(env_ids, np.clip(j - self.first[1], 0, m - 1))]
+        i, j = np.clip(i - self.first[0], 0, k - 1), np.clip(j - self.first[1], 0, m - 1)
+        return self.heights[np.ix_(i, j)]
 
 
 GridFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]

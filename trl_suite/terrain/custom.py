@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import importlib
 import inspect
 import math
 import os
@@ -27,25 +26,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from trl_suite.terrain import mesh
 from trl_suite.terrain.checks import Parameters, check_new
 from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.planar.generators import GENERATORS, register_line
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
-from trl_suite.util.compiled import compiled_loop
-from trl_suite.util.files import check_size, existing
+from trl_suite.util.files import existing
+from trl_suite.util.libraries import library
 
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
-MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
-Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
-MOST_BYTES = 10**9  # of a mesh file
 
 HeightFunction = Callable[..., npt.ArrayLike]
 
 
 @dataclasses.dataclass(frozen=True)
-class Surface(Terrain):
+class CustomTerrain(Terrain):
     """A terrain that is pickled as the call that made it, so that other processes can repeat it."""
 
     recipe: tuple[Any, ...] = dataclasses.field(default=(), compare=False, repr=False)
@@ -92,7 +89,7 @@ def from_function(
     _functions[arguments, name] = function
     _register(name, function, arguments)
     recipe = functools.partial(from_function, start_span=start_span, replace=True), (function, name)
-    return Surface(name, name, ({'StartSpan': start_span},), recipe)
+    return CustomTerrain(name, name, ({'StartSpan': start_span},), recipe)
 
 
 _functions: dict[tuple[int, str], HeightFunction] = {}
@@ -196,7 +193,9 @@ def from_heights(
     type_name = f'{name}#{digest.hexdigest()[:12]}'
     _register(type_name, raster if heights.ndim == 2 else raster.along, heights.ndim)
     again = functools.partial(from_heights, first=tuple(corner.tolist()), start_span=start_span)
-    return Surface(name, type_name, ({'StartSpan': start_span},), (again, (heights, spacing, name)))
+    return CustomTerrain(
+        name, type_name, ({'StartSpan': start_span},), (again, (heights, spacing, name))
+    )
 
 
 def _where(heights: np.ndarray) -> list[int]:
@@ -262,7 +261,7 @@ def from_image(
     file = existing(path, IMAGES)
     if not (math.isfinite(low) and math.isfinite(high)) or low == high:
         raise ValueError(f'{file}: black is {low} m and white {high} m; expected two heights')
-    imageio = library('imageio.v3', "'trl_suite[video]'")
+    imageio = library('imageio.v3', 'trl_suite[video]')
     try:
         shape = imageio.improps(file, plugin='pillow').shape  # without reading pixels
     except Exception as error:  # of the reader's own kinds
@@ -316,14 +315,14 @@ def from_mesh(
         points, or a number is invalid.
       FileNotFoundError: there is no such file; the message has similar names.
     """
-    file = existing(path, MESHES)
-    up = up or ('y' if file.suffix.lower() in Y_UP else 'z')
+    file = existing(path, mesh.READ)
+    up = up or ('y' if file.suffix.lower() in mesh.Y_UP else 'z')
     if up not in ('y', 'z'):
         raise ValueError(f"{file}: up is {up!r}; expected 'y' or 'z'")
     for name, number in (('spacing', spacing), ('scale', scale)):
         if not 0 < number < math.inf:
             raise ValueError(f'{file}: {name} is {number}; expected a positive number')
-    triangles = _triangles(file) * scale
+    triangles = mesh.read_triangles(file) * scale
     if up == 'y':
         triangles = triangles[..., [0, 2, 1]] * (1, -1, 1)
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
@@ -344,70 +343,7 @@ def from_mesh(
             f'expected 2 or more along each axis and no more than {LARGEST:g} in all'
         )
     x, y = (spacing * (first[i] + np.arange(count[i])) for i in (0, 1))
-    heights = heights_over(triangles, x, y)
+    heights = mesh.heights_over(triangles, x, y)
     heights[np.isinf(heights)] = low[2]
     corner = int(first[0]), int(first[1])
     return from_heights(heights, spacing, file.stem, first=corner, line=line, start_span=start_span)
-
-
-def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns the highest points of triangles over a grid, (k, m) m; -inf where there are none.
-
-    Args:
-      triangles: corners, (t, 3, 3) m.
-      x, y: ascending, (k,) and (m,) m.
-    """
-    # Ray casting by trimesh would need another library, and take three times as long.
-    heights = np.full((len(x), len(y)), -np.inf)
-    low, high = (triangles.min(1) - 1e-9).T, (triangles.max(1) + 1e-9).T
-    bounds = [np.searchsorted(x, low[0]), np.searchsorted(x, high[0])]
-    bounds += [np.searchsorted(y, low[1]), np.searchsorted(y, high[1])]
-    spans = np.stack(bounds, 1)
-    _raise(np.ascontiguousarray(triangles), spans, x, y, heights)
-    return heights
-
-
-@compiled_loop
-def _raise(
-    triangles: np.ndarray, spans: np.ndarray, x: np.ndarray, y: np.ndarray, heights: np.ndarray
-) -> None:
-    """Raises heights (k, m) to triangles, each over the points of its span."""
-    for t in range(len(triangles)):
-        corner = triangles[t]
-        px, py, pz = corner[0, 0], corner[0, 1], corner[0, 2]
-        ux, uy, uz = corner[1, 0] - px, corner[1, 1] - py, corner[1, 2] - pz
-        vx, vy, vz = corner[2, 0] - px, corner[2, 1] - py, corner[2, 2] - pz
-        area = ux * vy - uy * vx
-        if abs(area) < 1e-12:  # seen edge on
-            continue
-        for i in range(spans[t, 0], spans[t, 1]):
-            for j in range(spans[t, 2], spans[t, 3]):
-                dx, dy = x[i] - px, y[j] - py
-                along, across = (dx * vy - dy * vx) / area, (ux * dy - uy * dx) / area
-                if along >= -1e-9 and across >= -1e-9 and along + across <= 1 + 1e-9:
-                    heights[i, j] = max(heights[i, j], pz + along * uz + across * vz)
-
-
-def _triangles(file: os.PathLike[str]) -> np.ndarray:
-    """Returns the corners of a mesh file's triangles, (t, 3, 3), in its own units."""
-    trimesh = library('trimesh', 'trimesh')
-    check_size(file, MOST_BYTES)
-    try:
-        # Unprocessed: merging equal corners takes most of the time, and changes no height.
-        mesh = trimesh.load_scene(file, process=False).to_mesh()
-        triangles = np.asarray(mesh.triangles, float)
-    except Exception as error:  # the reader raises types of its own
-        raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
-    if not len(triangles) or not np.isfinite(triangles).all():
-        raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')
-    return triangles
-
-
-def library(name: str, source: str) -> Any:
-    """Imports an optional library; if it is missing, the error names `source` to install by pip."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition('.')[0]
-        message = f'{package} is needed and not installed; pip install {source}'
-        raise ImportError(message) from error

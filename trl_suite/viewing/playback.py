@@ -1,4 +1,4 @@
-"""Long steps, of gaits and of plans of footsteps, played back in frames of 1/30 s."""
+"""Playback of long steps, of gaits and of footstep plans, in frames of 1/30 s."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
 
-class Frames(dm_env.Environment):
+class Playback(dm_env.Environment):
     """An environment whose long steps are shown frame by frame, 1/30 s each.
 
     A step is simulated as a whole and then played back: every step of this environment puts the
