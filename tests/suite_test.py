@@ -578,7 +578,7 @@ class BuildTest(parameterized.TestCase):
          "'biped3d_mocap' is three-dimensional and terrain 'var2d_gaps'"),
         ({'character': 'biped3d', 'task': 'gait'}, "'biped3d' is three-dimensional; the task 'gait'"),
         ({'character': 'dog', 'task': 'goal_navigation'}, "'dog' is planar; the task 'goal_navigation'"),
-        ({'character': 'dog', 'task': 'footsteps'}, "'dog' has no right and left foot"),
+        ({'character': 'dog', 'task': 'footsteps'}, "'dog' has finger, toe as end effectors"),
         ({'character': 'hopper', 'task': 'footsteps'}, "'hopper' has no clip of its own"),
         ({'character': 'biped2d_full', 'task': 'footsteps', 'clip': motion.load_steps('biped3d_mocap')},
          "'biped3d_mocap' is a library of steps"),

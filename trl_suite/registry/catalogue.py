@@ -30,7 +30,7 @@ def find(id: str) -> EnvSpec:
     """Returns the `EnvSpec` of an id or alias.
 
     Raises:
-      TypeError: the id is no string.
+      TypeError: the id is not a string.
       ValueError: unknown id; the message has the closest matches.
     """
     if not isinstance(id, str):
@@ -45,7 +45,7 @@ def spec_of(environment: str | EnvSpec) -> EnvSpec:
     """Returns the data of an environment that is given by id, by alias, or by its data.
 
     Raises:
-      TypeError: it is none of these.
+      TypeError: the argument is none of these.
       ValueError: unknown id; the message has the closest matches.
     """
     if isinstance(environment, (str, EnvSpec)):

@@ -25,7 +25,7 @@ PLAN_BLOCKS: Meanings = {
 _ERRORS = {
     'pose': 'angles of joints and root, mean with the weights in Links; rad^2',
     'velocity': 'angular velocities of joints and root, mean with the same weights; rad^2/s^2',
-    'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
+    'com': f'velocity of the centre of mass, times {rewards.COM_ERROR_FACTOR:g}; m^2/s^2',
     'root': 'height of the root above the ground; m^2',
     'heading': '-',
 }
