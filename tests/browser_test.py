@@ -212,7 +212,7 @@ class ReplayTest(FolderTest):
         with self.assertRaisesRegex(ValueError, 'fps is 0; expected a positive number'):
             replays.Replay(environment, fps=0)
         with (
-            self.assertRaisesRegex(ValueError, 'a replay of no states'),
+            self.assertRaisesRegex(ValueError, 'the replay has no states'),
             replays.Replay(environment, self.folder / 'goat.html'),
         ):
             pass

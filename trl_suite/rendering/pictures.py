@@ -1,7 +1,7 @@
 """Pictures as files, without OpenGL: videos, film strips, plots of terrain, height maps.
 
-`trl_suite.rendering` also exports these names. Files get their names only when they are complete.
-Videos, PNG files and plots need `pip install 'trl_suite[video]'`.
+`trl_suite.rendering` also exports these names. A file appears under its name only when it is
+complete. Videos, PNG files and plots need `pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Video:
             raise self._failure(self._encoder) from None
 
     def _started(self, height: int, width: int) -> subprocess.Popen[bytes]:
-        """Starts ffmpeg, whose exit status tells whether all was written; imageio ignores it."""
+        """Starts ffmpeg; imageio would ignore its exit status, which reports write errors."""
         command = [
             self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
             '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
@@ -115,11 +115,11 @@ class Video:
         ]  # fmt: skip
         return subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            start_new_session=True,  # an interrupt from the keyboard is for this process alone
+            start_new_session=True,  # Ctrl-C interrupts only this process
         )  # fmt: skip
 
     def _failure(self, encoder: subprocess.Popen[bytes]) -> OSError:
-        """Returns why the encoder ended, which it must have done."""
+        """Returns an error with the reason for which the encoder has ended."""
         assert encoder.stderr is not None
         lines = encoder.stderr.read().decode(errors='replace').split('\n')
         said = next((line.strip() for line in reversed(lines) if line.strip()), '')
@@ -141,7 +141,7 @@ class Video:
             raise
         finally:
             if self._encoder is not None:
-                self._encoder.kill()  # nothing, if it has ended
+                self._encoder.kill()  # no effect if it has ended
                 with contextlib.suppress(OSError, ValueError):
                     self._encoder.communicate()
             self._files.__exit__(kind, error, traceback)  # removes the part after an exception
@@ -222,7 +222,7 @@ def plot_terrain(
       draws: number of grounds.
       length: extent ahead of the start, m; for a map its side, at most 300 m, around the origin.
       seed: ground i has the seed sequence (seed, i).
-      terrain_level: number of the terrain's parameter set.
+      terrain_level: index of the terrain's parameter set.
 
     Raises:
       ValueError: invalid arguments; see also `trl_suite.terrain.load`.
@@ -237,7 +237,7 @@ def plot_terrain(
         raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
     if seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or more')
-    # `Figure` needs no screen and does not affect the user's pyplot.
+    # `Figure` needs no display and does not affect the user's pyplot.
     make = _optional('matplotlib.figure').Figure
     if terrain.spatial:
         figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')
@@ -390,5 +390,5 @@ def _optional(name: str) -> Any:
     except ImportError as error:
         package = name.partition('.')[0]
         raise ImportError(
-            f"{package} is needed and not installed; pip install 'trl_suite[video]'"
+            f"{package} is required but not installed; pip install 'trl_suite[video]'"
         ) from error

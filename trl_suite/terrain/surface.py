@@ -409,5 +409,5 @@ def library(name: str, source: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition('.')[0]
-        message = f'{package} is needed and not installed; pip install {source}'
+        message = f'{package} is required but not installed; pip install {source}'
         raise ImportError(message) from error
