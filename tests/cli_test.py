@@ -252,7 +252,9 @@ class InfoTest(CommandTest):
         self.assertRegex(
             out, r'\n  end_effector +0\.1905 +5 .*from the root .*, sum over them; m\^2\n'
         )
-        self.assertRegex(out, r'\n  com +0\.09524 +10 .*times 0\.1; m\^2/s\^2\n')
+        self.assertRegex(
+            out, r'\n  com +0\.09524 +10 .*\(0\.1 times the squared difference\); m\^2/s\^2\n'
+        )
         self.assertIn('one of root, torso touches the ground', out)
         self.assertIn('steps 0.5 m long, feet 0.15 m apart', out)
         self.assertIn('N(0, 0.25) rad', out)
