@@ -206,7 +206,7 @@ class CharacterTest(Folder):
         environment.reset()
         reward = environment.step(environment.task.clip_action(0)).reward
         self.assertBetween(reward, 0.5, 1)
-        with self.assertRaisesRegex(ValueError, "no clip of its own; give clip=, or task='walk'"):
+        with self.assertRaisesRegex(ValueError, "no clip of its own; pass clip=, or task='walk'"):
             suite.build(spec)
 
     def test_spatial_imitation_of_a_clip(self):

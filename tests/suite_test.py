@@ -584,7 +584,7 @@ class BuildTest(parameterized.TestCase):
          "'biped3d_mocap' is a library of steps"),
         ({'character': 'biped3d', 'task': 'spatial_imitation'}, "unknown task 'spatial_imitation'"),
         ({'character': 'biped3d', 'task': 'footsteps'},
-         'no library of steps of its own; give clip=, one of .*biped3d_mocap'),
+         'no library of steps of its own; pass clip=, one of .*biped3d_mocap'),
         ({'character': 'biped3d_mocap', 'task': 'footsteps', 'clip': 'biped3d_moca'},
          "unknown step library 'biped3d_moca'; did you mean 'biped3d_mocap'"),
         ({'character': 'biped3d_simbicon'}, "'biped3d_simbicon' has no clip of its own"),

@@ -121,7 +121,7 @@ def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> in
     if not top:
         raise problem(file, 'there is no body; expected one that is the ancestor of all others')
     if root is None:
-        raise problem(file, f'several bodies may be the root; give root=, one of {[*top]}')
+        raise problem(file, f'several bodies may be the root; pass root=, one of {[*top]}')
     names = [model.body(i).name for i in range(1, model.nbody)]
     if root in names:
         above = model.body(model.body_rootid[model.body(root).id]).name

@@ -42,7 +42,7 @@ def find(id: str) -> EnvSpec:
 
 
 def spec_of(environment: str | EnvSpec) -> EnvSpec:
-    """Returns the data of an environment that is given by id, by alias, or by its data.
+    """Returns the `EnvSpec` of an environment, from an id, an alias, or an `EnvSpec`.
 
     Raises:
       TypeError: the argument is none of these.

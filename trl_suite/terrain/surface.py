@@ -265,7 +265,7 @@ def from_image(
     imageio = library('imageio.v3', "'trl_suite[video]'")
     try:
         shape = imageio.improps(file, plugin='pillow').shape  # without reading pixels
-    except Exception as error:  # the reader raises exceptions of its own types
+    except Exception as error:  # the reader raises its own types of exceptions
         raise ValueError(f'{file}: not a picture that can be read ({error})') from None
     if len(shape) < 2 or math.prod(shape[:2]) > LARGEST:
         raise ValueError(
@@ -396,7 +396,7 @@ def _triangles(file: os.PathLike[str]) -> np.ndarray:
         # Unprocessed: merging equal corners takes most of the time, and changes no height.
         mesh = trimesh.load_scene(file, process=False).to_mesh()
         triangles = np.asarray(mesh.triangles, float)
-    except Exception as error:  # the reader raises types of its own
+    except Exception as error:  # the reader raises its own types of exceptions
         raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
     if not len(triangles) or not np.isfinite(triangles).all():
         raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')

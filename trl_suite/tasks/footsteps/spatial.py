@@ -93,7 +93,7 @@ class SpatialFootstepsConfig(MirroredConfig):
         if self.pushes is not None:
             self._set('pushes', options(Pushes, 'pushes', self.pushes))
         if self.hidden_plan and self.mirrored:
-            raise ValueError('hidden_plan and mirrored cannot be combined: give only one of them')
+            raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
 
 
 class SpatialFootsteps(SpatialTask):
