@@ -250,7 +250,7 @@ class InfoTest(CommandTest):
         self.assertIn('42 kg', out)
         self.assertRegex(out, r'\n  heading +0\.09524 ')
         self.assertRegex(
-            out, r'\n  end_effector +0\.1905 +5 .*from the root .*, sum over them; m\^2\n'
+            out, r'\n  end_effector +0\.1905 +5 .*from the root .*, sum over end effectors; m\^2\n'
         )
         self.assertRegex(
             out, r'\n  com +0\.09524 +10 .*\(0\.1 times the squared difference\); m\^2/s\^2\n'

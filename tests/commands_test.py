@@ -28,8 +28,8 @@ class TryTest(CommandTest):
         self.assertRegex(out, r'figure: planar, [\d.]+ kg, 1.\d+ m high')
         self.assertIn('end effectors: right_shin, left_shin; must not touch the ground: trunk', out)
         self.assertRegex(out, r'facing: along \[1.0, 0.1\], derived from .* left and right')
-        self.assertIn('collide: 6; that touch at the start: 0', out)
-        self.assertIn('actuators: 2 in the file, 2 kept, 0 left out', out)
+        self.assertIn('collide: 6; in contact at the start: 0', out)
+        self.assertIn('actuators: 2 in the file, 2 kept, 0 omitted', out)
         self.assertRegex(out, 'right_hip +hinge +90 +3 +70')
         self.assertRegex(out, 'note: no torque limits in the file; .*left_hip')
         self.assertRegex(out, '(?s)flat: root .* m at the start.*slopes: .*steps: ')
@@ -46,7 +46,7 @@ class TryTest(CommandTest):
         self.assertIn('dog_file: three-dimensional', out)
         self.assertRegex(out, r'facing: along \[-?0.\d*, 1.0\]')
         self.assertIn('end effectors: left_shin; must', out)
-        self.assertIn('actuators: 3 in the file, 2 kept, 1 left out', out)
+        self.assertIn('actuators: 3 in the file, 2 kept, 1 omitted', out)
         self.assertTrue(pathlib.Path('a.png').exists())
 
     def test_bad_files(self):
@@ -96,7 +96,7 @@ class DoctorTest(CommandTest):
             (),
             'MUJOCO_GL=disable if you need no',
         ),
-        ((1, '', 'ImportError: mujoco'), (), 'see failures above'),
+        ((1, '', 'ImportError: mujoco'), (), 'see the failures above'),
     )
     def test_remedies(self, end, works, remedy):
         with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):

@@ -324,7 +324,7 @@ class ReadingTest(FolderTest):
         ('OFFSET 0.000000', 'OFFSET nan', "line 4: 'OFFSET nan .*'; expected OFFSET and three finite"),
         ('Frame Time: ', 'Frame Time: inf ', 'Frame Time is inf; expected a positive'),
         ('OFFSET 0.000000 0.000000 0.000000\nCHANNELS 3 Zrotation', 'OFFSET 0 0 0\nCHANNELS 0 Zrotation',
-         'line .* without channels is not read; expected'),
+         'line .* without channels are not supported; expected'),
         ('MOTION', 'MOTON', 'no line MOTION'),
         ('Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
     )  # fmt: skip

@@ -255,8 +255,8 @@ class ActTest(parameterized.TestCase):
         ({'weights': [], 'biases': []}, 'weights: 0 layers'),
         ({'biases': [np.zeros(2)]}, 'weights: 3 layers with 1 biases'),
         ({'weights': [np.zeros((7, 2)), 3.0, np.zeros((6, 2))]}, r'bias_0: has shape \(6,\); exp'),
-        ({'info': {'a': np.zeros(2)}}, 'info: JSON cannot hold it'),
-        ({'info': {'a': np.nan}}, 'info: JSON cannot hold it'),
+        ({'info': {'a': np.zeros(2)}}, 'info: not representable as JSON'),
+        ({'info': {'a': np.nan}}, 'info: not representable as JSON'),
         ({'info': [1]}, 'info: expected a dict'),
         ({'columns': np.array([0.5])}, 'columns: expected integers, at least one'),
         ({'columns': np.array([7])}, 'columns: expected numbers of 0 to 6'),
@@ -509,7 +509,7 @@ class FileTest(FolderTest):
         ({'other': 1}, "'other': is unknown"),
         ({'info': '{'}, "'info': Expecting"),
         ({'info': '[]'}, 'info: expected a dict'),
-        ({'info': '{"a": NaN}'}, 'info: JSON cannot hold it'),
+        ({'info': '{"a": NaN}'}, 'info: not representable as JSON'),
     )
     def test_invalid_arguments_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):

@@ -220,7 +220,7 @@ class Policy:
         try:
             put('info', json.loads(json.dumps(self.info, allow_nan=False)))
         except (TypeError, ValueError) as error:
-            raise ValueError(f'info: cannot be written as JSON ({error})') from None
+            raise ValueError(f'info: not representable as JSON ({error})') from None
         if not isinstance(self.info, dict):
             raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
         if self.mirror is not None:
