@@ -2,9 +2,9 @@
 
     python benchmarks/cluster.py overhead nodes evaluation --repeats 3
 
-Prints the seconds of every repetition, and of processors if this runs in a control group of its own (for
-example by `systemd-run --scope`), and their medians. Variants alternate. The start of Ray is measured by
-itself. Repeat once more: the first run compiles. `projection` computes how long all runs would take on more
+Prints the wall time of every repetition and the medians, in s; if the benchmark runs in its own control
+group (for example by `systemd-run --scope`), also the processor time. Variants alternate. The start of Ray
+is measured separately. Run it twice: the first run includes compilation. `projection` computes how long all runs would take on more
 nodes, from the durations in trained/. Needs `pip install 'trl_suite[train,cluster]'`.
 """
 
@@ -39,14 +39,14 @@ PARTS = 'start', 'overhead', 'nodes', 'evaluation', 'projection'
 
 
 class Spent(NamedTuple):
-    """Seconds on the clock, and of all processors by all processes, Ray's included; or NaN."""
+    """Wall time and processor time of all processes, including Ray's, s; NaN if unknown."""
 
     wall: float
     cpu: float
 
 
 def now() -> Spent:
-    """Returns the time of the clock and of processors so far."""
+    """Returns the current wall time and processor time."""
     return Spent(time.perf_counter(), cpu_seconds())
 
 
@@ -57,7 +57,7 @@ def since(begin: Spent) -> Spent:
 
 
 def cpu_seconds() -> float:
-    """Returns the processor time of this process's control group, s; NaN if it has none of its own."""
+    """Returns the processor time of this process's control group, s; NaN without its own group."""
     root = pathlib.Path('/sys/fs/cgroup')
     for line in pathlib.Path('/proc/self/cgroup').read_text().splitlines():
         _, kinds, path = line.split(':', 2)

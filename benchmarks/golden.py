@@ -467,7 +467,7 @@ def summary(id_, seed, nudge=0.0, environment=None):
 
 
 class Controller:
-    """Holds the mean pose; the results of a network would differ between processors."""
+    """Holds the mean pose; a network would give different results on different processors."""
 
     nudge, draw = 0.0, None
 

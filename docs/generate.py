@@ -58,7 +58,7 @@ README = '../README.md'
 # Comments around the tables of the README that this program writes.
 SPEED = '<!-- speed, written by docs/generate.py -->', '<!-- /speed -->'
 SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
-MACHINE = (  # of benchmarks/vector_environment.json
+MACHINE = (  # that of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
@@ -195,7 +195,7 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
     drawn = task_type(spec).description.legend
     name, _ = acting.best(environment, spec.id)
     who = WITHOUT.get(name)
-    said = f'No policy is shipped yet; shown is {who}' if who else 'The shipped policy'
+    said = f'No policy is shipped; the pictures show {who}' if who else 'The shipped policy'
     return (
         f'{picture("Film strip", gallery.strip_path(spec.id))}\n\n'
         f'*{said}: {begin:g} to {end:g} s of an episode, or to its end.{drawn}*'
@@ -228,8 +228,12 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
         after += ', at the end of the imitation'
     seeds = len(found['runs'])
+    gait = task_type(spec).score == 'distance'
     facts = (
-        ('return', f'{result["normalized_return"]:.1%} of the maximum {result["step_limit"]}'),
+        *(
+            [] if gait else
+            [('return', f'{result["normalized_return"]:.1%} of the maximum {result["step_limit"]}')]
+        ),
         ('episodes that reached the step limit', f'{result["completion_rate"]:.0%} of {result["episodes"]}'),
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
@@ -241,7 +245,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     return (
         f'## The shipped policy\n\n{table(("", ""), facts)}\n\n'
         f'{picture("Learning curve", gallery.curve_path(spec.id))}\n\n'
-        f'*Return during training, without noise{more}. All policies: [Results](../results.md).*'
+        f'*{"Distance" if gait else "Return"} during training, without noise{more}. All policies: [Results](../results.md).*'
     )
 
 
@@ -439,7 +443,7 @@ def leaderboard() -> str:
         'other seeds of their training, and of the default gaits. They are ranked by return, gaits by '
         'distance.',
         table(('environment', 'rank', 'policy', 'return', 'complete', 'distance, m', 'episodes'), cells),
-        '*Return*: mean return divided by the step limit, its maximum (for gaits it has none). '
+        '*Return*: mean return divided by the step limit, its maximum (not shown for gaits). '
         '*Complete*: share of the episodes that lasted to the step limit. *Distance*: mean. Confidence '
         'intervals and training: [Results](results.md).',
         '## Add a policy',

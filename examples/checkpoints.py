@@ -1,8 +1,8 @@
-"""Checkpoints of training runs: whole or refused, without pickled objects; one run per folder.
+"""Checkpoints of training runs, with a check of their integrity; one run per folder.
 
-A checkpoint is a line that names the format, a line with the SHA-256 of the rest, and what `torch.save`
-writes. It is read with `weights_only`, which lets no file run code: dicts, lists, tuples, numbers,
-strings, tensors and arrays may be in it.
+A checkpoint is a line that names the format, a line with the SHA-256 of the rest, and the output of
+`torch.save`. It is read with `weights_only`, so that loading a file cannot run code: it may contain
+dicts, lists, tuples, numbers, strings, tensors and arrays.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from trl_suite.util import files
 
 try:
     import fcntl
-except ImportError:  # Windows has none: there two runs in one folder are not noticed
+except ImportError:  # not on Windows, where two runs in one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
 FORMAT = b'trl_suite checkpoint 1\n'
-# What arrays are pickled as.
+# Globals in pickled arrays.
 ARRAYS = [
     np.ndarray, np.dtype, np._core.multiarray._reconstruct, np._core.multiarray.scalar, codecs.encode,
     *(type(np.dtype(kind)) for kind in '?bhilqBHILQefd'),
@@ -36,7 +36,7 @@ ARRAYS = [
 
 
 def save(state: dict[str, Any], path: pathlib.Path) -> None:
-    """Writes a checkpoint; an old one stays until the new one is whole."""
+    """Writes a checkpoint; an old one is replaced only when the new one is complete."""
     content = io.BytesIO()
     torch.save(state, content)
     data = content.getbuffer()
@@ -47,38 +47,41 @@ def save(state: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def load(path: pathlib.Path) -> dict[str, Any]:
-    """Returns what was saved.
+    """Returns the state in a checkpoint.
 
     Raises:
-      ValueError: the file is damaged, of another format, or holds other objects; the message names it.
+      ValueError: the file is damaged, has another format, or contains other objects; the message has
+        its path.
     """
     with path.open('rb') as file:
         known = file.readline(len(FORMAT)) == FORMAT
         digest, data = file.readline(66).strip(), file.read()
-    remedy = 'remove it to begin anew'
+    remedy = 'remove it to start again'
     if not known:
         raise ValueError(
-            f'{path}: no checkpoint of this version (or its beginning is damaged); {remedy}'
+            f'{path}: not a checkpoint of this version (or its beginning is damaged); {remedy}'
         )
     if hashlib.sha256(data).hexdigest().encode() != digest:
-        raise ValueError(f'{path}: the checkpoint is damaged or cut off; {remedy}')
+        raise ValueError(f'{path}: the checkpoint is damaged or incomplete; {remedy}')
     try:
         with torch.serialization.safe_globals(ARRAYS):
             return torch.load(io.BytesIO(data), weights_only=True)
-    except Exception as error:  # of the reader's own kinds; what it says advises to trust the file
+    except (
+        Exception
+    ) as error:  # UnpicklingError and others; torch's message suggests to trust the file
         other = re.search(r'GLOBAL (\S+)', str(error))
         raise ValueError(
-            f'{path}: no checkpoint that can be read: it holds {other[1] if other else "other objects"}; '
+            f'{path}: the checkpoint contains {other[1] if other else "other objects"}; '
             f'expected arrays, numbers and strings; {remedy}'
         ) from None
 
 
 @contextlib.contextmanager
 def only_run(folder: pathlib.Path) -> Iterator[None]:
-    """Makes a folder, and refuses a second run in it as long as this one lasts, however it ends.
+    """Creates a folder, and locks it against other runs until this run ends or its process dies.
 
     Raises:
-      RuntimeError: another process trains in the folder; the message has its number.
+      RuntimeError: another process trains in the folder; the message has its id.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / '.lock').open('a+') as file:
@@ -88,8 +91,8 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
             except OSError:
                 file.seek(0)
                 raise RuntimeError(
-                    f'{folder}: process {file.read().strip() or "?"} trains in this folder; wait for it, '
-                    'or give another --output'
+                    f'{folder}: process {file.read().strip() or "?"} trains in this folder; wait for '
+                    'it, or pass another --output'
                 ) from None
             file.truncate(0)
             file.write(f'{os.getpid()}\n')

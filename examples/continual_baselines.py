@@ -28,7 +28,7 @@ from trl_suite import policies, sequences
 from trl_suite.vector import Step, VectorEnvironment
 
 NUM_ENVS = 64
-STRENGTH = 1.0  # of the penalty of `EWC`, in units of the divergence from the policy before
+STRENGTH = 1.0  # of the penalty of `EWC`, in units of the divergence from the previous policy
 FISHER_SAMPLES = 1024
 
 
@@ -51,7 +51,7 @@ class FineTuning:
     def learn(self, environments: Any, samples: int) -> dict[str, torch.Tensor]:
         """Trains with PPO for at most a number of samples; returns those of the last update.
 
-        The learning rate decreases to its last value, as in a run of its own.
+        The learning rate decreases to its last value, as in a separate run.
         """
         trainer = self.trainer
         trainer.settings = dataclasses.replace(trainer.settings, samples=samples)
@@ -108,7 +108,7 @@ class EWC(FineTuning):
             self.consolidate(batch['observation'])
 
     def penalty(self) -> Any:
-        """Second-order estimate of the divergence from the policy before, times `STRENGTH`."""
+        """Second-order estimate of the divergence from the previous policy, times `STRENGTH`."""
         weights = dict(self.trainer.policy.named_parameters())
         terms = [
             (fisher * (weights[name] - self.anchor[name]) ** 2).sum()
@@ -151,10 +151,10 @@ class EWC(FineTuning):
 
 
 class Several:
-    """Simulations of several environments, behind those parts of the interface that PPO uses.
+    """Simulations of several environments, with the parts of the interface that PPO uses.
 
     Attributes:
-      parts: one vector environment each; their simulations follow one another.
+      parts: one vector environment for each; their simulations are concatenated.
     """
 
     def __init__(self, parts: list[VectorEnvironment]) -> None:

@@ -47,7 +47,8 @@ def load(folder: pathlib.Path) -> dict[str, dict[int, dict[str, Any]]]:
     """Returns the checked runs of two stages or more: learner -> seed -> result.
 
     Raises:
-      ValueError: a file is no result, or two runs have the same learner and seed or other settings.
+      ValueError: a file is not a result, or two runs have the same learner and seed, or different
+        settings.
     """
     found: dict[str, dict[int, dict[str, Any]]] = {}
     settings: set[Any] = set()
@@ -61,7 +62,7 @@ def load(folder: pathlib.Path) -> dict[str, dict[int, dict[str, Any]]]:
         found[name][result['seed']] = result
         settings.add((result['sequence'], result['budget'], result['episodes']))
         if len(settings) > 1:
-            raise ValueError(f'{path}: other settings than the files before: {settings}')
+            raise ValueError(f'{path}: settings differ from those of the other files: {settings}')
     order = [*LEARNERS, *sorted(found)]
     return dict(sorted(found.items(), key=lambda item: order.index(item[0])))
 
@@ -221,7 +222,7 @@ def _picture(
 
 
 def page(text: str) -> str:
-    """Returns the page with the results of now."""
+    """Returns the page with the current results."""
     begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     sections = [section(folder) for folder in sorted(FOLDER.glob('*/'))]
     found = list(filter(None, sections)) or [NONE]

@@ -3,10 +3,10 @@
     cd examples
     trl-suite sequences run plaid_biped --learner plaid:Plaid --output plaid.json
 
-In every stage the policy is transferred to the next terrain with PPO, which makes an expert for it.
-Then this expert and the policy before, an expert for all earlier terrains, are distilled into one
-policy by DAgger (Ross et al. 2011, arXiv:1011.0686), which begins the next stage. Samples of both
-parts count; distillation takes some on earlier terrains. G. Berseth, C. Xie, P. Cernek, M. van de
+In every stage PPO trains the policy on the next terrain, for which it becomes an expert. Then this expert
+and the previous policy, an expert for all earlier terrains, are distilled into one policy by DAgger
+(Ross et al. 2011, arXiv:1011.0686). The next stage starts from this policy. Samples of both parts
+count; distillation takes some of them on earlier terrains. G. Berseth, C. Xie, P. Cernek, M. van de
 Panne: Progressive Reinforcement Learning with Distillation for Multi-Skilled Motion Control. ICLR
 2018. Needs `pip install 'trl_suite[train]'`.
 """
@@ -56,7 +56,7 @@ def distil(
         labels so far.
       environments: one part for every expert.
       experts: observations (n, k) -> actions (n, a); each labels the observations of its part.
-      samples: at most, in all rounds together.
+      samples: largest number of samples, in all rounds together.
       rounds: number of rounds.
     """
     trainer.enter(environments)

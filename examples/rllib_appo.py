@@ -1,11 +1,11 @@
-"""Trains a policy with RLlib's APPO: asynchronous PPO, whose learner waits for no runner.
+"""Trains a policy with RLlib's APPO: asynchronous PPO, whose learner does not wait for runners.
 
     python examples/rllib_appo.py --environment PD_Biped2D_Flat-v0 --runners 16 --updates 200
 
-For clusters with many or unequal nodes: samples of slow runners are a little older, which V-trace,
-as in IMPALA (Espeholt et al. 2018, arXiv:1802.01561), corrects, and a lost runner delays nobody. Runners and
-simulations are those of `rllib_ppo.py`. An update is what RLlib reports at least every 5 s. Needs
-`pip install 'trl_suite[rllib]'`.
+For clusters with many or unequal nodes. Samples of slow runners are a little older, which is corrected by
+V-trace, as in IMPALA (Espeholt et al. 2018, arXiv:1802.01561). The loss of a runner does not delay training.
+Runners and simulations are those of `rllib_ppo.py`. An update is one report of RLlib, at least 5 s apart.
+Needs `pip install 'trl_suite[rllib]'`.
 """
 
 import rllib_ppo

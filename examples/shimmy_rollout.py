@@ -5,7 +5,7 @@ For programs that use Shimmy to wrap dm_control. The suite's own Gymnasium inter
 `pip install 'trl_suite[shimmy]'`.
 """
 
-# First: without a screen it lets dm_control, which Shimmy imports, draw by EGL.
+# Imported first: without a display, it makes dm_control, which Shimmy imports, render with EGL.
 from trl_suite import suite  # isort: split
 
 import gymnasium

@@ -1,7 +1,7 @@
-"""Files of a training run in a place that outlives its machine: a folder, or a URL of fsspec.
+"""Copies the files of a training run to persistent storage: a folder, or a URL of fsspec.
 
-Examples of URLs: `s3://bucket/runs`, `gs://bucket/runs`, `sftp://host/home/me/runs`; most need a package of
-their own, which fsspec names if it is missing.
+Examples of URLs: `s3://bucket/runs`, `gs://bucket/runs`, `sftp://host/home/me/runs`. Most protocols need an
+additional package, which fsspec names if it is missing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import fsspec
 
 CHECKPOINT = 'checkpoint.pt'
-EVERY = 5.0  # s between two looks for a new checkpoint
+EVERY = 5.0  # s; interval at which a new checkpoint is looked for
 
 
 def absolute(url: str) -> str:
@@ -40,8 +40,8 @@ def fetch(url: str, folder: pathlib.Path) -> None:
 def put(folder: pathlib.Path, url: str) -> None:
     """Copies the files of a run to a store.
 
-    A file replaces that of the store when it is whole, and the checkpoint is the last one: those that
-    it needs are then there.
+    A file replaces that of the store only when it is complete. The checkpoint is copied last, so that the
+    files that it needs are present.
     """
     system, path = fsspec.core.url_to_fs(url)
     system.makedirs(path, exist_ok=True)
@@ -61,7 +61,7 @@ def remove(url: str) -> None:
 
 @contextlib.contextmanager
 def kept(folder: pathlib.Path, url: str) -> Iterator[None]:
-    """Copies a run from a store, its files to the store after each checkpoint, and all at the end."""
+    """Copies a run from a store, and back to it after each checkpoint and at the end."""
     fetch(url, folder)
     ended = threading.Event()
     thread = threading.Thread(target=_follow, args=(folder, url, ended), daemon=True)
@@ -80,8 +80,8 @@ def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
         now = _written(folder)
         if now == before:
             continue
-        # Files are replaced, never changed: links are those of one moment. The checkpoint is linked
-        # first, so that the other files are not older.
+        # Files are replaced, never changed, so hard links keep the current versions. The checkpoint is
+        # linked first, so that the other files are not older.
         with tempfile.TemporaryDirectory(dir=folder.parent) as moment:
             names = [each.name for each in folder.iterdir() if not each.name.startswith('.')]
             for name in sorted(names, key=lambda name: name != CHECKPOINT):
@@ -89,7 +89,7 @@ def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
                     os.link(folder / name, pathlib.Path(moment, name))
             try:
                 put(pathlib.Path(moment), url)
-            except OSError as error:  # training goes on; the next checkpoint may arrive
+            except OSError as error:  # training continues; the next copy may succeed
                 print(f'{url}: {error}', file=sys.stderr)
             else:
                 before = now

@@ -7,13 +7,13 @@
     python examples/train_all.py --ray                 # on all cores, or on those of a cluster
 
 Each run is `examples/ppo.py` on one thread, or for gait environments (FSM_...)
-`examples/learn_gaits.py` or `examples/search_gaits.py`. Runs that start from the policy of another
-environment, or whose footstep controller it is, are run after it. Interrupted runs continue from
-their checkpoints in RUNS. Finished runs are evaluated and entered into `trained/ID.json` (settings,
-learning curve, evaluation), and the best policy of an environment becomes `trained/ID.npz`. Runs
-that have been entered with the same settings are not repeated. `$TRL_SUITE_TRAINED` names another
-folder than `trained`. Five gait environments are trained; another one has to be selected by its
-full id.
+`examples/learn_gaits.py` or `examples/search_gaits.py`. A run that uses the policy of another
+environment, as initial policy or as footstep controller, starts after the runs of that environment.
+Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
+into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
+becomes `trained/ID.npz`. Runs that have been entered with the same settings are not repeated.
+The environment variable TRL_SUITE_TRAINED selects another folder than `trained`. By default
+the gait environments in `GAITS` are trained; others must be selected by their full ids.
 
 With `--ray` each run is a task of Ray (`docs/cluster.md`) and gives the same numbers. RUNS is then
 a folder or a URL that all machines reach; a run whose machine is lost continues on another one.
@@ -57,9 +57,9 @@ EPISODES, SEED = 50, 0  # of the published evaluation
 GAIT_EPISODES = 200  # the standard deviation of the distance before a fall is as large as its mean
 SEEDS = (1,)
 COMPARED_SEEDS = (1, 2, 3)  # where actuation models are compared
-ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # of the table of runs
-MEMORY = 1.5e9  # bytes that a run may use
-GAITS = (  # that are compared with their default gaits
+ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # a row of the table of runs
+MEMORY = 1.5e9  # bytes of memory that Ray reserves for a run
+GAITS = (  # gait environments that are trained by default
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
     'FSM_Biped2D_Terrain_Gaps-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
     'FSM_Hopper2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Mixed_Easy-v0',
@@ -67,7 +67,7 @@ GAITS = (  # that are compared with their default gaits
 )  # fmt: skip
 
 
-LEARNT = (  # not searched
+LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.py
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed_Easy-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0',
 )  # fmt: skip
@@ -119,7 +119,7 @@ def needed(id_: str) -> list[str]:
 
 
 def depth(id_: str) -> int:
-    """Returns the number of environments in which the policies that it uses were trained before."""
+    """Returns the length of the longest chain of environments that must be trained before this one."""
     return max((1 + depth(other) for other in needed(id_)), default=0)
 
 
@@ -130,7 +130,7 @@ def entries(id_: str) -> list[dict[str, Any]]:
         return []
     runs = json.loads(path.read_text())['runs']
     default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
-    for run in runs:  # settings added later have their defaults, removed ones are dropped
+    for run in runs:  # new settings get their defaults, removed ones are dropped
         own = run['settings']
         run['settings'] = {name: own.get(name, value) for name, value in default.items()}
     return runs
@@ -246,7 +246,7 @@ def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
 
 
 def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
-    """Evaluates a run that began at a time of `time.monotonic`."""
+    """Evaluates a run; `begin` is the time of `time.monotonic` at its start."""
     curve = json.loads((folder / 'curve.json').read_text())
     # With curriculum stages the last policy is used, because the curve does not measure all skills.
     name = 'last' if curve['settings'].get('stages') else 'policy'
@@ -336,7 +336,7 @@ def main(words: Sequence[str] | None = None) -> None:
         entered = any(r['seed'] == seed and r['settings'] == own for r in entries(id_))
         if arguments.overwrite or not entered:
             todo.append((id_, seed))
-    entering = threading.Lock()  # two seeds of one environment
+    entering = threading.Lock()  # two seeds of one environment write the same file
     failed = 0
     with contextlib.ExitStack() as stack:
         done_by = on_ray(arguments, stack) if arguments.ray else in_processes(arguments)
@@ -364,7 +364,7 @@ def main(words: Sequence[str] | None = None) -> None:
             id_, seed = running[done]
             try:
                 run = done.result()
-            except Exception as error:  # the others go on
+            except Exception as error:  # the other runs continue
                 failed += 1
                 bar.write(f'{id_:40} {seed:4}  {type(error).__name__}: {error}')
             else:

@@ -207,12 +207,12 @@ class ReplayTest(FolderTest):
         environment.reset()
         with self.assertRaisesRegex(ValueError, "unknown suffix '.mp4'; expected .html"):
             replays.Replay(environment, self.folder / 'goat.mp4')
-        with self.assertRaisesRegex(ValueError, 'no reference clip to draw as a ghost'):
+        with self.assertRaisesRegex(ValueError, 'no reference clip to show as a ghost'):
             replays.Replay(environment, ghost=True)
         with self.assertRaisesRegex(ValueError, 'fps is 0; expected a positive number'):
             replays.Replay(environment, fps=0)
         with (
-            self.assertRaisesRegex(ValueError, 'a replay of no states'),
+            self.assertRaisesRegex(ValueError, 'the replay has no states'),
             replays.Replay(environment, self.folder / 'goat.html'),
         ):
             pass

@@ -27,12 +27,12 @@ class TryTest(CommandTest):
         out = self.output('try', 'figure.xml')
         self.assertRegex(out, r'figure: planar, [\d.]+ kg, 1.\d+ m high')
         self.assertIn('end effectors: right_shin, left_shin; must not touch the ground: trunk', out)
-        self.assertRegex(out, r'facing: along \[1.0, 0.1\], as left and right')
-        self.assertIn('collide: 6; that touch at the start: 0', out)
-        self.assertIn('actuators: 2 in the file, 2 kept, 0 left out', out)
+        self.assertRegex(out, r'facing: along \[1.0, 0.1\], derived from .* left and right')
+        self.assertIn('collide: 6; in contact at the start: 0', out)
+        self.assertIn('actuators: 2 in the file, 2 kept, 0 omitted', out)
         self.assertRegex(out, 'right_hip +hinge +90 +3 +70')
         self.assertRegex(out, 'note: no torque limits in the file; .*left_hip')
-        self.assertRegex(out, '(?s)flat: root .* m up at the start.*slopes: .*steps: ')
+        self.assertRegex(out, '(?s)flat: root .* m at the start.*slopes: .*steps: ')
         self.assertEqual(Image.open('try_figure.png').size, (3 * 480 + 2 * 4, 360))
 
     def test_it_is_turned_and_its_tendons_are_left_out(self):
@@ -46,7 +46,7 @@ class TryTest(CommandTest):
         self.assertIn('dog_file: three-dimensional', out)
         self.assertRegex(out, r'facing: along \[-?0.\d*, 1.0\]')
         self.assertIn('end effectors: left_shin; must', out)
-        self.assertIn('actuators: 3 in the file, 2 kept, 1 left out', out)
+        self.assertIn('actuators: 3 in the file, 2 kept, 1 omitted', out)
         self.assertTrue(pathlib.Path('a.png').exists())
 
     def test_invalid_files_are_rejected(self):
@@ -96,7 +96,7 @@ class DoctorTest(CommandTest):
             (),
             'MUJOCO_GL=disable if you need no',
         ),
-        ((1, '', 'ImportError: mujoco'), (), 'see failures above'),
+        ((1, '', 'ImportError: mujoco'), (), 'see the failures above'),
     )
     def test_failures_name_a_remedy(self, end, works, remedy):
         with mock.patch.object(doctor, '_start'), mock.patch.object(doctor, '_end', lambda _: end):
@@ -112,7 +112,7 @@ class DoctorTest(CommandTest):
             mock.patch.object(doctor, '_end', ends.get),
         ):
             found = dict(doctor.backends())
-        self.assertEqual(found['egl'].text, 'MUJOCO_GL=egl draws, llvmpipe')
+        self.assertEqual(found['egl'].text, 'MUJOCO_GL=egl renders, llvmpipe')
         self.assertEqual((found['osmesa'].state, found['glfw'].state), (doctor.NOTE, doctor.OK))
         self.assertIn('libosmesa6', found['osmesa'].remedy)
 
@@ -300,7 +300,7 @@ class ClipTest(CommandTest):
         motion.load('raptor_run_050').save('run.npz')
         out = self.output('clip', 'run.npz', *run_json[2:], '--frames')
         self.assertIn('right_knee from right_ankle', out)
-        self.assertIn('joints that nothing moves: right_hip', out)
+        self.assertIn('joints without a counterpart: right_hip', out)
         self.assertRegex(out, r'\n  joint limit +left_knee +121 +0 +120 +2\.12 +rad +\d+\n')
         self.assertRegex(out, r'\nframe 0, 0.000 s: joint limit, right_knee, \S+ rad\n')
 

@@ -62,7 +62,7 @@ class PagesTest(absltest.TestCase):
     def test_numbers_in_the_readme(self):
         text = (ROOT / 'README.md').read_text(encoding='utf-8')
         self.assertIn(f'{len(catalogue.SPECS)} environments', text)
-        self.assertIn(f'\n{len(suite.BENCHMARKING)} of them are registered', text)
+        self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
 

@@ -88,7 +88,9 @@ class ClockTest(parameterized.TestCase):
 
     def test_a_clip_that_starts_in_left_stance(self):
         mirrored = motion.load('biped2d_full_walk').mirrored()
-        with self.assertRaisesRegex(ValueError, r'its right foot does not stand.*clip\.mirrored'):
+        with self.assertRaisesRegex(
+            ValueError, r'expected the right foot on the ground.*clip\.mirrored'
+        ):
             suite.build('biped2d_full', task='footsteps', clip=mirrored)
         again = suite.build('biped2d_full', task='footsteps', clip=mirrored.mirrored())
         self.assertTrue(again.reset().first())

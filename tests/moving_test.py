@@ -81,7 +81,7 @@ class MovingTest(FolderTest):
         self.assertEqual(paths, [f'moving/{id_}.webp' for id_ in suite.ALL_IDS])
 
     def test_refusals(self):
-        with self.assertRaisesRegex(ValueError, 'a moving picture of no pictures'):
+        with self.assertRaisesRegex(ValueError, 'an animated picture needs at least one picture'):
             moving.save([], self.folder / 'a.webp')
         with self.assertRaisesRegex(ValueError, "unknown suffix '.gif'; expected .webp"):
             moving.save([np.zeros((9, 9, 3), np.uint8)], self.folder / 'a.gif')

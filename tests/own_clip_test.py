@@ -254,7 +254,7 @@ class ReadingTest(FolderTest):
             (r"a\.asf, line 2: 'order TX': expected TX, TY and TZ", 'a.amc', 'a.asf'),
             (r"b\.asf, line 4: 'length far'", 'a.amc', 'b.asf'),
             ('needs its skeleton, an .asf file', 'a.amc', None),
-            (r'a skeleton \(.*a\.asf\) belongs', 'a.bvh', 'a.asf'),
+            (r'a skeleton \(.*a\.asf\) was given', 'a.bvh', 'a.asf'),
             (r'a skeleton \(.asf\); expected the motion', 'a.asf', None),
         ):  # fmt: skip
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
@@ -287,7 +287,10 @@ class ReadingTest(FolderTest):
             write(self.folder / 'walk.txt')
             found = retargeting.read(self.folder / 'walk.txt', 'biped2d')
             np.testing.assert_allclose(found.poses, clip.poses, atol=1e-12)
-        for text, message in (('', 'is empty; expected one of: BVH'), ('<xml/>', 'no motion file')):
+        for text, message in (
+            ('', 'is empty; expected one of: BVH'),
+            ('<xml/>', 'not a motion file'),
+        ):
             path = self.folder / 'walk.bvh'
             path.write_text(text)
             with self.assertRaisesRegex(ValueError, f'walk.bvh: {message}'):
@@ -321,7 +324,7 @@ class ReadingTest(FolderTest):
         ('OFFSET 0.000000', 'OFFSET nan', "line 4: 'OFFSET nan .*'; expected OFFSET and three finite"),
         ('Frame Time: ', 'Frame Time: inf ', 'Frame Time is inf; expected a positive'),
         ('OFFSET 0.000000 0.000000 0.000000\nCHANNELS 3 Zrotation', 'OFFSET 0 0 0\nCHANNELS 0 Zrotation',
-         'line .* without channels is not read; expected'),
+         'line .* without channels are not supported; expected'),
         ('MOTION', 'MOTON', 'no line MOTION'),
         ('Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
     )  # fmt: skip

@@ -206,7 +206,7 @@ class CharacterTest(Folder):
         environment.reset()
         reward = environment.step(environment.task.clip_action(0)).reward
         self.assertBetween(reward, 0.5, 1)
-        with self.assertRaisesRegex(ValueError, "no clip of its own; give clip=, or task='walk'"):
+        with self.assertRaisesRegex(ValueError, "no clip of its own; pass clip=, or task='walk'"):
             suite.build(spec)
 
     def test_spatial_imitation_of_a_clip(self):
@@ -222,13 +222,13 @@ class CharacterTest(Folder):
 
     @parameterized.named_parameters(
         ('root', {'root': 'trunc'}, "unknown root 'trunc'; did you mean 'trunk'"),
-        ('inner_root', {'root': 'left_shin'}, "hangs on another body; did you mean 'trunk'"),
+        ('inner_root', {'root': 'left_shin'}, "is the child of another body; did you mean 'trunk'"),
         ('effector', {'end_effectors': ('left_shinn',)}, "effector 'left_shinn'; did you mean 'left_shin'"),
         ('joint', {'end_effectors': ('left_knee',)}, "is a joint; did you mean its body 'left_shin'"),
         ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
-        ('name', {'name': 'dog'}, "has a character named 'dog'"),
+        ('name', {'name': 'dog'}, "name is 'dog'; expected one without a slash"),
         ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
         ('spatial', {'spatial': 'x'}, "spatial is 'x'; expected True or False or None"),
         ('short_turn', {'turn': (0, 0, 90)}, r'turn is \(0, 0, 90\); expected a quaternion wxyz'),
@@ -302,8 +302,8 @@ class CharacterTest(Folder):
             np.testing.assert_allclose(first, second, atol=1e-6)  # files have six digits
 
     @parameterized.parameters(
-        ('', 'it may lie: the end effectors are'),
-        ('turn', "it may look along .0.1, -1.0., as left and right bodies lie"),
+        ('', 'it may lie: the end effectors are at'),
+        ('turn', "it may face .0.1, -1.0., according to its left and right bodies"),
     )  # fmt: skip
     def test_a_posture_that_may_be_wrong_is_noted(self, turn, note):
         self.assertNotIn('it may', '; '.join(self.planar().notes))

@@ -255,8 +255,8 @@ class ActTest(parameterized.TestCase):
         ({'weights': [], 'biases': []}, 'weights: 0 layers'),
         ({'biases': [np.zeros(2)]}, 'weights: 3 layers with 1 biases'),
         ({'weights': [np.zeros((7, 2)), 3.0, np.zeros((6, 2))]}, r'bias_0: has shape \(6,\); exp'),
-        ({'info': {'a': np.zeros(2)}}, 'info: JSON cannot hold it'),
-        ({'info': {'a': np.nan}}, 'info: JSON cannot hold it'),
+        ({'info': {'a': np.zeros(2)}}, 'info: not representable as JSON'),
+        ({'info': {'a': np.nan}}, 'info: not representable as JSON'),
         ({'info': [1]}, 'info: expected a dict'),
         ({'columns': np.array([0.5])}, 'columns: expected integers, at least one'),
         ({'columns': np.array([7])}, 'columns: expected numbers of 0 to 6'),
@@ -503,13 +503,13 @@ class FileTest(FolderTest):
         ({'block_sizes': np.array([3, 5])}, r'mean: has shape \(7,\); expected \(8,\)'),
         ({'block_sizes': np.array([7])}, r'zip\(\) argument 2 is shorter'),
         ({'activation': 'sin'}, "unknown activation 'sin'"),
-        ({'layers': 2}, "'layers': is 2, and there are arrays of others"),
+        ({'layers': 2}, "'layers': is 2, but there are arrays of other layers"),
         ({'layers': 10**15}, "'weight_3': is missing"),
-        ({'layers': -1}, "'layers': is 0, and there are arrays of others"),
+        ({'layers': -1}, "'layers': is 0, but there are arrays of other layers"),
         ({'other': 1}, "'other': is unknown"),
         ({'info': '{'}, "'info': Expecting"),
         ({'info': '[]'}, 'info: expected a dict'),
-        ({'info': '{"a": NaN}'}, 'info: JSON cannot hold it'),
+        ({'info': '{"a": NaN}'}, 'info: not representable as JSON'),
     )
     def test_invalid_arguments_are_rejected(self, changes, message):
         with self.assertRaisesRegex(ValueError, f'p.npz: .*{message}'):
@@ -571,7 +571,7 @@ class ReferenceTest(FolderTest):
         for id_ in (dog, 'plaid/dog_gaps'):
             self.assertEqual(suite.reference_policy(id_).id, dog)
             self.assertEqual(trl_suite.reference_policy(id_).id, dog)
-        with self.assertRaisesRegex(FileNotFoundError, f'closest that have one: {dog}, {GAPS}'):
+        with self.assertRaisesRegex(FileNotFoundError, f'closest ids with a policy: {dog}, {GAPS}'):
             policies.reference('PD_Dog2D_Steps_Terrain-v0')
         with self.assertRaisesRegex(ValueError, "unknown environment 'x'"):
             suite.reference_policy('x')
@@ -590,7 +590,7 @@ class ReferenceTest(FolderTest):
         np.testing.assert_array_equal(own.weights[0], other.weights[0])
 
     def test_no_policies_at_all(self):
-        with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; nor for any other"):
+        with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; none is installed"):
             policies.reference(GAPS)
 
     def test_a_file_of_another_environment(self):

@@ -135,9 +135,9 @@ class RunTest(parameterized.TestCase):
         other = io.BytesIO()
         torch.save({'settings': {}}, other)
         for content, message in (
-            (whole[: len(whole) // 2], 'damaged or cut off'), (whole[:-1], 'damaged or cut off'),
-            (bytes(flipped), 'damaged or cut off'), (b'', 'no checkpoint of this version'),
-            (other.getvalue(), 'no checkpoint of this version'), (whole[1:], 'no checkpoint of'),
+            (whole[: len(whole) // 2], 'damaged or incomplete'), (whole[:-1], 'damaged or incomplete'),
+            (bytes(flipped), 'damaged or incomplete'), (b'', 'not a checkpoint of this version'),
+            (other.getvalue(), 'not a checkpoint of this version'), (whole[1:], 'not a checkpoint of'),
         ):  # fmt: skip
             path.write_bytes(content)
             with self.assertRaisesRegex(ValueError, f'checkpoint.pt: .*{message}.*; remove it to'):
@@ -150,7 +150,7 @@ class RunTest(parameterized.TestCase):
         path = self.folder / 'checkpoint.pt'
         checkpoints.save({'where': pathlib.PurePosixPath('x'), 'a': np.arange(3)}, path)
         with self.assertRaisesRegex(
-            ValueError, 'it holds pathlib.PurePosixPath; expected arrays, numbers'
+            ValueError, 'contains pathlib.PurePosixPath; expected arrays, numbers'
         ):
             checkpoints.load(path)
 

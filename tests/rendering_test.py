@@ -586,7 +586,7 @@ except RuntimeError as error:
             with self.subTest(setting):
                 done = run_headless(program, {'MUJOCO_GL': setting})
                 self.assertEqual((done.returncode, done.stderr), (0, ''))
-                self.assertRegex(done.stdout, f'^nothing can be drawn.*MUJOCO_GL is {setting!r}')
+                self.assertRegex(done.stdout, f'^cannot render.*MUJOCO_GL is {setting!r}')
                 self.assertRegex(done.stdout, 'egl or osmesa .* glfw .*\n$')
                 self.assertEqual(done.stdout.count('\n'), 1)
 
@@ -623,7 +623,7 @@ print(os.waitpid(child, 0)[1], rendering.frame(environment).std() > 10)
         self.assertEqual(lines[1:], [lines[0], 'closed', '0 True'])
 
     def test_dm_control_imported_first(self):
-        # It then has chosen GLFW, which finds no screen.
+        # It then has chosen GLFW, which finds no display.
         program = f"""
 from dm_control import composer
 from trl_suite import rendering, suite

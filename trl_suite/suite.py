@@ -226,13 +226,13 @@ def _own_motion(character: characters.CharacterSpec, kind: type) -> str:
     if kind is motion.Clip:
         if character.clip is None:
             raise ValueError(
-                f"character {name!r} has no clip of its own; give clip=, or task='walk', which needs none"
+                f"character {name!r} has no clip of its own; pass clip=, or task='walk', which needs none"
             )
         return character.clip
     known = motion.steps_names()
     if name not in known:
         raise ValueError(
-            f'character {name!r} has no library of steps of its own; give clip=, one of '
+            f'character {name!r} has no library of steps of its own; pass clip=, one of '
             f'{", ".join(known)}'
         )
     return name

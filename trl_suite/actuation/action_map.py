@@ -120,7 +120,7 @@ class Drive(NamedTuple):
 
 @compiled_inline
 def _meant(i: int, k: int, action: np.ndarray, by: Drive) -> float:
-    """Control k of an action, in physical units, before any clamp of norms."""
+    """Control k of an action, in physical units, before norms are clamped."""
     return min(max(action[i, k], -1.0), 1.0) * by.scale[k] + by.offset[k]
 
 

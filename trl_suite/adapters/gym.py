@@ -238,9 +238,10 @@ def metadata(task: Any) -> Info:
 
 
 def limited(task_kwargs: Info | None, max_episode_steps: int | None) -> Info:
-    """Options whose step limit is the smaller of theirs and Gymnasium's, by default that of the id.
+    """Returns `task_kwargs` with the smaller of its step limit and `max_episode_steps`.
 
-    Gymnasium's is None if it is not given, and -1 for none.
+    By default the step limit is that of the id. `max_episode_steps` is Gymnasium's argument: None if it
+    is not given, and -1 for no limit.
     """
     options = errors.options('task_kwargs', task_kwargs)
     if max_episode_steps is None:
@@ -281,22 +282,22 @@ def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
 
 
 def flat(info: Info) -> Info:
-    """Info without a dict in it, which few programs understand: 'reward_NAME' for each term."""
+    """Returns info without nested dicts, which few programs support: 'reward_NAME' for each term."""
     rest = {name: value for name, value in info.items() if name != 'reward_terms'}
     terms = info.get('reward_terms', {})
     return {**rest, **{f'reward_{name}': value for name, value in terms.items()}}
 
 
 def unlimited(environment: str, **options: Any) -> SuiteEnv:
-    """Makes what `gymnasium.make` wraps: the limit is in its specification, and its wrapper cuts."""
+    """Makes an environment without a step limit: `gymnasium.make` adds a wrapper that truncates."""
     return SuiteEnv(environment, max_episode_steps=-1, **options)
 
 
-unlimited.metadata = METADATA  # type: ignore[attr-defined]  # `make` reads the render modes of it
+unlimited.metadata = METADATA  # type: ignore[attr-defined]  # `gymnasium.make` reads the render modes from here
 
 
 def masked(info: Info, env_ids: np.ndarray) -> Info:
-    """Info in Gymnasium's format: 0 in other simulations, and for each key the mask '_key'."""
+    """Returns info in Gymnasium's format: 0 in other simulations, and for each key a mask, '_key'."""
     result: Info = {}
     for name, value in info.items():
         result[name] = value.copy()

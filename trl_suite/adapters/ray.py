@@ -49,7 +49,7 @@ class RayExecutor:
           num_cpus: cores that a task needs.
           memory: memory that a task needs, bytes.
           retries: how often a task is started again after the loss of its process or node.
-          fresh: run each task in a process of its own.
+          fresh: whether to run each task in a new process.
 
         Raises:
           ConnectionError: there is no cluster at this address.

@@ -21,7 +21,7 @@ BEHIND, AHEAD = 6.0, 18.0  # m; extent of the window of boxes around its centre
 ADVANCE = 6.0  # m; window centres are multiples of it
 PROBES = 6  # random windows from which the size of the pool of boxes is estimated
 LINE_PROBES = 10  # windows to each side, 240 m, for that estimate if ground is a function of x
-SPARE = 1.3  # factor on the largest number of boxes in these windows
+SPARE = 1.3  # factor applied to the largest number of boxes in these windows
 EDGE = 0.82  # brightness of the edges of the ground, and so of its sides
 COARSEST = 0.1  # m; largest tolerance for merging pieces if the pool is too small
 
@@ -185,13 +185,13 @@ class PlanarArena(composer.Arena):
             return  # the window has equal vertices, as on flat ground: boxes need not move
         tolerance = boxes.TOLERANCE
         pieces = boxes.cut(start, heights, vertical, tolerance)
-        while pieces.number > len(self.boxes):  # rather coarser than with holes
+        while pieces.number > len(self.boxes):  # a coarser surface is better than one with holes
             tolerance *= 2
             if tolerance > COARSEST:
                 raise ValueError(
                     f'terrain {self.terrain.name!r} needs {pieces.number} boxes for '
-                    f'{BEHIND + AHEAD:g} m; expected at most {len(self.boxes)}, by {PROBES} random '
-                    'windows: its features must be spread more evenly'
+                    f'{BEHIND + AHEAD:g} m; expected at most {len(self.boxes)}, as estimated from {PROBES} '
+                    'random windows; distribute its features more evenly'
                 )
             pieces = boxes.cut(start, heights, vertical, tolerance)
         lay(
@@ -270,7 +270,7 @@ def _pool_size(terrain: Terrain) -> int:
     """Estimates the number of boxes that a window of a terrain needs, from a few fixed seeds."""
     generator, windows = GENERATORS.get(terrain.type), range(PROBES)
     if generator is not None and generator.line is not None:
-        windows = range(-LINE_PROBES, LINE_PROBES)  # every episode is the same; places differ
+        windows = range(-LINE_PROBES, LINE_PROBES)  # every episode has the same ground
     most = 0
     for terrain_level in range(max(1, len(terrain.parameter_sets))):
         for k in windows:

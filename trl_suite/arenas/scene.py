@@ -79,7 +79,7 @@ def _decorate(root: mjcf.RootElement, look: Look) -> None:
     root.visual.headlight.set_attributes(
         ambient=(0.35, 0.35, 0.35), diffuse=look.light, specular=(0.1, 0.1, 0.1)
     )
-    # What viewers may show on top: red rather than the pale blue that MuJoCo draws forces with.
+    # Contact forces, which viewers can show: red instead of MuJoCo's pale blue.
     root.visual.rgba.contactforce = (0.9, 0.2, 0.15, 1)
     root.visual.scale.forcewidth = 0.2
     root.asset.add(

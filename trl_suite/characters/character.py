@@ -30,9 +30,9 @@ class Joint:
       kp: position gain, N m/rad.
       kd: damping gain, N m s/rad.
       weight: weight in the pose and velocity terms of the imitation reward, before normalisation.
-      target: working posture of position control, rad; of a ball joint a rotation vector, or 0.
-      original_range: limits in rad by which the original scales position actions, where they differ
-        from the joint's limits; of a spherical joint the extremes over its three axes.
+      target: working posture of position control, rad; for a ball joint a rotation vector, or 0.
+      original_range: limits in rad by which the original scales position actions, if they differ
+        from the joint's limits; for a spherical joint the extremes over its three axes.
       armature: inertia in kg m^2 that is added so that stiff servos of light links are stable.
 
     Raises:
@@ -74,8 +74,8 @@ class CharacterSpec:
       collision_geoms: names of the geoms that can touch the ground; by default one for each link,
         with its name, unless its default class is group0.
       notes: assumptions that were made about the character, as sentences.
-      clip: the clip of those in mocap/ that it tracks by default.
-      differences: sentences on what differs from the original, by actuation model or 'gait'.
+      clip: name of the clip in mocap/ that it tracks by default.
+      differences: sentences on differences from the original, by actuation model or 'gait'.
     """
 
     name: str

@@ -4,8 +4,8 @@
                                 end_effectors=('left_foot', 'right_foot'), spatial=True)
     environment = suite.build(spec, terrain='hills3d', task='walk')
 
-MuJoCo reads the file. Frames are MuJoCo's: the character faces +x, z points up. Masses, limits,
-damping of joints, servos and torques in the file are kept; values that it does not contain are
+MuJoCo reads the file. Frames are MuJoCo's: the character faces +x, z points up. The masses, joint
+limits, joint damping, position actuators and torque limits of the file are kept; missing values are
 chosen as follows:
 
 * the torque limit of a joint is the torque of the whole character's weight at the farthest end of
@@ -15,10 +15,10 @@ chosen as follows:
 * the working posture of a joint is its angle in the first key frame, or else 0, moved into its
   limits.
 
-`spec.notes` lists these assumptions, and the actuators that were left out: those that act on a tendon, a
-site or a body, because every joint gets an actuator of its own. The passive damping of joints is added
-to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept; sensors, lights
-and everything outside the character are removed.
+`spec.notes` lists these assumptions, and the actuators that were left out: those that act on a
+tendon, a site or a body, because every joint gets its own actuator. The passive damping of joints
+is added to kd (see `trl_suite.actuation`); friction, springs, equalities and tendons are kept;
+sensors, lights and everything outside the character are removed.
 """
 
 from __future__ import annotations
@@ -77,16 +77,17 @@ def from_file(
     Links are all bodies with mass, in the order of the file; joints keep their names.
 
     Args:
-      path: MJCF (.xml, .mjcf) or .urdf; meshes are at the paths in the file, those of a package://
-        in a folder that contains the file. Visual geoms of a URDF file are discarded, as by MuJoCo.
+      path: MJCF (.xml, .mjcf) or .urdf; meshes are read from the paths in the file, and package://
+        addresses from the folders that contain the file. Visual geoms of a URDF file are discarded,
+        as by MuJoCo.
       end_effectors: bodies whose positions imitation tracks and whose contacts are observed, e.g.
         feet.
       fall_links: bodies whose contact with the ground ends the episode.
-      root: body that carries all others, a child of the world; by default the only one.
+      root: body that is the ancestor of all others, a child of the world; by default the only one.
       spatial: whether the character moves in three dimensions, instead of in the x-z plane; by
         default derived from the root's joints: a free joint, or two slides and a hinge.
       turn: rotation, as a quaternion wxyz, that makes the character face +x with z up; by default
-        none. (0.7071, 0.7071, 0, 0) raises a character whose up is y.
+        none. (0.7071, 0.7071, 0, 0) is for a character whose y axis points up.
       joints: parameters of joints by name, which replace those derived from the file.
       stumble_exempt: bodies that may touch the ground without a stumble; by default the end
         effectors.
@@ -111,7 +112,9 @@ def from_file(
     check_numbers(file)
     name = file.stem if name is None else name
     if name in CHARACTERS or '/' in name:
-        raise ValueError(f'the suite has a character named {name!r}; pass another name=')
+        raise ValueError(
+            f'name is {name!r}; expected one without a slash that no character of the suite has'
+        )
     spec = named(file)
     model = compiled(file, spec)
     number = find_root(file, model, root)
@@ -122,7 +125,7 @@ def from_file(
     found = ModelInspector(file, model, number, spatial)
     if abs(own_turn[0]) < 1 - 1e-6:
         found.notes.append(
-            f'the root is turned in the file by {own_turn.round(3).tolist()}; its axes are now those of '
+            f'the root is rotated in the file by {own_turn.round(3).tolist()}; its axes are now those of '
             'the world'
         )
     found.check_names('end effector', end_effectors)
@@ -133,8 +136,8 @@ def from_file(
     figures = found.figures()
     if left_out := found.left_out():
         found.notes.append(
-            f'actuators that are left out, as they act on other things than one joint of the '
-            f'character: {", ".join(left_out)}'
+            'actuators that are left out, because they do not act on a joint of the character: '
+            f'{", ".join(left_out)}'
         )
     for joint, own in (joints or {}).items():
         if joint not in figures:
@@ -235,7 +238,7 @@ def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjc
 
 
 def _stage(tree: mjcf.RootElement, root: mjcf.Element, reach: float) -> None:
-    """Replaces the file's lights by the suite's, and its cameras of the same names by fitting ones."""
+    """Replaces the lights of the file, and its cameras with the names of the suite's cameras."""
     away = CAMERA_AWAY * reach
     for item in (*tree.find_all('light'), *tree.find_all('camera')):
         if item.tag == 'light' or item.name in _CAMERAS:

@@ -26,8 +26,9 @@ LEAST_SWING = 0.05  # rad, from limit to limit of a hinge
 MOST_SWING = 2 * np.pi  # rad, from 0 to a limit of a hinge
 SIZES = (0.05, 10.0)  # m, from the root to the farthest end
 MASSES = (0.1, 2000.0)  # kg
-LYING = 0.2  # least share of the distance to the end effectors that points down, unless it may lie
-FACING = 0.7  # cosine of the angle beyond which a character may face elsewhere
+# Smallest downward component of the direction to the end effectors; below it, a character may lie.
+LYING = 0.2
+FACING = 0.7  # cosine of the largest angle between +x and the facing direction without a note
 LATERAL = 1e-3  # rad; largest deviation of a planar character's joint axis from plane or normal
 
 _FREE, _BALL, _SLIDE, _HINGE = (
@@ -45,7 +46,7 @@ KINDS = {_FREE: 'free', _BALL: 'ball', _SLIDE: 'slide', _HINGE: 'hinge'}
 
 
 def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Returns the facing direction (2,) of a character, or None if no names of bodies tell it.
+    """Returns the facing direction (2,) of a character, or None if names do not determine it.
 
     Args:
       places: positions of the bodies by name, (3,) m. The direction follows from pairs of bodies
@@ -57,14 +58,14 @@ def facing(places: Mapping[str, np.ndarray]) -> np.ndarray | None:
         if right is not None:
             aside += place - places[right]
     length = np.linalg.norm(aside[:2])
-    # If the character lies on its side, x and y tell nothing.
+    # The direction is mostly vertical if the character lies on its side.
     if length < FACING * np.linalg.norm(aside) or not length:
         return None
     return np.array([aside[1], -aside[0]]) / length
 
 
 def _right(left: str) -> list[str]:
-    """Returns what the right counterpart of a left body may be called."""
+    """Returns possible names of the right counterpart of a left body."""
     return [name for a, b in _SIDES if (name := re.sub(a, b, left, count=1)) != left]
 
 
@@ -104,7 +105,7 @@ class ModelInspector:
         self.links = tuple(np.array(self.bodies)[heavy].tolist())
         self.weight = float(model.body_mass[self.ids].sum()) * GRAVITY
         if not self.weight > 0:
-            raise problem(file, f'the mass of {self.bodies[0]!r} and all that hangs on it is 0')
+            raise problem(file, f'the mass of {self.bodies[0]!r} and its descendants is 0')
         self._doubt()
 
     def _dimensions(self, root_joints: np.ndarray, spatial: bool | None) -> bool:
@@ -162,7 +163,7 @@ class ModelInspector:
             self.notes.append(f'it weighs {self.weight / GRAVITY:.4g} kg; are masses in kg?')
 
     def check_posture(self, end_effectors: Sequence[str]) -> None:
-        """Notes that a character may lie, or may not look along +x, in its working posture."""
+        """Adds a note if a character seems to lie, or not to face +x, in its working posture."""
         model, data = self.model, mujoco.MjData(self.model)
         for i in self.joints.tolist():
             if model.jnt_type[i] in (_HINGE, _SLIDE):
@@ -174,8 +175,8 @@ class ModelInspector:
         distance = np.linalg.norm(away)
         if distance > 0 and -away[2] < LYING * distance:
             self.notes.append(
-                f'it may lie: the end effectors are {away.round(3).tolist()} m from the centre of mass; '
-                'expected below it, z up. turn= turns it'
+                f'it may lie: the end effectors are at {away.round(3).tolist()} m from the centre of mass; '
+                'expected below it, with z up; pass turn= to rotate the character'
             )
             return
         forward = facing(
@@ -183,12 +184,12 @@ class ModelInspector:
         )
         if forward is not None and forward[0] < FACING:
             self.notes.append(
-                f'it may look along {forward.round(2).tolist()}, as left and right bodies lie; expected '
-                'along +x, (1, 0). turn= turns it'
+                f'it may face {forward.round(2).tolist()}, according to its left and right bodies; expected '
+                '+x, [1, 0]; pass turn= to rotate the character'
             )
 
     def left_out(self) -> list[str]:
-        """Names of actuators that have no part in the character: what each acts on, in brackets."""
+        """Returns names of actuators that do not act on a joint, and in brackets what they act on."""
         model, names = self.model, []
         for a in range(model.nu):
             kind = mujoco.mjtTrn(model.actuator_trntype[a])
@@ -214,8 +215,8 @@ class ModelInspector:
                 raise problem(self.file, errors.unknown(what, name, self.bodies))
             if solid and name not in touching:
                 raise problem(
-                    self.file, f'{what} {name!r} has no geom that can touch the ground; those that '
-                    f'have: {", ".join(sorted(touching))}',
+                    self.file, f'{what} {name!r} has no geom that can touch the ground; bodies '
+                    f'with such geoms: {", ".join(sorted(touching))}',
                 )  # fmt: skip
 
     def figures(self) -> dict[str, Joint]:
@@ -256,7 +257,7 @@ class ModelInspector:
                 ('gains', 'no servos in the file; kp, N m/rad (slides: N/m)'),
                 ('damping', 'servos without damping; kd, N m s/rad (slides: N s/m)'),
                 ('posture', 'zero is beyond the limits; working posture'),
-                ('free', 'no limits of the angle'),
+                ('free', 'no joint limits in the file'),
             )
             if assumed[key]
         ]

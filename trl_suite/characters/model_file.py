@@ -1,4 +1,4 @@
-"""MJCF and URDF files as MuJoCo reads them: names for all that is in them, finite numbers, turned roots."""
+"""Reads MJCF and URDF files with MuJoCo: names elements, checks numbers, and rotates roots."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from lxml import etree
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
-# Of a file, besides bodies: what must have a name to be found again.
+# Kinds of elements, besides bodies, that need names because they are looked up later.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
 
 def problem(file: pathlib.Path, what: str) -> ValueError:
-    """Returns what to raise about a file."""
+    """Returns an error that names the file."""
     return ValueError(f'{file}: {what}')
 
 
 def named(file: pathlib.Path) -> mujoco.MjSpec:
-    """Reads a file; what has no name in it gets one."""
+    """Reads a file, and gives names to elements without a name."""
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
@@ -44,17 +44,17 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
             item.name = item.name or f'unnamed_{kind}_{i}'
     for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
         if '/' in item.name:
-            raise problem(file, f'the name {item.name!r} has a slash; expected none in names')
+            raise problem(file, f'the name {item.name!r} has a slash; expected a name without one')
     return spec
 
 
 def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
-    """Refuses NaN, which MuJoCo takes for something that is not said, and infinity.
+    """Raises an error for NaN, which MuJoCo treats as a missing value, and for infinity.
 
-    Refuses models that load themselves, too: they would crash the process.
+    Models that load themselves are errors as well, since they would crash the process.
 
     Args:
-      file: which is read with all that it includes and loads.
+      file: the file; files that it includes or loads are checked as well.
       above: files that load it, the first one first.
     """
     check_size(file)
@@ -76,7 +76,7 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
     for element in elements:
         if element.tag not in ('include', 'model') or not element.get('file'):
             continue
-        # MuJoCo takes paths from the file that it was given, too.
+        # MuJoCo resolves paths also relative to the first file.
         for folder in dict.fromkeys((file.parent, above[0].parent)):
             inside = folder / element.get('file', '')
             if inside.resolve() in above:
@@ -84,13 +84,13 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
                     file, f'line {element.sourceline}: <{element.tag} file="{element.get("file")}"> '
                     'loads a file that loads this one; expected another model',
                 )  # fmt: skip
-            if inside.is_file():  # else MuJoCo complains
+            if inside.is_file():  # otherwise MuJoCo reports the missing file
                 check_numbers(inside, above)
                 break
 
 
 def _finite(text: str) -> bool:
-    """Whether a text is no list of numbers, or one of finite ones."""
+    """Whether a text is a list of finite numbers, or not a list of numbers."""
     try:
         return bool(np.isfinite([float(number) for number in text.split()]).all())
     except ValueError:
@@ -98,7 +98,7 @@ def _finite(text: str) -> bool:
 
 
 def _in_package(file: pathlib.Path, name: str) -> str:
-    """Returns where a mesh of a ROS package lies, given a file somewhere in that package."""
+    """Returns the path of a mesh of a ROS package, from a file in that package."""
     address = re.fullmatch(r'package:/+([^/]+)/(.+)', name)
     if address is None:
         return name
@@ -112,20 +112,20 @@ def _in_package(file: pathlib.Path, name: str) -> str:
 
 
 def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> int:
-    """Returns the number of the body that carries all others; by default the only one there is."""
+    """Returns the id of the root body; by default the only child of the world."""
     top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
     if root is None and len(top) == 1:
         (root,) = top
     if root in top:
         return top[root]
     if not top:
-        raise problem(file, 'there is no body; expected one that carries all others')
+        raise problem(file, 'there is no body; expected one that is the ancestor of all others')
     if root is None:
-        raise problem(file, f'several bodies may be the root; give root=, one of {[*top]}')
+        raise problem(file, f'several bodies may be the root; pass root=, one of {[*top]}')
     names = [model.body(i).name for i in range(1, model.nbody)]
     if root in names:
         above = model.body(model.body_rootid[model.body(root).id]).name
-        raise problem(file, f'root {root!r} hangs on another body; did you mean {above!r}?')
+        raise problem(file, f'root {root!r} is the child of another body; did you mean {above!r}?')
     raise problem(file, errors.unknown('root', root, names))
 
 
@@ -149,8 +149,8 @@ def turned(
             equality.name1, equality.name2,
         ):  # fmt: skip
             raise problem(
-                file, f'the root {root!r} is turned, and equality {equality.name!r} holds it; expected '
-                'none at the root, or that the file is turned as it should be',
+                file, f'the root {root!r} is rotated, and equality {equality.name!r} refers to it; remove '
+                'the equality, or rotate the character in the file',
             )  # fmt: skip
     frame = body.add_frame(quat=rotation)
     for item in (*body.geoms, *body.sites, *body.cameras, *body.lights, *body.bodies):
@@ -160,7 +160,7 @@ def turned(
         if each is not frame and each.frame is None:
             each.set_frame(frame)
     if body.explicitinertial:
-        model = spec.compile()  # resolves what is written in other ways than by a quaternion
+        model = spec.compile()  # resolves orientations that are not given as quaternions
         number = model.body(root).id
         turn = Rotation(rotation)
         body.ipos = turn.vector(model.body_ipos[number])
@@ -207,7 +207,7 @@ def _numbers(element: etree._Element, key: str, default: Sequence[float]) -> np.
 
 
 class Rotation:
-    """A rotation, of vectors and of other rotations."""
+    """A rotation that is applied to vectors and to other rotations."""
 
     def __init__(self, quaternion: Sequence[float] | np.ndarray) -> None:
         self._turn = np.array(quaternion, float)

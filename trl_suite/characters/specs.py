@@ -140,7 +140,7 @@ _BIPED3D_SIMBICON_JOINTS = {
 }
 
 _TO_PARENT = ('targets of hips and shoulder are angles to the parent link, not to the world',)
-_BORROWED = ('the original has no muscles for this character; they are those of another one',)
+_BORROWED = ('the original has no muscles for this character; those of another character are used',)
 
 DOG = CharacterSpec(
     name='dog',
@@ -164,13 +164,13 @@ GOAT = CharacterSpec(
     fall_links=('root', 'spine0'),
     end_effectors=('finger', 'toe'),
     stumble_exempt=('toe', 'finger', 'ankle', 'wrist'),
-    description='Goat, 21 links: the skeleton of the dog with horns; only its rump is a fall.',
+    description='Goat, 21 links: the skeleton of the dog with horns; only ground contact of its rump is a fall.',
     clip='dog_bound',
     differences={
         'position': _TO_PARENT,
         'muscle': _BORROWED,
         'gait': (
-            "action 0 is a re-tuned gait: with the original's gaits the goat falls here on flat "
+            "action 0 is a retuned gait: with the original's gaits the goat falls here on flat "
             'ground; the original has the gait, but no environment for it',
         ),
     },
@@ -187,7 +187,7 @@ RAPTOR = CharacterSpec(
     differences={
         'position': _TO_PARENT,
         'gait': (
-            "action 0 is the original's base action 1, which is steadier than its base action 0",
+            "action 0 is the original's base action 1, which is more stable than its base action 0",
         ),
     },
 )
@@ -211,7 +211,7 @@ BIPED2D_SIMBICON = CharacterSpec(
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
     differences={
         'gait': (
-            "action 0 is a re-tuned gait: with the original's gait the character falls here; "
+            "action 0 is a retuned gait: with the original's gait the character falls here; "
             'torque is not rewarded',
         ),
     },
@@ -269,7 +269,7 @@ BIPED3D_MOCAP_RUN = dataclasses.replace(
     joints=_BIPED3D_MOCAP_RUN_JOINTS,
     description='Biped in 3D that runs, 8 links: light legs, strong and stiff joints.',
     clip='biped3d_mocap_run',
-    differences={'position': ('its ankles have an armature of 0.03 kg m^2',)},
+    differences={'position': ('the ankles have an armature of 0.03 kg m^2',)},
 )
 
 BIPED3D_FULL_MOCAP = dataclasses.replace(

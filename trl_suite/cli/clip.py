@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
         still = [joint for joint in joints if joint not in followed]
         print('joints:', ', '.join(f'{own} from {other}' for own, other in followed.items()))
         if still:
-            print('joints that nothing moves:', ', '.join(still))
+            print('joints without a counterpart:', ', '.join(still))
     if arguments.cycle is not None:
         clip = retargeting.cycle(clip, *arguments.cycle)
     report = clip_check.check(clip, name)

@@ -36,7 +36,7 @@ EXTRAS = {
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',
     'osmesa': 'libosmesa6 (Debian, Ubuntu: apt install libosmesa6)',
-    'glfw': 'a screen',
+    'glfw': 'a display',
 }
 
 # Prints one line with the error, without messages of libraries at exit.
@@ -138,7 +138,7 @@ def extras() -> Iterator[Finding]:
         if missing:
             yield Finding(
                 NOTE, f"extra '{extra}': {', '.join(missing)} not installed",
-                f"if you want it: pip install 'trl_suite[{extra}]'",
+                f"to use it: pip install 'trl_suite[{extra}]'",
             )  # fmt: skip
         else:
             yield Finding(OK, f"extra '{extra}'")
@@ -160,7 +160,9 @@ def cores() -> Finding:
     text = f'{usable} of {all_} cores usable, {machine.processor()}'
     if usable == all_:
         return Finding(OK, f'{text}; num_threads=0 starts as many threads')
-    return Finding(NOTE, text, f'num_threads=0 takes all {all_}: give num_threads={usable}')
+    return Finding(
+        NOTE, text, f'num_threads=0 starts {all_} threads; pass num_threads={usable} instead'
+    )
 
 
 def compiled_code() -> Finding:
@@ -186,7 +188,7 @@ def backends() -> Iterator[tuple[str, Finding]]:
         if status:
             yield name, Finding(NOTE, f'MUJOCO_GL={name}: {error}', f'needs {LIBRARIES[name]}')
         else:
-            yield name, Finding(OK, f'MUJOCO_GL={name} draws' + (f', {out}' if out else ''))
+            yield name, Finding(OK, f'MUJOCO_GL={name} renders' + (f', {out}' if out else ''))
 
 
 def self_test(works: Sequence[str]) -> Iterator[Finding]:
@@ -201,7 +203,7 @@ def self_test(works: Sequence[str]) -> Iterator[Finding]:
         if not out:
             yield Finding(
                 FAILED, f'no environment runs: {other}',
-                'see failures above; if there are none: pip install --force-reinstall trl_suite',
+                'see the failures above; if there are none: pip install --force-reinstall trl_suite',
             )  # fmt: skip
             return
     yield Finding(OK, f'an environment runs: {", ".join(json.loads(out.splitlines()[-1]))}')
@@ -213,7 +215,7 @@ def self_test(works: Sequence[str]) -> Iterator[Finding]:
             remedy = f'export MUJOCO_GL={works[0]}'
         yield Finding(
             FAILED,
-            f'nothing can be drawn with MUJOCO_GL={os.environ.get("MUJOCO_GL", "")}: {error}',
+            f'rendering fails with MUJOCO_GL={os.environ.get("MUJOCO_GL", "")}: {error}',
             remedy,
         )
 

@@ -105,134 +105,182 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     def add_policy(command: argparse.ArgumentParser, default: str) -> None:
         command.add_argument(
             '--policy', default=default, type=_policy_name, metavar='POLICY',
-            help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped one',
+            help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped policy',
         )  # fmt: skip
 
     command = add('list', 'list the environments of the catalogue')
     for name in FILTERS:
-        command.add_argument(f'--{name}', help=f'only those of one {name}')
-    command.add_argument('--trained', action='store_true', help='only those with a shipped policy')
+        command.add_argument(f'--{name}', help=f'only environments of this {name}')
+    command.add_argument(
+        '--trained', action='store_true', help='only environments with a shipped policy'
+    )
 
     command = add('info', 'describe one environment in full')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
 
     command = add('rollout', 'run a policy for a number of steps')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
-    command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
-    command.add_argument('--steps', type=_positive, default=256, help='control steps')
+    command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
+    command.add_argument('--steps', type=_positive, default=256, help='number of control steps')
     add_policy(command, 'random')
-    command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
     command.add_argument(
-        '--html', type=pathlib.Path, metavar='FILE', help='an .html replay, seen from all sides'
+        '--video', type=pathlib.Path, metavar='FILE', help='write a video, .mp4 or .gif'
     )
-    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+    command.add_argument(
+        '--html', type=pathlib.Path, metavar='FILE', help='write an interactive replay, .html'
+    )
+    command.add_argument(
+        '--strip', type=pathlib.Path, metavar='FILE', help='write a film strip, .png'
+    )
     command.add_argument('--columns', type=_positive, default=8, help='pictures in the strip')
-    command.add_argument('--trajectory', type=pathlib.Path, metavar='FILE', help='an .npz')
-    command.add_argument('--ghost', action='store_true', help='draw the reference clip as well')
-    command.add_argument('--size', type=_size, default='640x480', metavar='WxH', help='in pixels')
+    command.add_argument(
+        '--trajectory', type=pathlib.Path, metavar='FILE', help='write all time steps, .npz'
+    )
+    command.add_argument('--ghost', action='store_true', help='show the reference clip as well')
+    command.add_argument(
+        '--size', type=_size, default='640x480', metavar='WxH', help='size of pictures in pixels'
+    )
     command.add_argument('--camera', default='side', help='name of a camera')
 
-    command = add('view', "show a policy that acts: in dm_control's viewer, or in a web browser")
+    command = add(
+        'view', "show an environment with a policy, in dm_control's viewer or in a web browser"
+    )
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     command.add_argument(
         '--policy', default='best', type=_best_or_policy, metavar='POLICY',
         help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that exists',
     )  # fmt: skip
-    command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+    command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
     command.add_argument(
         '--browser', action='store_true',
-        help="serve web browsers, with many controls; without it, F1 shows dm_control's keys",
+        help="show it in web browsers, with controls, instead of dm_control's viewer (F1: its keys)",
     )  # fmt: skip
-    command.add_argument('--host', default='127.0.0.1', help='address that --browser listens on')
-    command.add_argument('--port', type=_positive, default=8080, help='the first that it tries')
+    command.add_argument('--host', default='127.0.0.1', help='address to listen on with --browser')
+    command.add_argument(
+        '--port', type=_positive, default=8080, help='first port to try with --browser'
+    )
 
-    command = add('evaluate', 'run a policy for whole episodes, and summarise them')
+    command = add('evaluate', 'run a policy for whole episodes, and print a summary')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     add_policy(command, 'reference')
-    command.add_argument('--episodes', type=_positive, default=50, help='how many')
-    command.add_argument('--seed', type=int, default=0, help='of all episodes')
-    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument('--episodes', type=_positive, default=50, help='number of episodes')
+    command.add_argument(
+        '--seed', type=int, default=0, help='seed of the environments and the policy'
+    )
+    command.add_argument(
+        '--threads', type=int, default=0, help='threads of the physics; 0: all cores'
+    )
     command.add_argument(
         '--step-limit', type=_positive, metavar='N',
         help="steps after which an episode is truncated, instead of the environment's limit",
     )  # fmt: skip
-    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of all results')
+    command.add_argument(
+        '--json', type=pathlib.Path, metavar='FILE', help='write all results, .json'
+    )
 
     command = add('terrain', 'plot random grounds of a terrain, or write one as a mesh')
     command.add_argument(
         'terrain', metavar='NAME-or-FILE', help='a preset, or a .json or .txt file'
     )
-    command.add_argument('--draws', type=_positive, default=3, help='how many')
-    command.add_argument('--length', type=float, default=40.0, help='in metres, or side of a map')
-    command.add_argument('--seed', type=int, default=0, help='of the grounds')
+    command.add_argument('--draws', type=_positive, default=3, help='number of grounds')
     command.add_argument(
-        '--terrain-level', type=float, default=0.0, help='which of the parameter sets'
+        '--length', type=float, default=40.0, help='length of a profile, or side of a map, in m'
+    )
+    command.add_argument('--seed', type=int, default=0, help='seed of the grounds')
+    command.add_argument(
+        '--terrain-level', type=float, default=0.0, help='index of the parameter set'
     )
     command.add_argument(
         '--output', type=pathlib.Path, metavar='FILE',
-        help='a .png; or a mesh of the first ground, .obj, .glb or .stl',
+        help='write a plot, .png, or a mesh of the first ground, .obj, .glb or .stl',
     )  # fmt: skip
 
     command = add('clip', 'retarget a motion file to a character, and check it')
     command.add_argument(
         'file', metavar='FILE', type=pathlib.Path,
-        help='BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; its content tells',
+        help='BVH, Acclaim (.amc), JSON of TerrainRL or DeepMimic, or a clip; recognised from the content',
     )  # fmt: skip
     command.add_argument('--character', required=True, help='name of a character')
-    command.add_argument('--skeleton', type=pathlib.Path, metavar='FILE', help='.asf of an .amc')
+    command.add_argument(
+        '--skeleton', type=pathlib.Path, metavar='FILE', help='the .asf file of an .amc file'
+    )
     command.add_argument(
         '--map', type=pathlib.Path, metavar='FILE',
-        help="a .json of joints: the character's to the motion's; default: by usual names",
+        help="a .json that maps the character's joints to the motion's; by default usual names are tried",
     )  # fmt: skip
-    command.add_argument('--scale', type=float, help='of lengths; default: by the length of limbs')
+    command.add_argument(
+        '--scale', type=float, help='scale of lengths; by default the ratio of limb lengths'
+    )
     command.add_argument(
         '--cycle', nargs='*', type=float, metavar='TIME',
-        help='cut one cycle, from a start to an end time (s); by default the best one is found',
+        help='cut one cycle, between two times (s), or without times the best cycle that is found',
     )  # fmt: skip
-    command.add_argument('--frames', action='store_true', help='print every fault in every frame')
-    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='a clip, .npz')
-    command.add_argument('--strip', type=pathlib.Path, metavar='FILE', help='a .png film strip')
+    command.add_argument('--frames', action='store_true', help='print the faults of every frame')
+    command.add_argument('--output', type=pathlib.Path, metavar='FILE', help='write the clip, .npz')
+    command.add_argument(
+        '--strip', type=pathlib.Path, metavar='FILE', help='write a film strip, .png'
+    )
 
-    command = add('try', 'read a character from a file, print its properties, and draw it')
+    command = add('try', 'read a character from a file, print its properties, and render it')
     command.set_defaults(command='try_file')
     command.add_argument('file', metavar='FILE', type=pathlib.Path, help='an .xml, .mjcf or .urdf')
-    command.add_argument('--root', metavar='BODY', help='that carries all others')
     command.add_argument(
-        '--end-effectors', nargs='+', metavar='BODY', help='by default the last ones of each limb'
+        '--root', metavar='BODY', help='root of the character, parent of all other links'
+    )
+    command.add_argument(
+        '--end-effectors', nargs='+', metavar='BODY', help='by default the last body of each limb'
     )
     command.add_argument(
         '--fall-links', nargs='+', metavar='BODY',
-        help='that must not touch the ground; by default the first one that can',
+        help='links that must not touch the ground; by default the first that can touch it',
     )  # fmt: skip
     command.add_argument(
         '--spatial', action=argparse.BooleanOptionalAction,
-        help="whether it moves in three dimensions; by default derived from the root's joints",
+        help="whether the character is three-dimensional; by default derived from the root's joints",
     )  # fmt: skip
     command.add_argument(
         '--turn', nargs=4, type=float, metavar=('W', 'X', 'Y', 'Z'),
-        help='quaternion that makes it face +x with z up',
+        help='quaternion that rotates the character so that it faces +x, with z up',
     )  # fmt: skip
     command.add_argument(
-        '--output', type=pathlib.Path, metavar='FILE', help='a .png of it on three terrains'
+        '--output',
+        type=pathlib.Path,
+        metavar='FILE',
+        help='file of the picture on three terrains, .png',
     )
 
     add('doctor', 'check the installation; print problems and remedies')
 
     command = add('bench', 'measure the speed of this machine against raw MuJoCo')
     command.add_argument(
-        'id', metavar='ID', nargs='?', default='PD_Biped2D_Gaps_Terrain-v0', help="or 'domain/task'"
+        'id',
+        metavar='ID',
+        nargs='?',
+        default='PD_Biped2D_Gaps_Terrain-v0',
+        help="id, or 'domain/task'",
     )
-    command.add_argument('--num-envs', type=_positive, default=64, help='of the vector environment')
-    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
-    command.add_argument('--seconds', type=float, default=2.0, help='of each of four measurements')
-    command.add_argument('--json', type=pathlib.Path, metavar='FILE', help='a .json of everything')
+    command.add_argument(
+        '--num-envs', type=_positive, default=64, help='simulations of the vector environment'
+    )
+    command.add_argument(
+        '--threads', type=int, default=0, help='threads of the physics; 0: all cores'
+    )
+    command.add_argument(
+        '--seconds', type=float, default=2.0, help='duration of each of four measurements'
+    )
+    command.add_argument(
+        '--json', type=pathlib.Path, metavar='FILE', help='write all results, .json'
+    )
 
     command = add('gallery', 'make pictures of all environments, terrains and characters')
     command.add_argument(
-        '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='where to'
+        '--output', type=pathlib.Path, default='gallery', metavar='FOLDER', help='output folder'
     )
     command.add_argument(
-        '--filter', default='*', metavar='PATTERN', help='part of a name, as Dog2D_Gaps or terrains'
+        '--filter',
+        default='*',
+        metavar='PATTERN',
+        help='part of a path in the folder, as Dog2D_Gaps or terrains',
     )
     command.add_argument('--overwrite', action='store_true', help='replace existing pictures')
     command.add_argument(
@@ -247,22 +295,28 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         'run', help='train a learner on a sequence, and test it after each stage',
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )  # fmt: skip
-    command.add_argument('name', metavar='NAME', help='of a sequence')
+    command.add_argument('name', metavar='NAME', help='name of a sequence')
     command.add_argument(
         '--learner', required=True, metavar='MODULE:CLASS',
-        help='made as CLASS(sequence, seed), with the methods train(stage) and policy()',
+        help='class of the learner: CLASS(sequence, seed), with the methods train(stage) and policy()',
     )  # fmt: skip
     command.add_argument('--budget', default='small', help='samples per stage: small, full, or N')
-    command.add_argument('--episodes', type=_positive, default=32, help='per test and environment')
-    command.add_argument('--stages', type=_positive, metavar='N', help='end early, after N stages')
-    command.add_argument('--seed', type=int, default=0, help='of the run')
-    command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
+    command.add_argument(
+        '--episodes', type=_positive, default=32, help='episodes per test and environment'
+    )
+    command.add_argument('--stages', type=_positive, metavar='N', help='stop after N stages')
+    command.add_argument('--seed', type=int, default=0, help='seed of the run')
+    command.add_argument(
+        '--threads', type=int, default=0, help='threads of the physics; 0: all cores'
+    )
     command.add_argument(
         '--output', type=pathlib.Path, default='result.json', metavar='FILE',
-        help='a .json; an unfinished run is resumed',
+        help='result, .json; an unfinished run is resumed',
     )  # fmt: skip
     command = actions.add_parser('check', help='check results: fields, budget and metrics')
-    command.add_argument('files', nargs='+', type=pathlib.Path, metavar='FILE', help='a .json')
+    command.add_argument(
+        'files', nargs='+', type=pathlib.Path, metavar='FILE', help='a result, .json'
+    )
     return parser
 
 

@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
             if time_step.first() or not watched:
                 look(time_step.first())
             if arguments.strip is not None and done in in_strip:
-                in_strip.discard(done)  # the start that follows an end has the same number
+                in_strip.discard(done)  # the next reset has the same number
                 pictures.append(picture())
     if arguments.strip is not None:
         rendering.film_strip(pictures, arguments.strip, arguments.columns)
@@ -121,18 +121,18 @@ class _Record:
             int(time_step.step_type), environment.physics.data.qpos.copy(),
         ))  # fmt: skip
         if first:
-            self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'goes on'})
+            self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'unfinished'})
             return
         episode, info = self._episodes[-1], environment.info
         episode['steps'] += 1
         episode['return'] += time_step.reward
         episode['distance'] = info.get('distance', 0.0)
         if time_step.last():
-            cut = 'was cut' if time_step.discount else 'failed'
+            cut = 'truncated' if time_step.discount else 'failed'
             episode['end'] = next((end for end in _ENDS if info.get(end)), cut)
 
     def arrays(self) -> dict[str, Any]:
-        """The entries as arrays; actions[i] was taken from observations[i], if there was one."""
+        """Returns the entries as arrays; actions[i] follows observations[i], or is 0 at ends of episodes."""
         names = ('observations', 'actions', 'rewards', 'discounts', 'step_types', 'qpos')
         return {
             name: np.array(column)

@@ -1,4 +1,4 @@
-"""`trl-suite try`: reads a character from a file, tells what became of it, and draws it."""
+"""`trl-suite try`: reads a character from a file, prints its properties, and renders it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
 TERRAINS = {True: ('plane', 'hills3d', 'stairs3d'), False: ('flat', 'slopes', 'steps')}
-SECONDS = 1.0  # under actions of zero, before a picture is drawn
+SECONDS = 1.0  # duration of zero actions before a picture is rendered
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Prints what of a file became of the character, then draws it on three terrains."""
+    """Prints the properties of the character in a file, then renders it on three terrains."""
     output = arguments.output or pathlib.Path(f'try_{arguments.file.stem}.png')
     files.check_path(output, rendering.IMAGE_SUFFIXES)
     suite = engine.load()
@@ -48,9 +48,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _links(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """Returns end effectors and links that must not touch the ground, by default what looks like them.
+    """Returns end effectors, and links that must not touch the ground.
 
-    End effectors are the last bodies of limbs that reach below the centre of mass.
+    By default end effectors are the last bodies of limbs that reach below the centre of mass, and the
+    first other body with collision geoms must not touch the ground.
     """
     import mujoco
 
@@ -78,7 +79,7 @@ def _links(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
 
 
 def _above(model: Any, body: int) -> list[int]:
-    """Returns the bodies that carry a body."""
+    """Returns the ancestors of a body."""
     found = []
     while body := int(model.body_parentid[body]):
         found.append(body)
@@ -86,7 +87,7 @@ def _above(model: Any, body: int) -> list[int]:
 
 
 def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -> str:
-    """Returns what became of a file, for an environment that has just been reset on level ground."""
+    """Returns the properties of a character, after a reset of its environment on level ground."""
     from trl_suite.characters import inspect, model_file
 
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
@@ -96,9 +97,11 @@ def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -
     low, high = _extent(model, data, own)
     bodies = zip(spec.links, character.bodies, strict=True)
     forward = inspect.facing({name: environment.physics.bind(body).xipos for name, body in bodies})
-    looks = 'unknown, as no links are named left and right'
+    looks = 'unknown, since no links are named left and right'
     if forward is not None:
-        looks = f'along {forward.round(2).tolist()}, as left and right links lie'
+        looks = (
+            f'along {forward.round(2).tolist()}, derived from the positions of left and right links'
+        )
     kinds = [joint.type or 'hinge' for joint in character.joints]
     given = len(model_file.named(file).actuators)
     left = next((note for note in spec.notes if note.startswith('actuators')), '').count(' (')
@@ -111,9 +114,9 @@ def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -
         f'links: {", ".join(spec.links)}',
         f'end effectors: {", ".join(spec.end_effectors)}; must not touch the ground: '
         f'{", ".join(spec.fall_links)}',
-        f'pairs of its geoms that may collide: {pairs}; that touch at the start: {len(inside)}'
+        f'pairs of its geoms that can collide: {pairs}; in contact at the start: {len(inside)}'
         + (f', up to {-min(inside):.2g} m deep' if inside else ''),
-        f'actuators: {given} in the file, {given - left} kept, {left} left out; now one per joint',
+        f'actuators: {given} in the file, {given - left} kept, {left} omitted; the character has one per joint',
         tables.table(
             ('joint', 'type', 'kp', 'kd', 'torque limit'),
             (
@@ -133,7 +136,7 @@ def _root(environment: Environment) -> int:
 
 
 def _colliding(model: Any, bodies: np.ndarray) -> int:
-    """Returns how many pairs of geoms of bodies may collide."""
+    """Returns the number of pairs of geoms, of these bodies, that can collide."""
     excluded, count = {*model.exclude_signature.tolist()}, 0
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
     for a, b in itertools.combinations(geoms.tolist(), 2):
@@ -151,7 +154,7 @@ def _colliding(model: Any, bodies: np.ndarray) -> int:
 
 
 def _contacts(model: Any, data: Any, bodies: np.ndarray) -> list[float]:
-    """Returns the distances (m, negative inside each other) of contacts among bodies."""
+    """Returns the distances (m, negative for penetration) of contacts among bodies."""
     return [
         contact.dist
         for contact in data.contact
@@ -160,7 +163,7 @@ def _contacts(model: Any, data: Any, bodies: np.ndarray) -> list[float]:
 
 
 def _extent(model: Any, data: Any, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the lowest and the highest corner (3,) m of what can be touched of bodies."""
+    """Returns lowest and highest corner, (3,) m, of the bounding box of collision geoms."""
     touching = (model.geom_contype | model.geom_conaffinity) != 0
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies) & touching)
     axes = data.geom_xmat[geoms].reshape(-1, 3, 3)
@@ -170,7 +173,7 @@ def _extent(model: Any, data: Any, bodies: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _stand(environment: Environment) -> str:
-    """Runs actions of zero, and tells how that went."""
+    """Runs zero actions, and returns a phrase on the result."""
     task = environment.task
     root = environment.physics.bind(task.character.root_body)
     begin, steps = float(root.xpos[2]), round(SECONDS / environment.control_timestep())
@@ -181,4 +184,4 @@ def _stand(environment: Environment) -> str:
             how = 'diverges' if environment.info.get('diverged') else 'falls'
             return f'{how} after {after:.2g} s of zero actions'
     end = float(root.xpos[2])
-    return f'root {begin:.3g} m up at the start, {end:.3g} m after {SECONDS:g} s of zero actions'
+    return f'root at a height of {begin:.3g} m at the start, {end:.3g} m after {SECONDS:g} s of zero actions'

@@ -20,11 +20,11 @@ from trl_suite.viewing.playback import Playback
 if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
 
-INSTEAD = 'without one, look at it in a web browser (--browser), from another machine too'
+INSTEAD = 'use --browser to show it in a web browser, on this or another machine'
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Opens a window, and returns when it is closed; or serves web browsers until interrupted."""
+    """Opens a window and returns when it is closed, or serves web browsers until interrupted."""
     if arguments.browser:
         in_browser(arguments)
         return
@@ -44,11 +44,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def in_browser(arguments: argparse.Namespace) -> None:
-    """Shows an environment to web browsers until a keyboard interrupt."""
+    """Serves web browsers until a keyboard interrupt."""
     viewer = engine.load('trl_suite.viewing.browser').Browser(
         arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port
     )
-    print(f'{viewer.url} shows it; Ctrl+C ends this', flush=True)
+    print(f'open {viewer.url} in a web browser; press Ctrl+C to stop', flush=True)
     viewer.run()
 
 
@@ -56,13 +56,13 @@ def check_screen() -> None:
     """Checks that a window can be opened, and makes dm_control use GLFW.
 
     Raises:
-      RuntimeError: there is no screen, or none that GLFW can use; the message says what to do.
+      RuntimeError: there is no display, or GLFW cannot use it; the message has an alternative.
     """
     if sys.platform == 'linux' and not (
         os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
     ):
         raise RuntimeError(
-            'a window needs a screen, but neither DISPLAY nor WAYLAND_DISPLAY is set; ' + INSTEAD
+            'a window needs a display, but neither DISPLAY nor WAYLAND_DISPLAY is set; ' + INSTEAD
         )
     import glfw  # a dependency of dm_control
 
@@ -70,7 +70,7 @@ def check_screen() -> None:
         warnings.simplefilter('always')
         if not glfw.init():
             reason = ' '.join(str(each.message) for each in caught) or 'GLFW gives no reason'
-            raise RuntimeError(f'a window needs a screen that GLFW can use ({reason}); {INSTEAD}')
+            raise RuntimeError(f'a window needs a display that GLFW can use ({reason}); {INSTEAD}')
     # dm_control's windows need GLFW. It reads the variable when it is imported.
     os.environ['MUJOCO_GL'] = 'glfw'
     render = sys.modules.get('dm_control._render')

@@ -1,9 +1,8 @@
 """The equations of motion of a planar character, in compiled functions of one simulation.
 
 For stable PD, gravity compensation and virtual forces: joint-space inertia, Jacobians, world
-angles,
-velocity of the centre of mass. Degrees of freedom are in link order: x, z, pitch, then the joints;
-positive pitch is nose up.
+angles, velocity of the centre of mass. Degrees of freedom are in link order: x, z, pitch, then the
+joints; positive pitch is nose up.
 """
 
 from __future__ import annotations

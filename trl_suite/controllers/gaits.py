@@ -58,8 +58,8 @@ def bound_torques(i: int, gait: GaitRules) -> None:
         stand(i, gait)
         if machine.holds_weight:
             add_weight(i, gait)
-        # A force on the body is the opposite force on the ground, by the hind or fore foot per
-        # state.
+        # A force on the body is the opposite force on the ground, of the hind or the fore foot
+        # depending on the state.
         leg = 0 if state.number[i] < 2 else 1
         ahead, up = state.vector[i, 2 + 2 * leg], state.vector[i, 3 + 2 * leg]
         support = gait.scratch.support

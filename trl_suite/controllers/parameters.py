@@ -23,8 +23,8 @@ One JSON file per character:
 
 and optionally, for exceptions:
 
-    original_base_actions    the base actions of the papers' mixture of experts, if `base_actions`
-                             are others
+    original_base_actions    the base actions of the papers' mixture of experts, if they differ
+                             from `base_actions`
     tuning                   set -> record and scores of the search that found it
     gravity_compensation     false: legs of a bound on the ground do not support the weight
     forward_only             true: a root that moves backwards is a fall

@@ -1,10 +1,10 @@
 """Describes an environment in text and tables, from its `EnvSpec` and the built environment.
 
-from trl_suite import describe, suite
+    from trl_suite import describe, suite
 
-spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
-for title, text in describe.sections(spec, suite.make(spec.id)):  # as `trl-suite info` prints it
-    print(title, text)
+    spec = suite.find('PD_Dog2D_Gaps_Terrain-v0')
+    for title, text in describe.sections(spec, suite.make(spec.id)):  # as `trl-suite info` prints
+        print(title, text)
 
 Sections that all environments share are in `common`, those of a task type in `trl_suite.tasks`;
 `differences` lists the differences from the original.
@@ -51,7 +51,7 @@ def parts(spec: EnvSpec, environment: Environment) -> Iterator[Section]:
       environment: built from it, or from a spec that differs only in its terrain.
     """
     type_, task = task_type(spec), environment.task
-    if type_ is None:  # a user's class or function makes the task
+    if type_ is None:  # the task is made by a user's class or function
         yield common.observation(environment, PLANAR_BLOCKS)
         yield description.action(environment)
         yield description.time(spec, task)

@@ -10,7 +10,7 @@ ORIGINS = {  # by tag
     'addition': 'not part of the original',
 }
 ACTUATION = {
-    'position': 'damping is split between servo and joint, joints have an armature of 0.01 kg m^2',
+    'position': 'damping is split between servo and joint; joints have an armature of 0.01 kg m^2',
     'torque': 'joints have passive damping and an armature of 0.01 kg m^2; action 1 is 0.75 of the limit',
     'velocity': 'joints have an armature of 0.01 kg m^2; the velocity gain is the damping gain kd',
     'muscle': "MuJoCo's muscle curves fitted to the original's, rigid tendons, constant moment arms",
@@ -27,8 +27,8 @@ TERRAIN = {
     'conveyor3d': _BELTS,
     'conveyor3d_wide': _BELTS,
     'dynamic_obstacles3d': (
-        'moving boxes have an armature of 10^6 kg: they push and carry, and cannot be stopped; in the '
-        'original they are kinematic, and have a mass of 1 kg in contacts'
+        'moving boxes have an armature of 10^6 kg: they push and carry other bodies, which cannot stop '
+        'them; in the original they are kinematic, and have a mass of 1 kg in contacts'
     ),
     'mixed_humanoid': 'the terrain is inferred: slopes_mixed_humanoid without slopes',
     'obstacles3d': _OVERLAPS,

@@ -16,7 +16,7 @@ _EVERYWHERE = (
         'rewards, observations, failures',
         '-',
         '',
-        'custom functions, see docs/make_your_own.md',
+        'custom functions; see docs/make_your_own.md',
     ),
     ('random', '-', '', 'seed; by default drawn from the operating system'),
     ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),

@@ -61,12 +61,12 @@ def check_state(state: Any, owner: str, keys: Iterable[str]) -> None:
     """Checks that a saved state was made by an environment like this one.
 
     Args:
-      state: what is to be restored.
-      owner: what an own state has under 'made_for'.
-      keys: what else it has.
+      state: the state to check.
+      owner: the value of 'made_for' in a state of this environment.
+      keys: the other keys of such a state.
 
     Raises:
-      TypeError: the state is no mapping.
+      TypeError: the state is not a mapping.
       ValueError: it belongs to another environment, or parts of it are missing.
     """
     if not isinstance(state, Mapping):

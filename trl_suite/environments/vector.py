@@ -114,7 +114,7 @@ class VectorEnvironment:
         self.flat_observation = flat_observation
         self._task_kwargs = options = errors.options('task_kwargs', task_kwargs)
         if 'random' in options:
-            raise ValueError("task_kwargs has 'random'; here the argument `seed` takes its place")
+            raise ValueError("task_kwargs has 'random'; use the argument `seed` instead")
         own = (
             self.spec.step_limit if isinstance(step_limit, int) and step_limit == -1 else step_limit
         )
@@ -443,7 +443,7 @@ class VectorEnvironment:
         """Returns the numbers of simulations as they are given.
 
         Raises:
-          TypeError: they are no integers and no mask.
+          TypeError: they are neither integers nor a mask.
           ValueError: there are no such simulations, or a mask has another shape.
         """
         if env_ids is None:
@@ -468,7 +468,7 @@ class VectorEnvironment:
 
     @property
     def _owner(self) -> str:
-        """What states are made for."""
+        """The value of 'made_for' in states of this environment."""
         return f'simulations of {self._task.signature}'
 
     def _check_usable(self) -> None:
@@ -485,7 +485,7 @@ def _seed_sequence(seed: Any) -> np.random.SeedSequence:
     """Returns the sequence of a seed for all simulations.
 
     Raises:
-      TypeError: it is no integer.
+      TypeError: it is not an integer.
       ValueError: it is negative.
     """
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):

@@ -27,7 +27,7 @@ from trl_suite.util.libraries import library
 
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
-ACCLAIM_RATE = 120.0  # frames per second of the CMU database; the files do not say
+ACCLAIM_RATE = 120.0  # frames per second of the CMU database; the files do not state the rate
 _AXES = {'x': (1.0, 0.0, 0.0), 'y': (0.0, 1.0, 0.0), 'z': (0.0, 0.0, 1.0)}
 
 
@@ -222,7 +222,7 @@ def _capture(
 
 
 def _check_bvh(path: pathlib.Path, text: str) -> None:
-    """Refuses, by line, what pybvh does not read or does not refuse."""
+    """Raises an error, with the line number, for input that pybvh rejects or reads wrongly."""
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         key = words[0].upper() if words else ''
@@ -234,7 +234,7 @@ def _check_bvh(path: pathlib.Path, text: str) -> None:
             )
         if key == 'CHANNELS' and words[1:2] == ['0']:
             raise ValueError(
-                f'{path}, line {number}: {line.strip()!r}: a joint without channels is not read; '
+                f'{path}, line {number}: {line.strip()!r}: joints without channels are not supported; '
                 "expected 'CHANNELS 3 Zrotation Xrotation Yrotation', and three zeros in every frame"
             )
     raise ValueError(f'{path}: there is no line MOTION; expected one after the HIERARCHY')

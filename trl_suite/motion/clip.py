@@ -243,7 +243,7 @@ class Clip:
         return dataclasses.replace(self, poses=mirror.pose(self.poses))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the clip as .npz without pickled objects; an old file is replaced at the end."""
+        """Writes the clip as .npz without pickled objects; an existing file is replaced at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
@@ -254,8 +254,8 @@ def load(path_or_name: str | os.PathLike[str]) -> Clip:
       path_or_name: a name of `names()`, or a path: a string that ends in .npz, or a PathLike.
 
     Raises:
-      ValueError: for an unknown name (names the closest), or a broken or malformed file
-        (names file and field).
+      ValueError: for an unknown name (the message has the closest), or a broken or malformed file
+        (the message names file and field).
       FileNotFoundError: if there is no file at the path.
     """
     path = shipped(path_or_name, 'clip', names())
@@ -278,7 +278,7 @@ def shipped(
     """Returns the path of a shipped file, or the argument if it is a PathLike or ends in .npz.
 
     Raises:
-      ValueError: for a name that is not `known` (names the closest).
+      ValueError: for a name that is not `known`; the message has the closest matches.
     """
     if not isinstance(path_or_name, str) or path_or_name.endswith('.npz'):
         return pathlib.Path(path_or_name)

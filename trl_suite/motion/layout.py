@@ -11,7 +11,7 @@ from trl_suite.motion import quaternion
 from trl_suite.util import errors
 
 ROOT_SIZES = {'planar': 3, 'free': 7}  # columns of a pose: x, z, pitch; x, y, z, quaternion
-LARGEST = 1e6  # m, rad or s; in a motion, what is larger is a mistake, and its square may overflow
+LARGEST = 1e6  # m, rad or s; larger values in a motion are errors, and their squares may overflow
 JOINT_SIZES = (1, 4)  # hinge angle; ball-joint quaternion
 _REFLECTED_QUATERNION = (1, -1, 1, -1)
 _REFLECTED_POSITION = (1, -1, 1)

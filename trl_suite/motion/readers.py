@@ -134,7 +134,7 @@ def read_deepmimic(
 
 
 def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
-    """Returns the layout whose frames have so many numbers."""
+    """Returns the layout whose frames have this many numbers."""
     known = {_HEADER + sum(layout.values()): layout for layout in (HUMANOID3D, DOG3D)}
     if length not in known:
         lengths = ' or '.join(f'{count} ({len(layout)} joints)' for count, layout in known.items())
@@ -147,7 +147,7 @@ def _deepmimic_layout(path: pathlib.Path, length: int) -> Mapping[str, int]:
 def write_terrainrl(clip: Clip, path: str | os.PathLike[str]) -> None:
     """Writes a clip as a TerrainRL motion file that `read_terrainrl` reads back unchanged.
 
-    The format cannot express an accumulating heading: of a turning clip the file has one cycle.
+    The format cannot express an accumulating heading: the file of a turning clip has one cycle.
     """
     durations = np.append(np.diff(clip.times), 0.0)
     n = len(clip.times)
@@ -197,7 +197,7 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
             if not (number and abs(value) < LARGEST):  # false for NaN, too
                 shown = repr(value) if len(repr(value)) < 40 else f'{repr(value)[:40]}...'
                 raise ValueError(
-                    f'{path}: frame {i}, {_field(j)}: {shown} is no finite number below {LARGEST:g}'
+                    f'{path}: frame {i}, {_field(j)}: {shown} is not a finite number below {LARGEST:g}'
                 )
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')

@@ -7,9 +7,8 @@ start; the heading of the pelvis oscillates slightly about it.
 
 As in the original (anim/MocapStepController.cpp), clips are selected by seven features, `FEATURES`,
 of the current state and the plan, relative to the current heading of the root. The original's
-weights scale with the spread of each feature over the library; here they are fixed, and those of
-the feet at the start are 0, as these are similar in all clips of a library that varies one step
-after another.
+weights scale with the spread of each feature over the library; here they are fixed. The weights of
+the initial foot positions are 0, because all clips of a shipped library start in the same pose.
 """
 
 from __future__ import annotations
@@ -178,7 +177,7 @@ class Steps:
         return np.argmin((gap * gap).sum(axis=2), axis=1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the library as .npz without pickled objects; replaces an old file at the end."""
+        """Writes the library as .npz without pickled objects; replaces an existing file at the end."""
         archive.write(path, {field: getattr(self, field) for field in _FIELDS})
 
 
@@ -223,8 +222,8 @@ def load(path_or_name: str | os.PathLike[str]) -> Steps:
       path_or_name: a name of `names()`, or a path: a string that ends in .npz, or a PathLike.
 
     Raises:
-      ValueError: for an unknown name (names the closest), or a broken or malformed file
-        (names file and field).
+      ValueError: for an unknown name (the message has the closest), or a broken or malformed file
+        (the message names file and field).
       FileNotFoundError: if there is no file at the path.
     """
     path = shipped(path_or_name, 'step library', names(), STEPS_SUFFIX)

@@ -41,27 +41,27 @@ and, if the policy maps left stance to right stance by reflection (see `trl_suit
 and, if the network has additional Cartesian inputs for p places that are observed as bearing and
 distance:
 
-    places       int (p, 2)  columns of the bearing, rad, and of the distance, m, after any mirror;
+    places       int (p, 2)  columns of the bearing, rad, and the distance, m, after reflection, if any;
                              `placed` appends the additional inputs
 
 and, if the network uses only some columns, e.g. the near part of a height map:
 
-    columns      int (c,)    of the observation, after any mirror and with the 2p numbers of places
+    columns      int (c,)    of the observation, after reflection, and with the 2p numbers of places
 
 and, if it selects one of b actions, as mixtures of experts do:
 
     choices      float (b, a)  the action is the row whose output is the largest
 
-and, if the first l of its inputs are a line, e.g. of ground heights, that passes C convolutions,
-whose outputs, position by position, are followed by the other c - l inputs:
+and, if the first l inputs form a line, e.g. of ground heights, to which C convolutions are applied;
+their outputs, position by position, and then the other c - l inputs are the inputs of layer 0:
 
     line           int ()    l
     strides        int (C,)  of each layer
     filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters); channel 0 of the
                              first is the line; window (positions, channels) @ filter
     filter_bias_0  float     (filters,); the activation is that of the hidden layers
-    origin         int ()    optional: index of the input that is subtracted from each of the line
-                             before the normalisation, such as the height of the root
+    origin         int ()    optional: index of the input that is subtracted from each input of
+                             the line before the normalisation, such as the height of the root
 
 and, if hidden layers have layer normalisation before the activation: mean 0 and standard deviation
 1 over the layer's outputs, with 1e-5 added to the variance:
@@ -106,7 +106,7 @@ _LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
-    """Writes a policy as .npz; an old file is replaced when the new one is complete.
+    """Writes a policy as .npz; an existing file is replaced when the new one is complete.
 
     Raises:
       ValueError: another suffix.
@@ -198,7 +198,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
             if left.partition('_')[0] not in ('weight', 'bias'):
                 raise ValueError('is unknown')
             read.field = 'layers'
-            raise ValueError(f'is {len(weights)}, and there are arrays of others')
+            raise ValueError(f'is {len(weights)}, but there are arrays of other layers')
     except Exception as error:  # damaged archives raise many types of errors
         where = f'field {read.field!r}' if read.field else 'no readable policy'
         raise ValueError(f'{path}: {where}: {error}'.replace(f' {path}:', '')) from None
@@ -220,11 +220,11 @@ def reference(id: str) -> Policy:
     """Returns the policy shipped for an environment.
 
     Args:
-      id: id of the environment; `suite.reference_policy` takes aliases, too.
+      id: id of the environment; `suite.reference_policy` also accepts aliases.
 
     Raises:
-      FileNotFoundError: no policy is shipped for it; the message has the closest that have one, or
-        how to install the policies.
+      FileNotFoundError: no policy is shipped for it; the message has the closest ids with a policy,
+        or how to install the policies.
     """
     shipped = available()
     if id not in shipped and resources.lacks_policies():
@@ -236,7 +236,7 @@ def reference(id: str) -> Policy:
         near = difflib.get_close_matches(id, shipped, n=3, cutoff=0)
         raise FileNotFoundError(
             f'no policy is shipped for {id!r}; '
-            + (f'the closest that have one: {", ".join(near)}' if near else 'nor for any other')
+            + (f'the closest ids with a policy: {", ".join(near)}' if near else 'none is installed')
         )
     other = trained_for(id)
     path = resources.directory('trained') / f'{other}.npz'

@@ -20,7 +20,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 _FLAT = 'observations'  # key of the flat vector, if an environment returns one
 _LEAST_VARIANCE = 1e-5  # added to the variance in layer normalisation
-_LARGEST = float(np.finfo(np.float32).max)  # that a sum may reach
+_LARGEST = float(np.finfo(np.float32).max)  # bound of sums
 REACH = 1.0  # m; `placed` keeps the positions of nearer places, and the directions of others
 
 
@@ -33,8 +33,8 @@ class Convolution:
     Attributes:
       line: number of inputs that form the line, l.
       strides: strides of each layer, in positions of its input.
-      weights: per layer (width, channels, filters), float32, like all arrays read-only; the first has
-        one channel, each other as many as the one before has filters.
+      weights: per layer (width, channels, filters), float32 and read-only, as all arrays; the first
+        has one channel, each other as many channels as the previous layer has filters.
       biases: per layer (filters,).
       origin: index of the input that is subtracted from those of the line, such as the root's
         height, before normalisation; None for none.
@@ -116,7 +116,7 @@ class Policy:
       blocks: name and size of the observation blocks, in order; k numbers in all.
       actions: names of the a actions, in order.
       quantity: quantity that an action controls, as in `ActionMap.quantity`.
-      mean: mean of the inputs, for normalisation, (c,) float32, like all arrays read-only.
+      mean: mean of the inputs, for normalisation, (c,) float32; all arrays are read-only.
       std: standard deviation of the inputs, for normalisation, (c,).
       clip: bound of the normalised observation.
       weights: per layer (inputs, outputs).
@@ -127,7 +127,7 @@ class Policy:
       mirror: the reflection of left stance to right stance; None for none.
       places: columns of bearing and distance of places for which `placed` adds Cartesian inputs,
         (p, 2); None for none.
-      columns: columns of the observation, after any mirror and with these inputs, that the network
+      columns: columns of the observation, after reflection and with these inputs, that the network
         uses, (c,); None for all.
       choices: actions of which the one with the largest output is selected, (b, a); None: the
         outputs are the action.
@@ -220,14 +220,14 @@ class Policy:
         try:
             put('info', json.loads(json.dumps(self.info, allow_nan=False)))
         except (TypeError, ValueError) as error:
-            raise ValueError(f'info: JSON cannot hold it ({error})') from None
+            raise ValueError(f'info: not representable as JSON ({error})') from None
         if not isinstance(self.info, dict):
             raise ValueError(f'info: expected a dict; got {type(self.info).__name__}')
         if self.mirror is not None:
             self.mirror.check(k, a)
 
     def _check_sums(self) -> None:
-        """Refuses weights with which a sum may overflow, so that an action may be NaN."""
+        """Raises an error if a sum may overflow, since an action could then be NaN."""
         bound = self.clip
         if self.convolution is not None:
             for i, layer in enumerate(
@@ -244,7 +244,7 @@ class Policy:
                 bound = self._hidden(bound)
 
     def _hidden(self, bound: float) -> float:
-        """Returns the bound of what the activation makes of numbers with a bound."""
+        """Returns a bound of the activation's outputs for inputs with a bound."""
         return min(bound, 1.0) if self.activation == 'tanh' else max(bound, 1.0)
 
     @property
@@ -361,7 +361,7 @@ class Policy:
 
 
 def _largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) -> float:
-    """Returns how large a layer's sums may be, given the bound of what it sums up.
+    """Returns a bound of a layer's sums, given a bound of its inputs.
 
     Raises:
       ValueError: larger than float32 can hold; the message has the name.
@@ -384,8 +384,8 @@ def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Appends forward and left coordinates of places to observations (n, k), (n, k + 2p).
 
     A bearing is discontinuous behind the character, and after normalisation, small distances have a
-    low resolution. So the position of a place within `REACH` is appended in units of `REACH`, and
-    of one farther away its direction.
+    low resolution. Therefore the position of a place within `REACH` is appended in units of
+    `REACH`, and the direction of a place farther away.
 
     Args:
       observation: (n, k).

@@ -47,7 +47,7 @@ def find(id: str) -> EnvSpec:
     """Returns the `EnvSpec` of an id or alias.
 
     Raises:
-      TypeError: the id is no string.
+      TypeError: the id is not a string.
       ValueError: unknown id; the message has the closest matches.
     """
     if not isinstance(id, str):
@@ -59,10 +59,10 @@ def find(id: str) -> EnvSpec:
 
 
 def spec_of(environment: str | EnvSpec) -> EnvSpec:
-    """Returns the data of an environment that is given by id, by alias, or by its data.
+    """Returns the `EnvSpec` of an environment, from an id, an alias, or an `EnvSpec`.
 
     Raises:
-      TypeError: it is none of these.
+      TypeError: the argument is none of these.
       ValueError: unknown id; the message has the closest matches.
     """
     if isinstance(environment, (str, EnvSpec)):

@@ -35,8 +35,8 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec
     if (character, model) == ('raptor', 'muscle'):
         options['start_phase'] = _FLIGHT
         differences = (
-            'episodes start in the air, at phases 0.25 to 0.5 and 0.75 to 1, since its muscles are too weak '
-            'to brake as the clip does in stance',
+            "episodes start in the air, at phases 0.25 to 0.5 and 0.75 to 1, since the raptor's muscles are "
+            'too weak to brake as the clip does in stance',
         )
     return EnvSpec(
         id=id_,
@@ -48,12 +48,12 @@ def _imitation(character: str, model: str, clip: str, original: bool) -> EnvSpec
         clip=clip,
         options=MappingProxyType(options),
         differences=differences,
-        description=f'The {figure} tracks a {GAITS[clip]} on flat ground by {BY[model]}.',
+        description=f'The {figure} tracks a {GAITS[clip]} on flat ground with {BY[model]}.',
         tags=frozenset({'planar', 'flat', status(id_, original)}),
     )
 
 
-# Name in ids, preset, words, whether the original has it. It tracks a walk over these.
+# Terrains of the walk: name in ids, preset, words, whether the original has the environment.
 _SPATIAL_TERRAINS = (
     ('', 'plane', 'flat ground', True),
     ('Hills', 'hills3d', 'hills', True),
@@ -74,8 +74,8 @@ def _spatial(
 ) -> EnvSpec:
     gait = 'run' if clip.endswith('run') else 'walk'
     seeing = options.get('terrain_observation', False)
-    view = ', observing the terrain around it,' if seeing else ''
-    view = ', whose state is observed,' if options.get('reference_observation') else view
+    view = ', observing the terrain around it' if seeing else ''
+    view = ', observing the state of the clip' if options.get('reference_observation') else view
     return EnvSpec(
         id=f'PD_Biped3D_Imitate{"-" if name else ""}{name}{"_Terrain" if seeing else ""}-v0',
         domain='imitation',
@@ -92,7 +92,7 @@ def _spatial(
         ),
         clip=clip,
         options=MappingProxyType(options),
-        description=f'The 3D biped tracks a {gait}{view} straight ahead over {words} by PD targets.',
+        description=f'The 3D biped tracks a {gait} straight ahead over {words} with PD targets{view}.',
         tags=frozenset({'spatial', 'original' if original else 'completion'}),
     )
 

@@ -1,4 +1,4 @@
-"""Rendering without a screen: frames, videos, film strips, plots of terrain, height maps."""
+"""Rendering without a display: frames, videos, film strips, plots of terrain, height maps."""
 
 from trl_suite.rendering.drawing import Policy, check_gl, frame, frames, no_gl, replay, watching
 from trl_suite.rendering.pictures import (

@@ -1,4 +1,4 @@
-"""Rendering without a screen: frames of environments.
+"""Rendering without a display: frames of environments.
 
     from trl_suite import suite
     from trl_suite import rendering
@@ -9,10 +9,10 @@
 
     policy = lambda time_step: environment.task.clip_action(0)
     rendering.video(rendering.frames(environment, policy, steps=90), 'rollout.mp4')
-    rendering.replay(environment, policy, 'rollout.html')  # looked at from all sides
+    rendering.replay(environment, policy, 'rollout.html')  # an interactive page
 
 Rendering needs an OpenGL library, chosen by the environment variable MUJOCO_GL before Python
-starts: egl or osmesa without a screen, glfw with one. `trl_suite.rendering.pictures` writes frames
+starts: egl or osmesa without a display, glfw with one. `trl_suite.rendering.pictures` writes frames
 to files, and makes pictures without OpenGL.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # plots of terrain need no engine
 
 
 Policy = Callable[[Any], np.ndarray]  # from a dm_env.TimeStep to an action in [-1, 1]
-_drawn_by: set[int] = set()  # the process that has rendered; a forked child has another number
+_drawn_by: set[int] = set()  # id of the process that has rendered; a forked child has another id
 
 
 def frame(
@@ -139,20 +139,20 @@ def replay(
     steps: int = 256,
     ghost: bool = False,
 ) -> Replay:
-    """Runs a policy from a reset on, over ends of episodes, and records it as a page.
+    """Runs a policy after a reset, through successive episodes, and records it as an HTML page.
 
-    The page shows the episodes from all sides, with a slider of time, and needs no network. It needs
-    no OpenGL to be made.
+    The page shows the episodes with an orbit camera and a time slider, and loads nothing from other
+    hosts. Recording needs no OpenGL.
 
     Args:
-      environment: is reset and stepped.
-      policy: time step -> action.
-      path: where to write it, .html; not written if None.
+      environment: reset and stepped by this function.
+      policy: time step -> action; not called at the end of an episode.
+      path: file to write, .html; None for none.
       steps: control steps.
       ghost: also show the reference clip.
 
     Returns:
-      The recording, which notebooks show; see `trl_suite.rendering.replays.Replay` for its errors.
+      The recording, which notebooks display; see `trl_suite.rendering.replays.Replay` for its errors.
     """
     from trl_suite.rendering.replays import Replay
 
@@ -226,19 +226,19 @@ def _use_chosen_library() -> None:
     """Makes dm_control use the library that MUJOCO_GL now names, if its current one does not work.
 
     dm_control reads the variable when it is imported. If it is imported before this package, as
-    with sorted imports, it uses GLFW, even if there is no screen.
+    with sorted imports, it uses GLFW, even if there is no display.
     """
     render = sys.modules.get('dm_control._render')
-    if getattr(render, 'BACKEND', None) != 'glfw' or _screen():
+    if getattr(render, 'BACKEND', None) != 'glfw' or _display():
         return
     if os.environ.get('MUJOCO_GL') not in ('egl', 'osmesa'):
         # GLFW would warn, and leave an incomplete context that fails again at exit.
-        raise RuntimeError('GLFW finds no screen')
+        raise RuntimeError('GLFW finds no display')
     assert render is not None
     importlib.reload(render)
 
 
-def _screen() -> bool:
+def _display() -> bool:
     return sys.platform != 'linux' or bool(
         os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
     )
@@ -250,7 +250,7 @@ def no_gl(error: Exception) -> str:
     state = 'is not set' if set_to is None else f'is {set_to!r}'
     reason = str(error).strip().partition('\n')[0].rstrip('.')
     return (
-        f'nothing can be drawn, since there is no OpenGL ({reason}); MUJOCO_GL {state}: set it '
-        'before Python starts, to egl or osmesa (no screen needed), glfw (with a screen), or '
-        'disable (no pictures). `trl-suite doctor` tells which can draw here'
+        f'cannot render: no OpenGL library works ({reason}); MUJOCO_GL {state}. Set it before Python '
+        'starts: egl or osmesa (without a display), glfw (with a display), or disable (no rendering). '
+        '`trl-suite doctor` shows which of them work on this machine'
     )

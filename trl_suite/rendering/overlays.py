@@ -1,4 +1,4 @@
-"""What is drawn on top of the physics: reference pose, markers of the task, observed terrain.
+"""Overlays of rendered images: reference pose, markers of the task, observed terrain.
 
 An overlay is a function (physics, scene) that appends geoms to a `mujoco.MjvScene`, as the
 `scene_callback` of `dm_control.mujoco.Physics.render` does.
@@ -19,30 +19,30 @@ from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 Overlay = Callable[[Any, Any], None]
 
 GHOST_COLOUR = (1.0, 0.85, 0.35, 0.45)  # red, green, blue, opacity
-GHOST_BEHIND = 0.7  # m; the ghost stands this much farther from the camera than the character
+GHOST_BEHIND = 0.7  # m; distance of the ghost behind the character, as seen by the camera
 
 
 def of_task(task: Any, with_ghost: bool = False) -> list[Overlay]:
-    """Returns what is drawn of a task in pictures: its markers, and the reference pose if asked for.
+    """Returns the overlays of a task: its markers, and optionally the reference pose.
 
     Raises:
-      ValueError: there is no reference pose.
+      ValueError: the task has no reference clip.
     """
     drawn = [ghost(task)] if with_ghost else []
     return [*drawn, markers(task)] if has_markers(task) else drawn
 
 
 def ghost(task: Any) -> Overlay:
-    """Returns an overlay of the reference pose, translucent and set back a little to the side.
+    """Returns an overlay of the reference pose, translucent and behind the character.
 
     Raises:
       ValueError: the task has no reference clip.
     """
     if not has_ghost(task):
-        raise ValueError(f'the task {type(task).__name__} has no reference clip to draw as a ghost')
+        raise ValueError(f'the task {type(task).__name__} has no reference clip to show as a ghost')
 
     def add(physics: Any, scene: Any) -> None:
-        # Data of its own on the same model: neither the model nor the simulation is touched.
+        # Uses a separate MjData of the same model, so that the simulation does not change.
         model, data = physics.model.ptr, mujoco.MjData(physics.model.ptr)
         addresses = task.figure.pose_qpos
         data.qpos[addresses] = task.reference_pose(0)
@@ -69,7 +69,7 @@ def has_ghost(task: Any) -> bool:
 
 
 def markers(task: Any) -> Overlay:
-    """Returns an overlay of what the task points out: footstep plans, goals, paths."""
+    """Returns an overlay of the markers of a task: footstep plans, goals, paths."""
 
     def add(physics: Any, scene: Any) -> None:
         for marker in task.markers(0):
@@ -79,7 +79,7 @@ def markers(task: Any) -> Overlay:
 
 
 def has_markers(task: Any) -> bool:
-    """Whether a task points anything out."""
+    """Whether a task has markers."""
     return hasattr(task, 'markers')
 
 
@@ -116,7 +116,7 @@ def append(scene: Any, marker: Marker) -> None:
     scene.ngeom += 1
     geom = scene.geoms[scene.ngeom - 1]
     cosine, sine = np.cos(marker.yaw), np.sin(marker.yaw)
-    if marker.shape == 'arrow':  # they point along their z axis
+    if marker.shape == 'arrow':  # MuJoCo's arrows point along their z axis
         axes = np.array([[0, -sine, cosine], [0, cosine, sine], [-1, 0, 0]])
     else:
         axes = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -125,6 +125,6 @@ def append(scene: Any, marker: Marker) -> None:
         np.array(marker.size, float), np.array(marker.position, float), axes.ravel(),
         np.array(marker.colour, np.float32),
     )  # fmt: skip
-    # What mjv_initGeom leaves as it was in memory.
+    # Attributes that mjv_initGeom does not initialise.
     geom.category, geom.objtype = mujoco.mjtCatBit.mjCAT_DECOR, mujoco.mjtObj.mjOBJ_UNKNOWN
     geom.objid = geom.dataid = geom.matid = geom.segid = -1

@@ -1,7 +1,7 @@
 """Pictures made without OpenGL: film strips, plots of terrain, height maps.
 
-`trl_suite.rendering` also exports these names. Files get their names only when they are complete.
-PNG files and plots need `pip install 'trl_suite[video]'`.
+`trl_suite.rendering` also exports these names. A file appears under its name only when it is
+complete. PNG files and plots need `pip install 'trl_suite[video]'`.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def plot_terrain(
       draws: number of grounds.
       length: extent ahead of the start, m; for a map its side, at most 300 m, around the origin.
       seed: ground i has the seed sequence (seed, i).
-      terrain_level: number of the terrain's parameter set.
+      terrain_level: index of the terrain's parameter set.
 
     Raises:
       ValueError: invalid arguments; see also `trl_suite.terrain.load`.
@@ -106,7 +106,7 @@ def plot_terrain(
         raise ValueError(f'length is {length}; expected metres in (0, {longest:g}]')
     if seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or more')
-    # `Figure` needs no screen and does not affect the user's pyplot.
+    # `Figure` needs no display and does not affect the user's pyplot.
     make = library('matplotlib.figure', 'trl_suite[video]').Figure
     if terrain.spatial:
         figure = make(figsize=(1.6 + 3.6 * draws, 4.0), layout='constrained')

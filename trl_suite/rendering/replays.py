@@ -1,7 +1,7 @@
-"""Replays: episodes as one HTML file that is looked at from all sides, without a network.
+"""Replays: episodes as one HTML file with an orbit camera, which loads nothing from other hosts.
 
-viser's own recording is what it holds: the viewer of `trl-suite view --browser` with the messages
-that it was sent, so that both look the same and no page of our own has to be kept.
+The file is a recording made by viser: its client, which `trl-suite view --browser` uses as well,
+and the messages that it was sent.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class Replay:
     """A recording of an environment to which states are added one by one.
 
-    Used as a context manager, inside which the environment must not be closed. The file appears at
-    the end, and not at all after an exception. In a notebook the object shows itself.
+    Used as a context manager, inside which the environment must not be closed. The file is written at
+    the end, and not after an exception. A notebook displays the object as the page.
 
     Attributes:
       html: the page, once the context has been left.
@@ -41,13 +41,13 @@ class Replay:
 
         Args:
           environment: any composer environment, after `reset`.
-          path: where to write it, .html; not written if None.
+          path: file to write, .html; None for none.
           fps: states per second; 30 is real time, as for `rendering.video`.
           ghost: also show the reference clip, as `rendering.frame` does.
 
         Raises:
-          ValueError: another suffix, an fps that is not positive, or a ghost where the task has no
-            reference clip.
+          ValueError: another suffix, an fps that is not positive, or a ghost although the task has
+            no reference clip.
           ImportError: the extra 'viewer' is not installed.
           OSError: the file cannot be written.
         """
@@ -69,12 +69,13 @@ class Replay:
         """Adds the current state.
 
         Args:
-          jump: whether the view does so too, as at the start of an episode.
+          jump: whether the camera moves to the character at once, as at the start of an episode,
+            instead of following it smoothly.
         """
         if self._recording is not None:
             self._recording.insert_sleep(self._seconds)
         self._scene.update(self._overlays, jump=jump)
-        if self._recording is None:  # it begins with everything there is
+        if self._recording is None:  # the recording begins with the whole scene
             self._recording = self._server.get_scene_serializer()
 
     def __exit__(
@@ -85,7 +86,7 @@ class Replay:
     ) -> None:
         try:
             if kind is None and self._recording is None:
-                raise ValueError('a replay of no states')
+                raise ValueError('the replay has no states')
             if kind is None:
                 self._recording.insert_sleep(self._seconds)
                 self.html = self._recording.as_html()

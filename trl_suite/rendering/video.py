@@ -125,7 +125,7 @@ class Video:
             raise
         finally:
             if self._encoder is not None:
-                self._encoder.kill()  # nothing, if it has ended
+                self._encoder.kill()  # no effect if it has ended
                 with contextlib.suppress(OSError, ValueError):
                     self._encoder.communicate()
             self._files.__exit__(kind, error, traceback)  # removes the part after an exception

@@ -1,9 +1,9 @@
-"""A simulation drawn by a viser server: the geoms that MuJoCo's renderer would draw, as meshes.
+"""A simulation shown by a viser server: the geoms that MuJoCo's renderer would draw, as meshes.
 
-`mujoco.mjv_updateScene` lists what there is to draw, overlays append to the list, and geoms of one
-shape become one batched mesh, so that a frame is a handful of messages. Terrain that is posed anew
-needs no special case. The package `mjviser` builds static geometry once and follows the first body
-that moves; here both change while an episode goes on.
+`mujoco.mjv_updateScene` fills a scene with geoms, and overlays append others. All geoms of one shape
+become one batched mesh, so that a frame takes few messages. The package `mjviser` is not used: it
+builds static geometry once and follows the first body that moves, whereas terrain changes during an
+episode here, and the first body that moves need not be the character.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from trl_suite.terrain import SPACING
 from trl_suite.terrain.planar.windows import PlanarWindows
 from trl_suite.util.libraries import library
 
-LIFT = 0.1  # share of a difference in height that the view follows per frame
-ROOM = 2000  # geoms of overlays and decoration
-TILE = 1.0  # m; edge of the squares of the ground, by which speeds can be seen
-SHADES = (1.0, 0.88)  # of the squares
-PLANE = 60.0  # m; half side of what is drawn of a plane without end
-DEPTH = 1.0  # m; of planar ground below its lowest point
-FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are not in use
-SECTIONS = 24  # of round shapes
-GAMMA = 2.2  # colours of batched meshes are linear ones, those of MuJoCo are not
-SHAFT, TIP = 0.8, 0.2  # share of the length of an arrow
-SAMPLE_COLOUR, SAMPLE_SIZE = (242, 64, 38), 0.05  # of observed terrain; m
-CAMERA = np.array([0.0, -4.0, 1.0])  # m; from the character
+LIFT = 0.1  # fraction of a height difference by which the view moves per frame
+ROOM = 2000  # largest number of geoms of overlays and decoration
+TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
+SHADES = (1.0, 0.88)  # brightness of the squares
+PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
+DEPTH = 1.0  # m; thickness of planar ground below its lowest point
+FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
+SECTIONS = 24  # number of faces around a cylinder or cone
+GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
+SHAFT, TIP = 0.8, 0.2  # fractions of the length of an arrow
+SAMPLE_COLOUR, SAMPLE_SIZE = (242, 64, 38), 0.05  # points of observed terrain: colour; diameter, m
+CAMERA = np.array([0.0, -4.0, 1.0])  # m; position of the camera from the character
 FIELD_OF_VIEW = 0.8  # rad
 
 _ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1)
@@ -57,15 +57,17 @@ def start_server(host: str, port: int) -> Any:
     """Starts a viser server that prints nothing.
 
     Args:
-      host: address that it listens on; '127.0.0.1' is reached from this machine only.
-      port: the first that is tried; 0 takes any that is free.
+      host: address to listen on; '127.0.0.1' accepts connections only from this machine.
+      port: the first port to try; 0 for any free port.
 
     Raises:
       ImportError: the extra 'viewer' is not installed.
-      OSError: nothing can listen on this address.
+      OSError: this machine cannot listen on the address.
     """
     viser = load_viser()
-    with socket.socket() as probe:  # viser would wait forever
+    with (
+        socket.socket() as probe
+    ):  # raises if the address is invalid, for which viser would wait forever
         probe.bind((host, 0))
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host, port, verbose=False)
@@ -79,11 +81,11 @@ def stop_server(server: Any) -> None:
 
 
 class WebScene:
-    """What a viser server shows of an environment.
+    """The scene of a viser server that shows an environment.
 
     Attributes:
-      option: which decoration of MuJoCo's is drawn, e.g. contact forces; a `mujoco.MjvOption`.
-      follow: whether the character stays in the middle of the view.
+      option: which visual elements MuJoCo draws, e.g. contact forces; a `mujoco.MjvOption`.
+      follow: whether the view is centred on the character.
     """
 
     def __init__(self, server: Any, environment: Any) -> None:
@@ -91,7 +93,7 @@ class WebScene:
 
         Args:
           server: a `viser.ViserServer`.
-          environment: any composer environment whose model is not compiled again.
+          environment: any composer environment; its model must not be recompiled.
         """
         self.option, self.follow = mujoco.MjvOption(), True
         self._server, self._physics = server, environment.physics
@@ -103,9 +105,9 @@ class WebScene:
         self._root = root_body(environment)
         arena = getattr(environment.task, 'arena', None)
         self._profile = arena.ground if isinstance(arena, PlanarArena) else None
-        self._focus = np.full(3, np.nan)  # what the view follows
+        self._focus = np.full(3, np.nan)  # the point that the view follows
         self._handles: dict[str, Any] = {}
-        self._laid: list[np.ndarray] = []  # what the meshes of the ground were made from
+        self._laid: list[np.ndarray] = []  # data from which the meshes of the ground were made
         with server.atomic():
             server.scene.reset()
             server.scene.set_up_direction('+z')
@@ -122,9 +124,9 @@ class WebScene:
         """Draws the current state.
 
         Args:
-          overlays: what else is drawn.
+          overlays: functions that append geoms, see `rendering.overlays`.
           samples: points where the terrain is observed, (k, 3) m.
-          jump: whether the view goes to the character at once, as at the start of an episode.
+          jump: whether the view moves to the character at once, as at the start of an episode.
         """
         data = self._physics.data.ptr
         mujoco.mjv_updateScene(
@@ -137,8 +139,9 @@ class WebScene:
         if jump or np.isnan(self._focus[0]):
             self._focus = root
         self._focus = self._focus + (root - self._focus) * (1.0, 1.0, LIFT)
-        # Everything is moved by its own message: clients apply the position of a common parent at
-        # another time than what is below it, and the character would shake.
+        # Every mesh gets its own position. With a common parent node, clients would apply the
+        # position of the parent and those of its children at different times, and the character
+        # would shake.
         offset = -self._focus if self.follow else np.zeros(3)
         with self._server.atomic():
             self._draw_shapes(offset)
@@ -183,9 +186,9 @@ class WebScene:
                 handle.visible = False
 
     def _draw_ground(self, offset: np.ndarray) -> None:
-        """Moves the ground, after making meshes of what of it has been laid anew."""
+        """Moves the ground; builds its meshes again if the ground has changed."""
         model, data = self._model, self._physics.data.ptr
-        # A finite part of planes is drawn, which moves by whole pairs of squares.
+        # Of an infinite plane, a finite part is drawn, which moves by multiples of two squares.
         middle = np.round(self._focus / (2 * TILE)) * 2 * TILE
         ground = self._is_ground
         planes = (model.geom_type[ground] == mujoco.mjtGeom.mjGEOM_PLANE).any()
@@ -199,7 +202,7 @@ class WebScene:
             lowest = self._focus[2] + FAR_BELOW
             if self._profile is None:
                 meshes = _ground(model, data, ground, middle, lowest)
-            else:  # one surface rather than boxes that overlap
+            else:  # one surface instead of overlapping boxes
                 meshes = {int(model.geom_matid[ground][0]): _planar_ground(self._profile)}
             for material, mesh in meshes.items():
                 kept.add(f'ground_{material}')
@@ -232,7 +235,7 @@ def _assign(handle: Any, **values: Any) -> None:
 
 
 def root_body(environment: Any) -> int:
-    """Returns the number of the character's root body; of a task without, of the first that moves."""
+    """Returns the id of the character's root body; without a character, of the first moving body."""
     model, figure = environment.physics.model, getattr(environment.task, 'figure', None)
     if figure is None:
         return int(np.flatnonzero(model.body_weldid)[0])
@@ -243,9 +246,9 @@ def root_body(environment: Any) -> int:
 def _instances(
     scene: Any, model: Any, material_colours: np.ndarray, is_ground: np.ndarray, lowest: float
 ) -> Iterator[tuple[Any, ...]]:
-    """Yields shape, position, axes, scales and colour of what a scene consists of.
+    """Yields shape, position, axes, scales and colour of the geoms in a scene.
 
-    The ground is left out, as is what lies below the lowest height, m.
+    Omits the ground, and geoms below the height `lowest`, m.
     """
     kinds, of_model = mujoco.mjtGeom, int(mujoco.mjtObj.mjOBJ_GEOM)
     for geom in scene.geoms[: scene.ngeom]:
@@ -319,7 +322,7 @@ def _ground(
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
             axes = data.geom_xmat[geom].reshape(3, 3)
             box = _shape('box')
-            # Corners of their own for each face, so that each is flat.
+            # Faces share no corners, so that shading is flat.
             corners = (box.vertices * model.geom_size[geom])[box.faces.ravel()] @ axes.T + place
             mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
         else:
@@ -352,7 +355,7 @@ def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
     for (y_right, z_right), (y_left, z_left) in strips:
         right = np.stack([x, np.full(len(x), y_right), z_right], 1)
         left = np.stack([x, np.full(len(x), y_left), z_left], 1)
-        # Two triangles for each piece, with corners of their own, so that each is flat.
+        # Two triangles for each piece, which share no corners, so that shading is flat.
         corners.append(
             np.stack([right[:-1], right[1:], left[1:], right[:-1], left[1:], left[:-1]], 1)
         )
@@ -379,7 +382,7 @@ def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
 
 
 def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
-    """Paints the ground with squares of the world's x and y; sides with stripes."""
+    """Textures the ground with squares along the world's x and y; sides get stripes."""
     from PIL import Image
 
     shades = np.array(SHADES)[np.array([[0, 1], [1, 0]])]
@@ -392,7 +395,7 @@ def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
 
 
 def _material_colours(model: Any) -> np.ndarray:
-    """Returns the mean colour of each material, white as the last for none, (materials + 1, 4)."""
+    """Returns the mean colour of each material, (materials + 1, 4); the last is white, for none."""
     colours = np.ones((model.nmat + 1, 4))
     colours[:-1] = model.mat_rgba
     textures = model.mat_texid[:, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]

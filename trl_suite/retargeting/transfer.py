@@ -65,13 +65,13 @@ CharacterLike = str | characters.CharacterSpec
 def read(
     path: Path, character: CharacterLike, skeleton: Path | None = None, **options: Any
 ) -> Clip | Capture:
-    """Reads a motion file of any format, which its content tells, whatever its name.
+    """Reads a motion file; its format is recognised from its content, not from its name.
 
     Args:
       path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, with the character's joints in its order, or
         of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save` (.npz).
-      character: for TerrainRL's files.
-      skeleton: for Acclaim, the corresponding .asf file.
+      character: the character of a TerrainRL file; other formats ignore it.
+      skeleton: the .asf file that belongs to an Acclaim file; None for other formats.
       **options: of `motion.read_bvh` or `motion.read_amc`.
 
     Raises:
@@ -85,7 +85,7 @@ def read(
         raise ValueError(f'{path}: an .amc file needs its skeleton, an .asf file')
     if found != 'amc' and skeleton is not None:
         raise ValueError(
-            f'{path}: a skeleton ({skeleton}) belongs to an .amc file, and to no other'
+            f'{path}: a skeleton ({skeleton}) was given, but the file is not an .amc file'
         )
     if found == 'bvh':
         return read_bvh(path, **options)
@@ -126,7 +126,7 @@ def _format(path: pathlib.Path) -> str:
     if len(first) == 1 and first[0].isdigit():
         return 'amc'
     known = '; '.join(FORMATS.values())
-    what = 'is empty' if not text else 'no motion file'
+    what = 'is empty' if not text else 'not a motion file'
     raise ValueError(f'{path}: {what}; expected one of: {known}')
 
 

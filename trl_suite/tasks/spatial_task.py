@@ -25,10 +25,10 @@ from trl_suite.tasks.components.spatial_rules import (
     ACTION_OFFSETS,
     ACTION_SCALE,
     CONTROL_TIMESTEP,
+    HEIGHT_MAP,
     MIRRORED_BINS,
     PHASE_BINS,
     SUBSTEPS,
-    TERRAIN_MAPS,
     Clock,
     SpatialRules,
     Travel,
@@ -53,14 +53,14 @@ from trl_suite.util.options import Config, option
 class SpatialConfig(Config):
     """Options of tasks for a 3D walker."""
 
-    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+    terrain_observation: str | Collection[str] = option((), HEIGHT_MAP, choices=('height',))
     substeps: int = option(
         SUBSTEPS, 'physics steps per control step of 1/30 s', at_least=6, at_most=MOST_SUBSTEPS
     )
     action_offset: str = option(
         'clip',
-        "pose at action 0: the mean of the reference motion made symmetric ('clip'), or the working "
-        "'posture'; 'original': the original's map, with an angle and an axis for every ball joint",
+        "pose at action 0: the mean pose of the reference motion, made symmetric ('clip'), or the working "
+        "posture ('posture'); 'original': the original's map, with an angle and an axis for every ball joint",
         choices=ACTION_OFFSETS, actuation='position',
     )  # fmt: skip
     action_scale: float | None = option(

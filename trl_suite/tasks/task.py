@@ -124,8 +124,8 @@ class Task(composer.Task):
 
     Several threads call `reset` and `step`, each for some of the simulations. A call may change
     only the simulations that it is given. The composer hooks below call the same methods for one
-    simulation, so that a plain `composer.Environment` can run the task. The exception are tasks
-    whose steps vary in duration; these override `simulate`.
+    simulation, so that a plain `composer.Environment` can run the task. Exceptions are tasks whose
+    steps vary in duration; these override `simulate`.
 
     Attributes:
       world: the simulations; set by `bind`.

@@ -105,12 +105,12 @@ def check_new(
     Args:
       type_name: name of the type.
       known: the function that is registered already, if any.
-      function: the one that is to be.
-      replace: whether the user wants it replaced in any case.
+      function: the function to register.
+      replace: whether the user allows that the type is replaced.
 
     Raises:
-      ValueError: the name belongs to a function that is written elsewhere. Of a lambda nobody knows
-        where it is written.
+      ValueError: the name belongs to another function. Two functions are the same if they have the
+        same module and qualified name; lambdas are always different.
     """
     if known is None or known is function or replace:
         return

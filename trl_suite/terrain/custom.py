@@ -62,8 +62,8 @@ def from_function(
 
     Args:
       function: x (k,) -> heights (k,), m, of planar ground; or x, y (k, m) -> heights (k, m) of
-        three-dimensional ground. It gets arrays, and must be deterministic. For use in other
-        processes it must be importable.
+        three-dimensional ground. It is called with arrays, and must be deterministic. For use in
+        other processes it must be importable.
       name: name of the terrain and of its type; by default the function's.
       start_span: episodes start at random from -start_span to start_span, m, along x and, in three
         dimensions, along y: the ground is shifted so that this place is at the origin. In three
@@ -71,7 +71,7 @@ def from_function(
       replace: whether an existing type of that name may be replaced.
 
     Raises:
-      ValueError: there is no name, or it is taken; or the function has no or more than two
+      ValueError: there is no name, or it is taken; or the function does not have one or two
         arguments, or does not return an array of the shape of its arguments.
       TypeError: it is not a function, or fails for arrays.
     """
@@ -240,7 +240,7 @@ def from_image(
     line: float | None = None,
     start_span: float = 0.0,
 ) -> Terrain:
-    """Makes terrain from a height image: grey is height.
+    """Makes terrain from a height image: the brightness of a pixel is its height.
 
     The image is a map: x points to its right, y up, and the origin is the pixel in its middle.
 
@@ -264,7 +264,7 @@ def from_image(
     imageio = library('imageio.v3', 'trl_suite[video]')
     try:
         shape = imageio.improps(file, plugin='pillow').shape  # without reading pixels
-    except Exception as error:  # of the reader's own kinds
+    except Exception as error:  # the reader raises its own types of exceptions
         raise ValueError(f'{file}: not a picture that can be read ({error})') from None
     if len(shape) < 2 or math.prod(shape[:2]) > LARGEST:
         raise ValueError(
@@ -304,7 +304,7 @@ def from_mesh(
       path: .obj, .glb, .gltf, .stl or .ply.
       spacing: distance of the points at which heights are sampled, m.
       scale: m per unit of the file, 0.001 for one in millimetres.
-      up: the file's axis that points up, 'z' or 'y' (then z points to the viewer: -y here); by
+      up: the file's axis that points up, 'z' or 'y' (its z axis is then -y of the terrain); by
         default 'y' for .glb and .gltf, as that format requires, and 'z' for the others.
       centre: whether to move the middle of the mesh to the origin; otherwise its origin is kept.
       line: as for `from_heights`.

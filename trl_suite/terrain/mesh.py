@@ -76,7 +76,7 @@ def save_mesh(
       low, high: as for `to_mesh`.
 
     Raises:
-      ValueError: the suffix is another one, or as `to_mesh`.
+      ValueError: another suffix, or as for `to_mesh`.
       OSError: the file cannot be written.
     """
     target = check_path(path, WRITTEN)

@@ -18,7 +18,7 @@ The original ignored unknown entries. Here a file raises a ValueError that names
 key, if it has
 * a key that its type does not use (of another type, or misspelt), or the same key twice;
 * a value that is not a finite number;
-* a range whose Min is above its Max, be they given or defaults;
+* a range whose Min is above its Max, whether given or default;
 * a negative spacing, width or count, or a value beyond `checks.LIMITS`. Zero is allowed: every
   feature has at least one vertex, so every generator terminates.
 

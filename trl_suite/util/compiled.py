@@ -43,7 +43,7 @@ from typing import Any
 
 from trl_suite.util import interrupts
 
-PATIENCE = 2.0  # s; if compiling takes longer, a message is printed on a terminal
+PATIENCE = 2.0  # s; if compiling takes longer, a message is printed if stderr is a terminal
 UNUSED = 30 * 86400.0  # s; folders of other source versions that were unused for longer are removed
 _PREFIX = 'trl_suite-'
 
@@ -233,7 +233,7 @@ def _forget(folder: pathlib.Path) -> None:
 
 
 class _Announcer:
-    """Prints a message on a terminal, once per process, if compiling takes long."""
+    """Prints a message, once per process, if compiling takes long and stderr is a terminal."""
 
     def __init__(self) -> None:
         self.spent, self.told = 0.0, False

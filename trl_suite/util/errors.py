@@ -12,7 +12,7 @@ import numpy as np
 
 LIKE, ALIKE = 0.6, 0.4  # `cutoff` of `difflib.get_close_matches`, for few and for many names
 FEW = 20  # with at most this many names the stricter cutoff applies, since all can be listed
-MANY = 40  # names; of more only some are listed
+MANY = 40  # names; if there are more, only some of them are listed
 KINDS: dict[object, tuple[tuple[type, ...], str, str]] = {  # types, singular and plural in words
     bool: ((bool, np.bool_), 'True or False', 'bools'),
     int: ((numbers.Integral,), 'a whole number', 'whole numbers'),
@@ -50,12 +50,12 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
 
     Args:
       name: name of the argument.
-      value: may be any number that is whole.
-      low, high: bounds, which are allowed.
-      why: where a bound comes from, for the message.
+      value: a number; a float without a fractional part is valid.
+      low, high: inclusive bounds.
+      why: text at the end of the message, which explains the bounds.
 
     Raises:
-      ValueError: it is not; the message has its name and the bounds.
+      ValueError: the value is not such a number; the message has the name and the bounds.
     """
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not number or value % 1 or not low <= value <= high:  # type: ignore[operator]
@@ -63,14 +63,14 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
 
 
 def options(name: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Returns a copy of options by name; none for None.
+    """Returns a copy of a mapping of options; an empty dict for None.
 
     Args:
       name: name of the argument that holds them.
-      value: what is given.
+      value: the options by name, or None.
 
     Raises:
-      TypeError: it is no mapping.
+      TypeError: the value is not a mapping.
     """
     if value is not None and not isinstance(value, Mapping):
         raise TypeError(f'{name} is {value!r}; expected a dict of options by name')
@@ -82,7 +82,7 @@ def check_kind(name: str, value: object, hint: object) -> None:
 
     Args:
       name: name of the option.
-      value: its value; annotations that this function does not know accept any value.
+      value: its value; any value is valid for an annotation that this function does not support.
       hint: the annotation.
 
     Raises:
@@ -106,7 +106,7 @@ def _fits(value: object, hint: object) -> bool:
         return hint is bool or not isinstance(value, bool)
     if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
         (inner,) = typing.get_args(hint)
-        # Bytes and dicts can be gone through, too, but hold something else.
+        # Bytes and mappings are iterable as well, but their elements are not the intended values.
         if not isinstance(value, Iterable) or isinstance(value, (bytes, Mapping)):
             return False
         return all(_fits(each, inner) for each in value)

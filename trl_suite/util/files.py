@@ -62,15 +62,15 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
 
 
 def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> None:
-    """Checks how many bytes a file has, before it is read.
+    """Checks the size of a file before it is read.
 
     Args:
       path: path of the file.
-      largest: bytes.
-      size: bytes once it is read, if not those of the file.
+      largest: largest allowed size, bytes.
+      size: size of the content, bytes, if it differs from that of the file.
 
     Raises:
-      ValueError: too many; the message names the file and both sizes.
+      ValueError: it is too large; the message names the file and both sizes.
     """
     size = pathlib.Path(path).stat().st_size if size is None else size
     if size > largest:
@@ -83,7 +83,7 @@ def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
     """Opens an archive of arrays (.npz) without pickled objects.
 
     Raises:
-      ValueError: it is too large, once inflated; or no archive.
+      ValueError: the file or its uncompressed content is too large, or it is not an archive.
       OSError: it cannot be read.
     """
     check_size(path)
@@ -92,7 +92,7 @@ def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
         with zipfile.ZipFile(content) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
     except zipfile.BadZipFile as error:
-        raise ValueError(f'{path}: no archive of arrays (.npz): {error}') from None
+        raise ValueError(f'{path}: not an archive of arrays (.npz): {error}') from None
     check_size(path, size=size)
     return np.load(content, allow_pickle=False)
 
@@ -125,7 +125,7 @@ def read_json(path: Path) -> Any:
         return json.loads(text)
     except RecursionError:
         raise ValueError(f'{path}: not JSON: nested too deeply') from None
-    except ValueError as error:  # also of numbers with too many digits
+    except ValueError as error:  # also raised for integers with too many digits
         raise ValueError(f'{path}: not JSON: {error}') from None
 
 
@@ -134,7 +134,8 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary path in the same folder; the file replaces `path` if nothing is raised.
 
     Raises:
-      OSError: as raised within, with the path if the error had none, as errors of writing have not.
+      OSError: any that is raised inside; the path is added if the error has none, as for errors of
+        `write`.
     """
     part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
     try:

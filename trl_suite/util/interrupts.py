@@ -16,7 +16,7 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 def postpone_while_compiling() -> None:
-    """Lets signals wait for the end of the current compiler pass. Called once, it holds for the process.
+    """Postpones signals to the end of the compiler pass, in all later compilations of the process.
 
     Then the handler that was installed before, e.g. Python's, which raises `KeyboardInterrupt`, is
     called. Only the main thread handles signals, so compiling in other threads is not affected.
@@ -34,7 +34,7 @@ def postpone_while_compiling() -> None:
             if threading.current_thread() is threading.main_thread():
                 postponed.leave()
 
-    for kind in ('numba:compile', 'numba:run_pass'):  # they contain each other
+    for kind in ('numba:compile', 'numba:run_pass'):  # the events are nested
         event.register(kind, Listener())
 
 

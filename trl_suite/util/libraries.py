@@ -14,11 +14,13 @@ def library(name: str, source: str) -> Any:
       source: what to install with pip, e.g. 'trl_suite[video]'.
 
     Raises:
-      ImportError: it is not installed; the message says how to install it.
+      ImportError: it is not installed; the message tells how to install it.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition('.')[0]
         quoted = f"'{source}'" if '[' in source else source
-        raise ImportError(f'{package} is needed and not installed; pip install {quoted}') from error
+        raise ImportError(
+            f'{package} is required but not installed; pip install {quoted}'
+        ) from error

@@ -94,7 +94,7 @@ class Config:
         """Makes a config from values by name.
 
         Args:
-          owner: what the options belong to, for messages.
+          owner: name of the owner of the options, for messages.
           given: values that differ from the defaults.
           others: further valid names that are handled elsewhere, for messages.
 

@@ -1,4 +1,4 @@
-"""What programs have in common: bad input ends in one line, and SIGTERM as an interrupt does."""
+"""Error handling of programs: bad input is reported in one line, SIGTERM acts as an interrupt."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import threading
 from collections.abc import Iterator
 from types import TracebackType
 
-# What users can bring about. Whatever else is raised is a defect, and keeps its traceback.
+# Exceptions that users can cause. Any other one is a defect, and its traceback is printed.
 EXPECTED = (ValueError, ImportError, RuntimeError, OSError)
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: unfinished files are removed, as after an interrupt."""
+    """Raised by SIGTERM: unfinished files are removed, as after an interrupt."""
 
 
 def in_one_line(error: BaseException) -> str:
-    """Returns what an error says."""
+    """Returns the message of an error in one line."""
     return ' '.join(str(error).split())
 
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Lets SIGTERM raise `Terminated`; in other threads than the main one nothing is changed."""
+    """Makes SIGTERM raise `Terminated` inside the context; only in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -37,12 +37,12 @@ def terminable() -> Iterator[None]:
 
 
 def _terminate(number: int, frame: object) -> None:
-    signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+    signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
     raise Terminated
 
 
 def begin_script() -> None:
-    """Makes a script that is run by itself end as commands do: with one line on stderr.
+    """Makes a script report errors as the commands do: in one line on stderr.
 
     Its exit status is 1, as after any exception. With `python -X dev` tracebacks are printed.
     """

@@ -11,7 +11,7 @@ POLICIES = 'trl_suite_policies'  # the distribution with the trained policies, s
 def directory(kind: str) -> pathlib.Path:
     """Returns the folder of the data files of one kind: 'xml', 'mocap' or 'trained'.
 
-    `$TRL_SUITE_TRAINED` replaces the last one.
+    The environment variable `TRL_SUITE_TRAINED` selects another folder for 'trained'.
     """
     if kind == 'trained' and os.environ.get('TRL_SUITE_TRAINED'):
         return pathlib.Path(os.environ['TRL_SUITE_TRAINED'])

@@ -3,11 +3,11 @@
     from trl_suite.viewing import browser
 
     viewer = browser.Browser('PD_Dog2D_Gaps_Terrain-v0').start()
-    viewer  # shows itself in a notebook; else open viewer.url
+    viewer  # displayed by a notebook; elsewhere, open viewer.url
     viewer.stop()
 
-Several browsers may look at one viewer at the same time. It listens on this machine only unless told
-otherwise; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`.
+Several browsers can connect to one viewer at the same time. By default it accepts connections only
+from this machine; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Loaded, Session
 
 HOST, PORT = '127.0.0.1', 8080
-IDLE = 0.01  # s; between two looks at what was asked for
+IDLE = 0.01  # s; longest wait before requests are handled
 PLOT_INTERVAL = 0.25  # s
 PLAN, CLIP, SAMPLES = 'plan and goal', 'reference clip', 'observed terrain'
-DECORATION = {  # drawn by MuJoCo
+DECORATION = {  # visual elements drawn by MuJoCo
     'contacts': mujoco.mjtVisFlag.mjVIS_CONTACTPOINT,
     'contact forces': mujoco.mjtVisFlag.mjVIS_CONTACTFORCE,
     'joint axes': mujoco.mjtVisFlag.mjVIS_JOINT,
@@ -42,14 +42,14 @@ DECORATION = {  # drawn by MuJoCo
 
 
 class Browser:
-    """A viewer that web browsers show. Its methods may be called from any thread.
+    """A viewer for web browsers. Its methods may be called from any thread.
 
     Attributes:
-      url: where it is.
-      session: the environment and the policy that acts.
-      playing: whether time passes.
-      speed: how fast; 1 is real time.
-      shown: what is drawn beside the bodies, by name.
+      url: address of the page.
+      session: the environment and the current policy.
+      playing: whether the simulation runs, or is paused.
+      speed: simulated time per time; 1 is real time.
+      shown: whether each overlay is shown, by name.
     """
 
     session: Session
@@ -62,20 +62,21 @@ class Browser:
         host: str = HOST,
         port: int = PORT,
     ) -> None:
-        """Opens the viewer; time passes in `run` or after `start`.
+        """Opens the viewer; the simulation runs in `run` or after `start`.
 
         Args:
-          spec: an id, an alias, or what `suite.combine` returns.
+          spec: an id, an alias, or a result of `suite.combine`.
           policy: 'best', one of `named_policies.POLICIES`, or an .npz file.
           seed: seed of the environment, and of random actions.
-          host: address to listen on; '0.0.0.0' lets every machine of the network in.
-          port: the first that is tried, then the next ones.
+          host: address to listen on; '0.0.0.0' accepts connections from every machine of the
+            network.
+          port: the first port to try, then the following ones.
 
         Raises:
           ValueError: an unknown id or policy, or a policy that does not fit.
           FileNotFoundError: there is no such file.
           ImportError: the extra 'viewer' is not installed.
-          OSError: nothing can listen on this address.
+          OSError: this machine cannot listen on the address.
         """
         web_scene.load_viser()
         self.playing, self.speed, self.seed = True, 1.0, seed
@@ -83,7 +84,9 @@ class Browser:
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
-        loaded = self._load(spec, policy)  # before a server that an error would leave behind
+        loaded = self._load(
+            spec, policy
+        )  # before the server is started, as an error would leave it running
         self._uploads = tempfile.TemporaryDirectory(prefix='trl_suite_')
         self._server = web_scene.start_server(host, port)
         self.url = f'http://{host}:{self._server.get_port()}'
@@ -91,7 +94,7 @@ class Browser:
         self._show(loaded)
 
     def run(self) -> None:
-        """Lets time pass until `stop` or a keyboard interrupt, then closes the viewer."""
+        """Runs the simulation until `stop` or a keyboard interrupt, then closes the viewer."""
         due = plotted = 0.0
         try:
             while not self._stopped.is_set():
@@ -102,7 +105,8 @@ class Browser:
                     continue
                 passed = self.session.advance() or FRAME
                 self._draw()
-                # Where frames take longer than they last, time goes slower; none is left out.
+                # If frames take longer to compute than they last, playback slows down; no frame is
+                # skipped.
                 due = max(now, due) + passed / self.speed
                 if now - plotted > PLOT_INTERVAL:
                     plotted = now
@@ -114,13 +118,13 @@ class Browser:
             self._uploads.cleanup()
 
     def start(self) -> Browser:
-        """Lets time pass in a thread of its own, and returns the viewer."""
+        """Runs the simulation in a separate thread, and returns the viewer."""
         self._thread = threading.Thread(target=self.run, daemon=True)
         self._thread.start()
         return self
 
     def stop(self) -> None:
-        """Ends `run`, or what `start` has started."""
+        """Ends `run`, or the thread that `start` has started."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()
@@ -128,14 +132,14 @@ class Browser:
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" width="100%" height="600" style="border: none"></iframe>'
 
-    # What can be asked for: it is done between two frames, by the thread in which time passes.
+    # Requests; the thread that runs the simulation handles them between two frames.
 
     def play(self, playing: bool) -> None:
-        """Lets time pass, or stops it."""
+        """Runs or pauses the simulation."""
         self._ask(lambda: setattr(self, 'playing', playing))
 
     def step(self) -> None:
-        """Stops time, and goes on by one frame."""
+        """Pauses the simulation, and advances it by one frame."""
 
         def step() -> None:
             self.playing = False
@@ -145,7 +149,7 @@ class Browser:
         self._ask(step)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begins the next episode, or the first one of a seed."""
+        """Starts the next episode, or the first episode of a seed."""
 
         def reset() -> None:
             self.seed = self.seed if seed is None else seed
@@ -159,7 +163,7 @@ class Browser:
         self._ask(lambda: self.session.push(direction, speed))
 
     def show(self, name: str, shown: bool) -> None:
-        """Shows or hides one of `shown`."""
+        """Shows or hides an overlay, one of `shown`."""
 
         def show() -> None:
             self.shown[name] = shown
@@ -168,7 +172,7 @@ class Browser:
         self._ask(show)
 
     def follow(self, followed: bool) -> None:
-        """Keeps the character in the middle, or leaves the view to the users."""
+        """Centres the view on the character, or leaves it to the users."""
 
         def follow() -> None:
             self._scene.follow = followed
@@ -188,7 +192,7 @@ class Browser:
         self._ask(choose)
 
     def choose_terrain(self, terrain: str | Mapping[str, Any]) -> None:
-        """Puts the character on another terrain, what `terrain.load` takes."""
+        """Puts the character on another terrain, an argument of `terrain.load`."""
 
         def choose() -> None:
             spec, _, _, policy = self._loaded
@@ -197,7 +201,7 @@ class Browser:
         self._ask(choose)
 
     def choose_policy(self, name: str) -> None:
-        """Lets another policy act, from the first episode of the seed on."""
+        """Switches to another policy, and starts at the first episode of the seed."""
 
         def choose() -> None:
             spec, environment, policies, _ = self._loaded
@@ -208,12 +212,12 @@ class Browser:
         self._ask(choose)
 
     def upload_policy(self, name: str, content: bytes) -> None:
-        """Lets a policy act that was sent as an .npz file."""
+        """Switches to a policy that was uploaded as an .npz file."""
         path = pathlib.Path(self._uploads.name) / pathlib.Path(name).name
         path.write_bytes(content)
         self.choose_policy(str(path))
 
-    # How it is done.
+    # Implementation.
 
     def _ask(self, work: Callable[[], None]) -> None:
         self._requests.put(work)

@@ -80,8 +80,9 @@ class Item:
 
     Attributes:
       path: path in the folder, with / between parts.
-      draw: function that returns the picture, (h, w, 3) uint8, or a sequence of such if it moves.
-      source: digest of what it shows, '' if that does not change.
+      draw: function that returns the picture, (h, w, 3) uint8, or a sequence of pictures if it is
+        animated.
+      source: digest of the policy or the record that it shows; '' if it shows neither.
       largest: largest number of bytes.
     """
 
@@ -92,7 +93,7 @@ class Item:
 
 
 def items() -> Iterator[Item]:
-    """Yields all pictures of the gallery that do not move, and that of the suite."""
+    """Yields the still pictures of the gallery, and the animated picture of the suite."""
     yield Item(
         'suite.webp', functools.partial(moving.side_by_side, SUITE, SUITE_SECONDS, SUITE_SIZE)
     )
@@ -109,7 +110,7 @@ def items() -> Iterator[Item]:
 
 
 def moving_items() -> Iterator[Item]:
-    """Yields the moving pictures of all environments."""
+    """Yields the animated pictures of all environments."""
     for id in catalogue.BY_ID:
         draw = functools.partial(moving.moving_picture, id)
         yield Item(moving_path(id), draw, _policy_digest(id))
@@ -121,7 +122,7 @@ def _policy_digest(id: str) -> str:
 
 
 def moving_path(id: str) -> str:
-    """Returns where the moving picture of an environment lies, below the folder."""
+    """Returns the path in the folder of an environment's animated picture."""
     return f'moving/{id}.webp'
 
 
@@ -347,9 +348,9 @@ def save(image: Any, path: files.Path, source: str = '', largest: int = LARGEST)
     """Writes a small picture: a .png with a palette, or a .jpg of the best quality that fits.
 
     Args:
-      image: (h, w, 3) uint8; for an animated .webp a sequence of such.
+      image: (h, w, 3) uint8; for an animated .webp a sequence of pictures.
       path: file to write.
-      source: digest of what it shows, stored in the file.
+      source: digest to store in the file, see `Item`.
       largest: number of bytes that a .jpg should not exceed; the lowest quality may exceed it.
 
     Raises:

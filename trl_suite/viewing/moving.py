@@ -1,4 +1,4 @@
-"""Moving pictures of environments: some seconds under the best policy, with the character in view."""
+"""Animated pictures of environments: some seconds with the best policy, the character in view."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from trl_suite.util.files import Path, check_path, replacing
 
 SUFFIXES = ('.webp',)
 SIZE = (300, 480)  # height and width, pixels
-SAMPLES, SHADOWS = 4, 4096  # per pixel, and of shadows, so that edges are smooth
+SAMPLES, SHADOWS = 4, 4096  # samples per pixel, and size of the shadow map, for smooth edges
 FRAME = 1 / 30  # s; between two moments
 STRIDE = 2  # moments per picture: 15 pictures per second
 SECONDS = 4.0
-SEEDS = range(1, 7)  # tried one after the other until an episode lasts
-# Seed and begin, s, of episodes that show what an environment is about, where first seconds do not.
+SEEDS = range(1, 7)  # tried in order until an episode does not fail
+# Seed and begin (s) of typical episodes, of environments whose first seconds are not typical.
 SCENES = {
     'PD_Biped3D_HLC_Soccer-v0': (8, 8.0),
     'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0),
     'PD_Biped3D_HLC_Conveyors-v0': (2, 23.0),
     'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 11.0),
 }
-# From where it is seen, the most wanted first: azimuth from the heading and elevation, degrees.
+# Camera angles in order of preference: azimuth from the heading, and elevation, degrees.
 PLANAR_VIEWS = ((74.0, -12.0),)
 SPATIAL_VIEWS = (
     (50.0, -20.0), (-50.0, -20.0), (130.0, -20.0), (-130.0, -20.0), (20.0, -25.0), (50.0, -42.0),
     (-50.0, -42.0), (0.0, -50.0), (90.0, -65.0),
 )  # fmt: skip
-VIEW_COST = 0.02  # share of the time hidden that a view may save before a less wanted one is taken
-LOOKS = 8  # moments at which it is tried whether obstacles hide the character
-FILL = 0.5  # of the picture's height or width by the character
-SMOOTH = 15  # moments; spread of the average that the camera follows
-QUALITY = 70  # of WebP
+VIEW_COST = 0.02  # added to the hidden fraction of the character for each place in this order
+LOOKS = 8  # moments at which visibility of the character is tested
+FILL = 0.5  # fraction of the picture's height or width that the character fills
+SMOOTH = 15  # moments; standard deviation of the weights that smooth the camera's path
+QUALITY = 70  # of the WebP file
 
 
 class Shot(NamedTuple):
-    """An episode to be drawn.
+    """An episode to be rendered.
 
     Attributes:
       states: states of the environment, `FRAME` apart.
-      root: where the character's root was, (moments, 3) m.
+      root: positions of the character's root, (moments, 3) m.
       lasted: whether the episode did not fail.
     """
 
@@ -61,18 +61,18 @@ class Shot(NamedTuple):
 def moving_picture(
     id: str, seconds: float = SECONDS, size: tuple[int, int] = SIZE
 ) -> list[np.ndarray]:
-    """Draws an environment under its best policy; see `named_policies.best`.
+    """Renders an environment with its best policy; see `named_policies.best`.
 
     Args:
       id: id of the environment.
-      seconds: how long; less if all episodes that are tried fail before.
+      seconds: duration; shorter if an episode fails earlier with every seed.
       size: height and width, pixels.
 
     Returns:
       Pictures `STRIDE` * `FRAME` apart, each (height, width, 3) uint8.
 
     Raises:
-      RuntimeError: there is no OpenGL to draw with.
+      RuntimeError: no OpenGL library works.
     """
     id = suite.find(id).id
     environment = suite.make(id)
@@ -92,9 +92,12 @@ def moving_picture(
 def side_by_side(
     rows: Sequence[Sequence[str]], seconds: float, size: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Draws several environments at once, in rows, as long as the shortest lasts.
+    """Renders several environments in rows; the duration is that of the shortest.
 
-    Arguments, but for the rows of ids, and errors are those of `moving_picture`.
+    Args:
+      rows: rows of ids.
+      seconds: as in `moving_picture`, which also has the errors.
+      size: height and width of each picture, pixels.
     """
     grid = [[moving_picture(id, seconds, size) for id in row] for row in rows]
     count = min(len(images) for row in grid for images in row)
@@ -105,12 +108,12 @@ def side_by_side(
 
 
 def save(images: Sequence[np.ndarray], path: Path, source: str = '') -> None:
-    """Writes pictures of `moving_picture` as an animated WebP that plays for ever, in real time.
+    """Writes pictures of `moving_picture` as an animated WebP that loops in real time.
 
     Args:
       images: (h, w, 3) uint8 each.
-      path: where to; .webp.
-      source: digest of what they show, which is kept in the file.
+      path: file to write; .webp.
+      source: digest to store in the file.
 
     Raises:
       ValueError: no pictures, or another suffix.
@@ -120,7 +123,7 @@ def save(images: Sequence[np.ndarray], path: Path, source: str = '') -> None:
 
     path = check_path(path, SUFFIXES)
     if not images:
-        raise ValueError('a moving picture of no pictures')
+        raise ValueError('an animated picture needs at least one picture')
     first, *others = map(Image.fromarray, images)
     content = io.BytesIO()
     first.save(
@@ -138,7 +141,7 @@ def _take(
     begin: float,
     seconds: float,
 ) -> Shot:
-    """Runs an episode, and keeps its states from a time on, s."""
+    """Runs an episode, and returns its states from the time `begin` (s)."""
     states: list[dict[str, Any]] = []
     root, body = [], root_body(environment)
     count, first, last = 0, round(begin / FRAME), round((begin + seconds) / FRAME)
@@ -176,7 +179,7 @@ def _draw(environment: Environment, shot: Shot, size: tuple[int, int]) -> list[n
         for overlay in drawn:
             overlay(physics, scene)
 
-    # Read when the context is made, by the first picture.
+    # These are read when the rendering context is created, for the first picture.
     quality = physics.model.vis.quality
     quality.offsamples, quality.shadowsize = SAMPLES, SHADOWS
     physics.model.vis.global_.offheight, physics.model.vis.global_.offwidth = size
@@ -199,11 +202,11 @@ def _extent(environment: Environment) -> np.ndarray:
 
 
 def _smooth(path: np.ndarray) -> np.ndarray:
-    """Returns a weighted average of each place and those before and after it, (k, 3) m."""
+    """Returns a path smoothed by Gaussian weights, (k, 3) m."""
     offsets = np.arange(-3 * SMOOTH, 3 * SMOOTH + 1)
     weights = np.exp(-0.5 * (offsets / SMOOTH) ** 2)
     weights /= weights.sum()
-    # Beyond the ends it goes on as it began and ended.
+    # The path is extended beyond its ends with its mean velocity.
     pace = (path[-1] - path[0]) / max(1, len(path) - 1)
     before = path[0] + offsets[offsets < 0, None] * pace
     after = path[-1] + offsets[offsets > 0, None] * pace
@@ -214,7 +217,7 @@ def _smooth(path: np.ndarray) -> np.ndarray:
 def _free_view(
     environment: Environment, shot: Shot, middle: np.ndarray, distance: float
 ) -> tuple[float, float]:
-    """Returns azimuth and elevation, degrees, from which no obstacle hides the character."""
+    """Returns azimuth and elevation, degrees, from which obstacles hide little of the character."""
     if not environment.task.arena.terrain.spatial:
         return PLANAR_VIEWS[0]
     travelled = shot.root[-1] - shot.root[0]
@@ -232,7 +235,7 @@ def _free_view(
 
 
 def _hidden(environment: Environment, eye: np.ndarray) -> float:
-    """Returns which part of the character's links cannot be seen from a place."""
+    """Returns the fraction of the character's links that are hidden from a point."""
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     root = root_body(environment)
     own = np.flatnonzero(model.body_rootid == model.body_rootid[root])

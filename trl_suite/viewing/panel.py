@@ -1,4 +1,4 @@
-"""The panel beside the picture of the web viewer: what can be chosen, and plots."""
+"""The control panel of the web viewer: choices, buttons and plots."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from trl_suite.terrain.checks import LIMITS
 from trl_suite.viewing.session import PUSHES, Loaded, Session
 
 SPEEDS = {'1/8': 0.125, '1/4': 0.25, '1/2': 0.5, '1': 1.0, '2': 2.0, '4': 4.0}
-PUSH = (0.1, 5.0, 1.0)  # m/s; least, most, and at first
+PUSH = (0.1, 5.0, 1.0)  # m/s; minimum, maximum, initial value
 SLIDER_STEPS = 100
 COLOURS = (
     '#1f77b4', '#ff7f0e', '#2ca02c', '#d62728', '#9467bd', '#8c564b', '#e377c2', '#7f7f7f',
     '#bcbd22', '#17becf',
 )  # fmt: skip
 PLOT_HEIGHT = 180  # pixels
-LEGEND = 8  # most lines of a plot that are named below it
+LEGEND = 8  # largest number of lines of a plot with a legend
 NOTICE = 8.0  # s; how long a message stays
 
 
@@ -47,7 +47,7 @@ class Controlled(Protocol):
 
 
 class Panel:
-    """The controls of a viewer, built once; `show` fits them to an environment."""
+    """The controls of a viewer, built once; `show` adapts them to an environment."""
 
     def __init__(self, server: Any, viewer: Controlled) -> None:
         self._server, self._viewer = server, viewer
@@ -56,8 +56,8 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         self._status = gui.add_html('')
-        self._filling = False  # whether values change because of the viewer, not of a user
-        self._fitted: list[Any] = []  # what is made anew for each environment
+        self._filling = False  # whether the viewer, not a user, is changing values
+        self._fitted: list[Any] = []  # controls that are replaced for each environment
         tabs = gui.add_tab_group()
         with tabs.add_tab('Run'):
             self._add_run()
@@ -107,7 +107,7 @@ class Panel:
         handle.on_update(chosen)
 
     def show(self, loaded: Loaded, session: Session) -> None:
-        """Fits the controls to an environment, its policies and its terrain."""
+        """Adapts the controls to an environment, its policies and its terrain."""
         self._filling = True
         self._environment.value = loaded.spec.id
         self._policy.options, self._policy.value = tuple(loaded.policies), loaded.policy
@@ -133,7 +133,7 @@ class Panel:
             low, high = slider_range(key, value)
             step = 10.0 ** np.floor(np.log10((high - low) / SLIDER_STEPS))
             sliders[key] = gui.add_slider(key, min=low, max=high, step=step, initial_value=value)
-        apply = gui.add_button('Lay this terrain')
+        apply = gui.add_button('Use this terrain')
         apply.on_click(
             lambda _: viewer.choose_terrain(
                 {
@@ -152,7 +152,7 @@ class Panel:
         )  # fmt: skip
 
     def _name(self, plot: Any, names: tuple[str, ...]) -> None:
-        """Gives a plot other lines. Made anew, it would get what was sent to its predecessor."""
+        """Changes the lines of a plot. A new plot would receive the data sent to the old one."""
         uplot = load_viser().uplot
         lines = [
             uplot.Series(label=name, stroke=COLOURS[i % len(COLOURS)], width=1)
@@ -164,7 +164,7 @@ class Panel:
             plot.legend = uplot.Legend(show=len(names) <= LEGEND)
 
     def plot(self, session: Session) -> None:
-        """Draws the plots anew."""
+        """Updates the plots."""
         if not session.history:
             return
         moments = list(session.history)
@@ -175,7 +175,7 @@ class Panel:
         self._torques.data = (times, *torques.T)
 
     def report(self, status: dict[str, str], playing: bool) -> None:
-        """Shows how the episode goes."""
+        """Shows the status of the episode."""
         cells = ' &middot; '.join(
             f'{name} <b>{html.escape(value)}</b>' for name, value in status.items()
         )
@@ -183,15 +183,13 @@ class Panel:
         self._play.label = 'Pause' if playing else 'Play'
 
     def tell(self, message: str) -> None:
-        """Shows a message to everybody who looks."""
+        """Shows an error message in all browsers."""
         for client in self._server.get_clients().values():
-            client.add_notification(
-                'This does not work', message, color='red', auto_close_seconds=NOTICE
-            )
+            client.add_notification('Error', message, color='red', auto_close_seconds=NOTICE)
 
 
 def slider_range(name: str, value: float) -> tuple[float, float]:
-    """Returns from where to where a slider of a terrain's parameter goes: twice its value to 0."""
+    """Returns the range of the slider of a terrain parameter: 0 to twice its value, within limits."""
     low, high = LIMITS.get(name.removesuffix('Min').removesuffix('Max'), (-np.inf, np.inf))
     reach = 2 * abs(value) or 1.0
     return float(max(low, -reach if value < 0 or low < 0 else 0.0)), float(min(high, reach))

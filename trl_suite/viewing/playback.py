@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 class Playback(dm_env.Environment):
-    """An environment whose long steps are shown frame by frame, 1/30 s each.
+    """Wraps an environment with long steps: a step of the wrapper is a frame of 1/30 s.
 
-    A step is simulated as a whole and then played back: every step of this environment puts the
-    simulation into the state of the next frame, the last one into that from which it goes on. Actions
-    count, and the policy is asked, only where no frame is left.
+    A step of the wrapped environment is simulated as a whole and then played back: every step of the
+    wrapper restores the state of the next frame. Actions are used, and the policy is called, only
+    when no frame is left.
     """
 
     def __init__(self, environment: Environment, policy: rendering.Policy) -> None:
@@ -28,7 +28,7 @@ class Playback(dm_env.Environment):
         self._action = np.zeros(environment.action_spec().shape)
 
     def policy(self, time_step: dm_env.TimeStep) -> np.ndarray:
-        """Returns the action that is due, of a step that is being played back the one it had."""
+        """Returns the next action, or during playback the action of the step that is played back."""
         if not self._left:
             self._action = self._policy(time_step)
         return self._action
@@ -64,5 +64,5 @@ class Playback(dm_env.Environment):
 
     @property
     def physics(self) -> Any:
-        """The simulation, as the viewer draws it."""
+        """The simulation, for the viewer."""
         return self._environment.physics

@@ -179,7 +179,7 @@ class Session:
         if 'distance' in info:
             texts['distance'] = f'{info["distance"]:.2f} m'
         if self.time_step.last():
-            default = 'was cut' if self.time_step.discount else 'failed'
+            default = 'truncated' if self.time_step.discount else 'failed'
             texts['end'] = next((end for end in _ENDS if info.get(end)), default)
         return texts
 

@@ -1,4 +1,4 @@
-"""dm_control's viewer, adapted to the suite. If GLFW finds no screen, importing this warns."""
+"""dm_control's viewer, adapted to the suite. Importing this module warns if there is no display."""
 
 from __future__ import annotations
 

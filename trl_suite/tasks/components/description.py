@@ -25,9 +25,9 @@ PLAN_BLOCKS: Meanings = {
 _ERRORS = {
     'pose': 'angles of joints and root, mean with the weights in Links; rad^2',
     'velocity': 'angular velocities of joints and root, mean with the same weights; rad^2/s^2',
-    'com': f'velocity of the centre of mass; {rewards.COM_ERROR_FACTOR:g} of the m^2/s^2',
+    'com': f'velocity of the centre of mass ({rewards.COM_ERROR_FACTOR:g} times the squared difference); m^2/s^2',
     'root': 'height of the root above the ground; m^2',
-    'heading': '-',
+    'heading': 'see below',
 }
 _ABOUT = {'com': 'the centre of mass', 'root': 'the root'}
 
@@ -62,8 +62,8 @@ def tracking_terms(task: Any, steps: bool, **more: str) -> Table:
     average = 'sum' if steps else 'mean'
     errors = {
         **_ERRORS,
-        'end_effector': f'end effector joints, position from {_ABOUT[task.ABOUT]} and height above '
-        f'the ground, {average} over them; m^2',
+        'end_effector': f'positions of the end effectors from {_ABOUT[task.ABOUT]} and heights above the '
+        f'ground, {average} over end effectors; m^2',
         **more,
     }
     return Table(

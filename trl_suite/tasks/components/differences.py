@@ -38,7 +38,7 @@ ROTATIONS = (
 OWN_CLIP = Difference(
     "the clip was made for this suite, with gait and speed close to the original's"
 )
-START_PHASE = Difference('the start phase is drawn uniformly instead of swept')
+START_PHASE = Difference('the start phase is drawn uniformly, not in a fixed sequence')
 LANDING = Difference('a landing error ends the episode only with the option max_landing_error')
 FACES = Difference(
     'faces of gaps, walls and steps are exactly vertical, and every start has flat ground from -1 to 1 m',

@@ -127,7 +127,7 @@ def check_two_feet(spec: CharacterSpec) -> None:
     """Checks that a character has two feet.
 
     Raises:
-      ValueError: it has not.
+      ValueError: the character does not have two end effectors.
     """
     if len(spec.end_effectors) != 2:
         raise ValueError(f'character {spec.name!r} does not have two end effectors as feet')

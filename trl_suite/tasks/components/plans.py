@@ -16,7 +16,7 @@ MAX_LANDING_ERROR = (
     'is no limit'
 )
 FOOTSTEP_SCALE = 'factor of the squared landing error in the reward; larger values reward accuracy'
-ROOT_TURN_LIMIT = 1.2  # rad; largest turn of a plan that is made from the root
+ROOT_TURN_LIMIT = 1.2  # rad; largest turn of a plan relative to the root
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Plans:
       change: probability that length and width of a step are redrawn.
       turn: standard deviation of the change of heading from one step to the next, rad.
       sharp: probability of a sharp turn instead, drawn from [-pi, pi).
-      from_root: probability that a plan is made from the position and heading of the root, as those
-        of a high-level controller are.
+      from_root: probability that a plan is relative to position and heading of the root, as the
+        plans of a high-level controller are.
       root_length, root_width: minimum and maximum length and width of the steps of such a plan, m.
       root_turn: standard deviation of its turn from the current heading, rad; clipped to +-1.2.
     """

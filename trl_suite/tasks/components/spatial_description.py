@@ -145,11 +145,11 @@ def _layout(spec: EnvSpec) -> Layout:
 
 
 def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
-    """Returns formulas of the reward terms for a ball, and when all of them are full.
+    """Returns formulas of the reward terms for a ball, and when all of them reach their maximum.
 
     Args:
       speed: target speed of walker and ball, m/s.
-      reached: distance of the ball from the goal within which all terms are full, m.
+      reached: distance of the ball from the goal within which all terms are at their maximum, m.
     """
     speeds = f'exp(-{ball.SPEED_SHARPNESS:g} min(0, v - {speed:g})^2)'
     formulas = [
@@ -160,8 +160,8 @@ def ball_terms(speed: float, reached: float) -> tuple[list[str], str]:
         f"exp(-{ball.GOAL_SHARPNESS:g} d), d: distance from the ball's centre to the goal on the ground, m",
     ]
     return formulas, (
-        f'all are full while the ball is within {reached:g} m of the goal and within {ball.NEAR:g} m of '
-        'the walker'
+        f'all four terms are at their maximum while the ball is within {reached:g} m of the goal and within '
+        f'{ball.NEAR:g} m of the walker'
     )
 
 

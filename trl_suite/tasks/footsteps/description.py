@@ -11,7 +11,7 @@ from trl_suite.tasks.imitation.description import PLANAR_BLOCKS
 from trl_suite.tasks.task_type import Description
 from trl_suite.util.tables import Section, section
 
-_PLANS = 'Plans: at every switch of stance'
+_PLANS = 'Plans: drawn at every switch of stance'
 _SWING = (
     'end_effector: in the second half of a step, the error of the swing foot is its displacement from the '
     'landing place'
@@ -36,7 +36,7 @@ def planar_rules(spec: Any, task: Any) -> Iterator[Section]:
         REWARD,
         tracking_terms(task, True),
         _SWING,
-        'heading: weight while the trunk points forwards, 0 while it points backwards',
+        'heading: equal to its weight while the trunk points forwards, 0 while it points backwards',
     )
     yield description.fall(task, description.missed(task))
 
@@ -46,8 +46,8 @@ def spatial_rules(spec: Any, task: Any) -> Iterator[Section]:
     motion = task.motion
     yield section(
         f'Steps: {motion.name}',
-        f'{motion.description}, and mirrored; the one nearest to the plan is the reference of a step. '
-        f'Period of two steps {task.period:.4g} s; right stance while the phase is below 0.5',
+        f'{motion.description}, also mirrored; the reference is the step nearest to the plan. '
+        f'Period (two steps) {task.period:.4g} s; right stance while the phase is below 0.5',
     )
     yield section(_PLANS, '; '.join(_plans(task)))
     yield section(
@@ -76,7 +76,9 @@ def _plans(task: Any) -> list[str]:
                 f'with probability {plans.sharp:g} it changes uniformly in [-pi, pi) instead'
             )
     if plans.from_root:
-        lines.append(f'with probability {plans.from_root:g} the plan is made from the root')
+        lines.append(
+            f'with probability {plans.from_root:g} the plan is relative to position and heading of the root'
+        )
     if task.pushes:
         low, high = task.pushes.force
         lines.append(f'the torso is pushed repeatedly with {low:g} to {high:g} N')

@@ -329,8 +329,8 @@ class PlanarFootsteps(PlanarImitation):
         )  # right above left foot, by halves
         if not higher[0] < 0 < higher[1]:
             raise ValueError(
-                f'clip {self.clip.name!r}: its right foot does not stand in the first half of the '
-                'cycle and its left foot in the second; if the left one stands first, give '
+                f'clip {self.clip.name!r}: expected the right foot on the ground in the first half of '
+                'the cycle, and the left foot in the second; if the left foot is first, pass '
                 'clip.mirrored()'
             )
         self._streams = Streams(n)
@@ -388,10 +388,11 @@ def check_feet(character: CharacterSpec) -> None:
     """Checks that a character has a right and a left foot, and no others.
 
     Raises:
-      ValueError: it has not.
+      ValueError: the character has no such pair of end effectors.
     """
     if character.end_effectors not in character.mirror:
         raise ValueError(
-            f'character {character.name!r} has no right and left foot, but '
-            f'{", ".join(character.end_effectors) or "no end effectors"}; biped2d_full has them'
+            f'character {character.name!r} has '
+            f'{", ".join(character.end_effectors) or "nothing"} as end effectors; expected a right and a left '
+            'foot, as biped2d_full has'
         )

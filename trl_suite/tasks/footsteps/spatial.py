@@ -93,7 +93,7 @@ class SpatialFootstepsConfig(MirroredConfig):
         if self.pushes is not None:
             self._set('pushes', options(Pushes, 'pushes', self.pushes))
         if self.hidden_plan and self.mirrored:
-            raise ValueError('hidden_plan and mirrored cannot be combined: give only one of them')
+            raise ValueError('hidden_plan and mirrored cannot be combined; pass only one of them')
 
 
 class SpatialFootsteps(SpatialTask):
@@ -109,11 +109,11 @@ class SpatialFootsteps(SpatialTask):
         0 in left stance; second landing place relative to the right foot, 0 in left stance, and to
         the left foot, 0 in right stance; (x, y, z) each, z relative to the ground under the root;
         then the planned heading, rad to the left of the current one; 13.
-    With the option mirrored, 117 numbers: observations and actions are reflected in left stance;
-      the
-    phase is that of the single step, with the one-hot of its half (3), and the plan (7) has the
-    heading first, then the first landing place relative to the swing foot, then the second relative
-    to the stance foot.
+
+    With the option `mirrored`, an observation has 117 numbers. Observations and actions are reflected
+    in left stance. The phase is that of the single step, with the one-hot of its half (3). The plan
+    (7) has the heading first, then the first landing place relative to the swing foot, then the
+    second relative to the stance foot.
     """
 
     TERMS = rewards.STEP_TERMS

@@ -24,7 +24,8 @@ TYPES = (
             ),
             Difference(
                 'actions are in [-1, 1], clipped, and mapped to the learnt parameters; the original assigns '
-                'them to the first of all parameters, so that most set the wrong one'
+                'them to the first entries of the vector of all parameters, so that most of them set a wrong '
+                'parameter'
             ),
             Difference(
                 'a step ends with its cycle or a fall, not up to 1/30 s later; the first action of an '

@@ -76,7 +76,7 @@ def before(task: Any) -> Iterator[Section]:
         Table(('state', 'ends'), list(zip(figures.states, task.gait.endings, strict=True))),
     )
     chosen = [
-        name
+        f'parameter set {name}'
         for name, values in figures.sets.items()
         if np.array_equal(values, figures.action_offset)
     ]
@@ -94,8 +94,8 @@ def before(task: Any) -> Iterator[Section]:
     yield section(
         f'Parameters: {len(figures.names)}, of which an action sets {len(figures.actions)}',
         Table(('base action', 'parameter set'), blends),
-        f'action 0 is {" = ".join(chosen)}',
-        f'only the absolute value counts: {", ".join(figures.names[i] for i in figures.absolute)}',
+        f'action 0 is {", i.e. ".join(chosen)}',
+        f'only the absolute values of these parameters are used: {", ".join(figures.names[i] for i in figures.absolute)}',
         *([f'fixed: {", ".join(fixed)}'] if fixed else []),
     )
 

@@ -65,15 +65,16 @@ class GaitConfig(Config):
 
     interface: str = option(
         'parameters',
-        "'parameters': a step is a cycle, and an action sets the gait's parameters, where 0 is the default "
-        "and +-1 the largest deviation of any base action from it; 'base_action': a step is 1/30 s, an "
-        'action has one preference per base action, and the base action with the largest one is used '
-        'when the next cycle begins',
+        "'parameters': a step is a cycle, and an action sets the gait's parameters; 0 is the default value, "
+        "and +-1 differs from it by the largest deviation of any base action; 'base_action': a step is "
+        '1/30 s, an action has one preference per base action, and the base action with the largest '
+        'preference is used when the next cycle begins',
         choices=INTERFACES,
     )
     base_actions: str = option(
         'default',
-        "'default', or 'original': those of the papers, which differ for the biped and the goat",
+        "base actions: 'default', or 'original' for those of the papers; the two differ for the biped and the "
+        'goat',
         choices=BASE_ACTIONS,
     )
     substeps: int = option(

@@ -74,8 +74,8 @@ class PlanarConfig(Config):
     )
     action_offset: str = option(
         'clip',
-        "pose at action 0: the mean of the 'clip', or the working 'posture'; 'original': the original's "
-        'map, where [-1, 1] spans four times the joint range about its middle',
+        "pose at action 0: the mean pose of the clip ('clip'), or the working posture ('posture'); "
+        "'original': the original's map, where [-1, 1] spans four times the joint range about its middle",
         choices=ACTION_OFFSETS, actuation='position',
     )  # fmt: skip
     action_scale: float | None = option(
@@ -109,7 +109,10 @@ class PlanarImitationConfig(PlanarConfig):
         False, 'observe the state of the reference instead of the phase'
     )
     muscle_set: str = option(
-        PLAIN, "'plain', or the clip for which the muscles were optimised", actuation='muscle'
+        PLAIN,
+        "set of muscle parameters: 'plain', or the motion for which they were optimised (biped: 'walk', "
+        "'run'; dog: 'bound'; raptor: 'run')",
+        actuation='muscle',
     )
 
 

@@ -86,7 +86,7 @@ def about_plans(spec: EnvSpec, task: Any) -> Iterator[Section]:
             'centre of mass towards the goal, m/s',
             '1',
         ]
-        full = f'speed is full if the step begins within {task.goal_reached:g} m of the goal'
+        full = f'the term speed is at its maximum if the step begins within {task.goal_reached:g} m of the goal'
     yield section(
         'Reward of a step: sum of weight * term, at most 1; 0 after a fall',
         Table(
@@ -117,7 +117,7 @@ def time(spec: EnvSpec, task: Any) -> Section:
     duration, physics = task.control_timestep, 1 / task.physics_timestep
     return section(
         'Time',
-        f'a step is {duration:.3g} s, the first of an episode may be shorter; footstep controller 30 Hz, '
+        f'a step is {duration:.3g} s (the first of an episode may be shorter); footstep controller 30 Hz, '
         f'physics\n{physics:.4g} Hz; an episode is truncated (discount 1) after {spec.step_limit} steps, '
         f'{spec.step_limit * duration:.3g} s',
     )
@@ -141,7 +141,7 @@ def about_joints(spec: EnvSpec, task: Any) -> Iterator[Section]:
 
 def _direct_reward(task: Any, where: str) -> Iterator[Table | str]:
     near = f'{direct_rules.NEAR:g} m'
-    yield tracking_terms(task, False, proximity=f'distance to the {where} over {near}')
+    yield tracking_terms(task, False, proximity=f'distance to the {where}, in units of {near}')
     yield (
         'heading: weight * ((1 + cos error) / 2)^4, error: angle between the heading and the direction of '
         f'the {where}'

@@ -25,7 +25,7 @@ from trl_suite.tasks.components.comparison import (
 )
 from trl_suite.tasks.components.goals import flag, goals, set_goal
 from trl_suite.tasks.components.reflection import Reflection
-from trl_suite.tasks.components.spatial_rules import TERRAIN_MAPS, act_all
+from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, act_all
 from trl_suite.tasks.components.trace import trace, trace_markers
 from trl_suite.tasks.footsteps.spatial import SpatialFootsteps, SpatialFootstepsConfig
 from trl_suite.tasks.imitation.spatial import TYPICAL_POSES, check_cycle, clip_action, pose_of_clip
@@ -50,7 +50,7 @@ from trl_suite.util.options import option
 class DirectConfig(SpatialConfig):
     """Options of `DirectNavigation`."""
 
-    terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=('height',))
+    terrain_observation: str | Collection[str] = option('height', HEIGHT_MAP, choices=('height',))
     goal_reached: float | None = option(
         None,
         f'distance within which a goal is reached, or a ball is at its goal; by default {GOAL_REACHED:g}',
@@ -64,8 +64,8 @@ class DirectNavigationConfig(DirectConfig):
 
     reward: str = option(
         'goal',
-        f"'goal', or 'original': the reward for tracking footsteps of {HIDDEN_LENGTH:g} m that are not "
-        'observed; the goal is then fixed',
+        f"'goal': reward for approaching the goal; 'original': reward for tracking footsteps of {HIDDEN_LENGTH:g} m "
+        'that are not observed, with a fixed goal',
         choices=REWARDS,
     )
 

@@ -93,13 +93,16 @@ class HierarchicalConfig(Config):
 
     controller: Any = option(
         CONTROLLER,
-        'footstep controller: an id with a shipped policy, a policy, its file, or a function',
+        (
+            'footstep controller: the id of an environment, whose shipped policy is used, a policy, the path '
+            'of its file, or a function'
+        ),
         policy=True,
     )
     interface: str = option(
         'plan',
-        "'plan': a step is a footstep; 'frame': a step is 1/30 s, and an action has the plan, then the "
-        'joint targets; a plan takes effect only in a step that begins a footstep',
+        "'plan': a step is a footstep; 'frame': a step is 1/30 s, an action contains the plan, then the joint "
+        'targets, and a plan takes effect only in a step that begins a footstep',
         choices=INTERFACES,
     )
     terrain_observation: str | Collection[str] = option('height', TERRAIN_MAPS, choices=MAPS)
@@ -108,7 +111,7 @@ class HierarchicalConfig(Config):
     )
     target_speed: float = option(
         1.0,
-        'speed of walker and ball towards the goal for full reward',
+        'speed of walker and ball towards the goal at which the reward reaches its maximum',
         unit='m/s',
         above=0,
     )
@@ -126,7 +129,7 @@ class HierarchicalConfig(Config):
     )
     start_phases: Sequence[float] = option(
         (0.1, 0.6),
-        'phases of the clock from which that of the start is chosen',
+        'phases of the cycle, from which the phase at the start of an episode is drawn',
         at_least=0,
         below=1,
     )

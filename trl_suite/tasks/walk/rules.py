@@ -36,7 +36,7 @@ from trl_suite.terrain.spatial.windows import SpatialWindows
 from trl_suite.util.compiled import compiled, compiled_loop
 
 SAMPLES = 50  # terrain heights that a planar character observes
-FROUDE = 0.25  # speed^2 / (gravity * height of the root) at which the reward of speed is full
+FROUDE = 0.25  # speed^2 / (gravity * root height) at which the speed reward reaches its maximum
 GRAVITY = 9.8  # m/s^2
 
 

@@ -22,7 +22,7 @@ from trl_suite.kinematics.spatial import (
 )
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
-from trl_suite.tasks.components.spatial_rules import TERRAIN_MAPS
+from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP
 from trl_suite.tasks.imitation.planar_rules import (
     CONTROL_TIMESTEP,
     SUBSTEPS,
@@ -86,7 +86,7 @@ class PlanarWalkConfig(WalkConfig):
 class SpatialWalkConfig(WalkConfig):
     """Options of a walk in three dimensions."""
 
-    terrain_observation: str | Collection[str] = option((), TERRAIN_MAPS, choices=('height',))
+    terrain_observation: str | Collection[str] = option((), HEIGHT_MAP, choices=('height',))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -100,14 +100,13 @@ class Walk(Task):
     `WALK`, unless the option `rewards` is given; a subclass may compute one after
     `super().finish_step`.
 
-    Observation blocks, in this order: terrain (optional), pose and velocity as in `PlanarImitation`
-      and
-    `SpatialImitation`; for a spatial character also
+    Observation blocks, in this order: terrain (optional), pose and velocity, as in
+    `PlanarImitation` and `SpatialImitation`, and for a spatial character:
       target_heading: cosine and sine of the bearing of the target heading, the heading at the
         start; 2.
 
     Attributes:
-      full_speed: speed at which the reward term `speed_ratio` is full, m/s.
+      full_speed: speed at which the reward term `speed_ratio` reaches its maximum, m/s.
     """
 
     CONFIG: Any = MappingProxyType({False: PlanarWalkConfig, True: SpatialWalkConfig})

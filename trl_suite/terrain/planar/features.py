@@ -128,7 +128,7 @@ def _step(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs
 
 @compiled
 def _narrow_gaps(number: int, first: int, parameters: np.ndarray, bits: int, runs: Runs) -> int:
-    """A cluster of gaps with stepping stones; all gap depths are below the same surface."""
+    """A cluster of gaps with stepping stones; all depths are relative to the same surface."""
     spacing = first + _SPACING
     low, high = max(1.0, parameters[first + _COUNTS]), max(1.0, parameters[first + _COUNTS + 1])
     for _ in range(_integer(low, high, bits)):

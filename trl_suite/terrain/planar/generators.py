@@ -74,8 +74,8 @@ def register(
     Args:
       type_name: the `Type` in terrain files.
       defaults: the names of all its parameters, with their defaults.
-      replace: whether another function's type of that name may be replaced; what is written in
-        the same place, as a notebook's cell that is run again, always may.
+      replace: whether a type that belongs to another function may be replaced. A function with the
+        same module and name, e.g. of a notebook cell that is run again, always replaces it.
 
     Raises:
       ValueError: the name is taken, or a default is invalid (see `check`).

@@ -63,8 +63,8 @@ class PlanarGround:
           spawn: 'intended' for flat ground from x = -1 to +1, or 'upstream' for the start that the
             original has when run.
           centre: x where the first two stretches meet if spawn is 'upstream', m; otherwise unused.
-            In the original 3 for gait machines, and x - 0.5 for the imitation of a clip that has
-            moved x m forward at its start phase.
+            In the original it is 3 for gait state machines, and x - 0.5 for the imitation of a clip
+            that has moved x m forward at its start phase.
 
         Raises:
           ValueError: three-dimensional terrain, unknown spawn, a centre that is not finite or whose
@@ -82,7 +82,7 @@ class PlanarGround:
             raise ValueError(f'centre must be a number within {LONGEST:g} m of 0, not {centre!r}')
         self.type = terrain.type
         self.parameters = terrain.parameters(terrain_level)
-        # Heights of the vertices _low, _low + 1, ...; one flag less, for the cells between them.
+        # Heights of the vertices _low, _low + 1, ...; `_vertical` is for the cells between them.
         self._low = round((centre if spawn == 'upstream' else INTENDED_CENTRE) / SPACING)
         self._heights = np.zeros(1)
         self._vertical = np.zeros(0, dtype=bool)

@@ -85,8 +85,8 @@ def is_outside(i: int, x: float, ground: PlanarWindows) -> bool:
 def far_height(i: int, x: float, ground: PlanarWindows) -> float:
     """Returns the height in m at x, m, from `wide`: up to one window length beyond the window.
 
-    Valid where `is_wide`; beyond `wide` its end values apply. Rounded as `PlanarGround.height` is,
-    which `height` is not: if a terrain observation reaches beyond the window, all of its heights
+    Valid where `is_wide`; beyond `wide` its end values apply. It rounds as `PlanarGround.height`
+    does, unlike `height`: if a terrain observation reaches beyond the window, all of its heights
     come from this function.
     """
     position = x / SPACING

@@ -123,7 +123,7 @@ class SpatialGround:
           direction: direction of the moving boxes, 1 or -1, (k,); their initial ones if None.
 
         Raises:
-          ValueError: as `height`.
+          ValueError: as for `height`.
         """
         return self._look(x, y, movers, direction)[1]
 
@@ -196,9 +196,9 @@ class SpatialGround:
     def spawn(self, random: Random) -> tuple[float, float, float]:
         """Draws the start of a character: x, y (m) and heading (rad).
 
-        Depends on the layout's place: at the origin along x; anywhere in a square (24 m to each
-        side among blocks and pillars, 12 m among moving boxes and belts) where 2 m x 2 m are clear;
-        or on the middle of a trail, along it. The number of random draws varies.
+        The position depends on the layout's place: at the origin along x; anywhere in a square (24
+        m to each side among blocks and pillars, 12 m among moving boxes and belts) where 2 m x 2 m
+        are clear; or on the middle of a trail, along it. The number of random draws varies.
         """
         layout = self.layout
         if layout.place == 'trail':
@@ -226,15 +226,16 @@ class SpatialGround:
     ) -> np.ndarray:
         """Draws a goal on the ground.
 
-        Depends on the layout's place: near the character (`far`: within 3 m along x and along y;
-        `near`: from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a start; or on
-        the trail, 1 to 10 segments of 2 m beyond the one nearest to the character (`step`: 1).
+        The position depends on the layout's place: near the character (rule `far`: within 3 m along
+        x and along y; `near`: from `distance` to 3 m ahead along x, at y = 0); anywhere clear, as a
+        start; or on the trail, 1 to 10 segments of 2 m beyond the one nearest to the character
+        (`near`: 1 segment).
 
         Args:
           random: source of randomness.
-          root: where the character is, (2,) m.
+          root: position of the character, (2,) m.
           rule: one of `RULES`.
-          distance: distance of the nearest goal of `step`, m.
+          distance: smallest distance of a goal for the rule `near`, m.
           movers: centres of the moving boxes, m, (k, 2); their initial ones if None.
 
         Returns:

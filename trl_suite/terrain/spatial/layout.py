@@ -242,7 +242,7 @@ class Layout:
         return heights
 
     def fault(self) -> str:
-        """Why the layout is invalid, for the author of a generator; empty if it is valid."""
+        """Returns why the layout is invalid, for the author of a generator; empty if it is valid."""
         if self.place not in PLACES:
             return f'place must be one of {", ".join(PLACES)}, not {self.place!r}'
         if self.place == 'trail' and self.trail is None:

@@ -24,7 +24,7 @@ from trl_suite.terrain.spatial.windows import (
 from trl_suite.util.compiled import compiled
 
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
-SPARE = 1.3  # factor on the largest number of boxes in these grounds
+SPARE = 1.3  # factor applied to the largest number of boxes in these grounds
 
 EnvIds = slice | np.ndarray
 ALL = slice(None)
@@ -73,7 +73,7 @@ class Surroundings:
       arrays: the windows, for the compiled functions of one simulation in
         `trl_suite.terrain.spatial.windows`.
       grounds: grounds of each character.
-      boxes: in each window, in order of x.
+      boxes: boxes of each window, sorted by x.
       centre: centres of the windows, m, (n, 2).
       distance: distances of moving boxes from the start of their paths, m, (n, M).
       direction: 1 where they move towards the end, -1 towards the start, (n, M).
@@ -126,8 +126,8 @@ class Surroundings:
             or movers > capacity.movers
         ):
             raise ValueError(
-                f'a ground of type {ground.type!r} holds more than {capacity}, which {PROBES} draws '
-                'led to expect: its generator must make the same kinds of things every time'
+                f'a ground of type {ground.type!r} has more parts than {capacity}, the capacity estimated '
+                f'from {PROBES} samples; a generator must return the same kinds of parts in every episode'
             )
         arrays = self.arrays
         self.grounds[env_id] = ground
@@ -144,7 +144,7 @@ class Surroundings:
         self._lay(env_id, np.round(np.asarray(xy, float) / SHIFT) * SHIFT)
 
     def follow(self, xy: np.ndarray, env_ids: np.ndarray | None = None) -> list[int]:
-        """Moves windows whose characters have left the middle.
+        """Moves the windows of characters that are more than 4 m from their centres.
 
         Args:
           xy: positions of the characters, m, (n, 2), or of the given simulations only.
@@ -165,10 +165,10 @@ class Surroundings:
         return leaving
 
     def advance(self, dt: float, xy: np.ndarray, env_ids: EnvIds = ALL) -> None:
-        """Moves moving boxes, for use without a physics engine.
+        """Advances the moving boxes, for use without a physics engine.
 
         Args:
-          dt: s.
+          dt: duration, s.
           xy: positions of the characters of these simulations, m.
           env_ids: numbers of the simulations.
         """

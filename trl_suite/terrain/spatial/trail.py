@@ -14,7 +14,8 @@ BEGIN = (-1.25, 0.0)  # m; start of the first segment
 STRAIGHT = 2  # number of straight segments before the first turn
 FREQUENCY = 0.005  # tiles of noise per m: five times finer than hills
 AMPLITUDE = 5.0  # m; of the first octave
-EASY, WIDEST = 1.0, 0.6 * math.pi  # rad; |heading| up to which turns are unbiased / always back
+# rad; |heading| up to which turns are unbiased, and from which they always turn back.
+EASY, WIDEST = 1.0, 0.6 * math.pi
 MARGIN = 10.0  # m; a trail this far ahead does not return
 MOST = 100_000  # segments
 
@@ -22,9 +23,10 @@ MOST = 100_000  # segments
 class Trail:
     """Segments of a path, generated on demand.
 
-    Each segment varies the width, turns (less where it is narrow, and more often back once its
-    heading is more than 1 rad off straight ahead), and may step up or down. Where the noise of the
-    surrounding ground is above its mean, the least width of the path is larger.
+    Each segment has a different width, turns (by a smaller angle where the path is narrow, and with
+    a higher probability towards straight ahead if its heading is more than 1 rad off), and may step
+    up or down. Where the noise of the surrounding ground is above its mean, the smallest width of
+    the path is larger.
 
     Attributes:
       start, end: end points of the existing segments, m, (k, 2).
@@ -70,7 +72,7 @@ class Trail:
             self._arrays()
 
     def leave(self, half_side: float) -> int:
-        """Number of segments up to the first that ends outside a square around the origin."""
+        """Returns the number of segments up to the first that ends outside a square at the origin."""
         self.reach(half_side)
         outside = (np.abs(self.end) > half_side).any(1)
         return int(outside.argmax()) + 1

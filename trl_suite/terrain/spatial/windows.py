@@ -16,7 +16,7 @@ from trl_suite.terrain.spatial.layout import GRID, TURN_DISTANCE
 from trl_suite.util.compiled import compiled, compiled_inline
 
 HALF = 16.0  # m; half side of a window
-SHIFT = 4.0  # m; window centres are multiples of it; a character farther away has its window moved
+SHIFT = 4.0  # m; window centres are multiples of it; windows of characters farther away are moved
 VERTICES = round(2 * HALF / GRID) + 1  # of the height grid of a window, along each axis
 SQUARES = (32, 32)  # bins of a window along x and y
 STRIPS = (256, 1)  # the same if all boxes reach from the right rim to the left one
