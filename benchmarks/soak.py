@@ -18,7 +18,6 @@ import argparse
 import ctypes
 import gc
 import importlib.metadata
-import json
 import os
 import pathlib
 import resource
