@@ -79,7 +79,7 @@ class JobsTest(parameterized.TestCase):
         )
         with (
             checkpoints.only_run(folder),
-            self.assertRaisesRegex(RuntimeError, 'trains in this folder'),
+            self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
         ):
             work('PD_Biped2D_Flat-v0', 1)
         self.assertTrue(folder.exists())
