@@ -229,6 +229,10 @@ class CharacterTest(Folder):
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
         ('name', {'name': 'dog'}, "has a character named 'dog'"),
+        ('slash', {'name': 'a/b'}, "name is 'a/b'; expected a name without '/'"),
+        ('number', {'fall_links': 3}, 'fall links are 3; expected a sequence of one name or more'),
+        ('effectors', {'end_effectors': 3}, 'end effectors are 3; expected a sequence'),
+        ('exempt', {'stumble_exempt': 3}, 'stumble-exempt links are 3; expected a sequence'),
         ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
         ('spatial', {'spatial': 'x'}, "spatial is 'x'; expected True or False or None"),
         ('short_turn', {'turn': (0, 0, 90)}, r'turn is \(0, 0, 90\); expected a quaternion wxyz'),
@@ -256,6 +260,9 @@ class CharacterTest(Folder):
             TypeError, r"joints\['left_hip'\] is 3; expected a characters.J"
         ):
             self.planar(joints={'left_hip': 3})
+        for joints in (3, ['left_hip']):
+            with self.assertRaisesRegex(TypeError, 'joints is .*; expected a dict of characters.J'):
+                self.planar(joints=joints)
         with self.assertRaisesRegex(TypeError, 'character is 3; expected a name, or what'):
             characters.make(3)
 
