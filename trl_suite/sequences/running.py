@@ -125,7 +125,7 @@ def run(
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
     errors.check_whole('budget', budget, 1, 2**53)
-    errors.check_whole('episodes', episodes, 1, 2**53)
+    errors.check_whole('episodes', episodes, 1, evaluation.MOST_EPISODES)
     errors.check_whole('seed', seed, 0, 2**53)
     stages = len(sequence) if stages is None else stages
     errors.check_whole('stages', stages, 1, len(sequence))
