@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from absl.testing import absltest, parameterized
 
-from trl_suite import cli, motion, policies, sequences, suite
+from trl_suite import cli, motion, policies, sequences, suite, terrain
 from trl_suite.util import program
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -122,7 +122,10 @@ PROGRAMS = {'command': command, 'train': train, 'learn': learn}
 
 def serve():
     """Runs a program in a forked child for each line of stdin; answers with how it ended."""
-    suite.make(GAPS, {'random': 0}).reset()  # loads the compiled code for all children
+    environment = suite.make(GAPS, {'random': 0})  # loads the compiled code for all children
+    environment.reset()
+    environment.step(np.zeros(11))
+    terrain.SpatialGround(terrain.load('hills3d'), 0).height(0.0, 0.0)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for line in sys.stdin:
         task = json.loads(line)
@@ -349,7 +352,7 @@ class FaultsTest(parameterized.TestCase):
         self.run_program(expected, 'learn')
         status, text, _ = self.run_program(self.folder, 'learn', limit=100)
         self.assertEqual(status, 2, text)
-        self.assertRegex(text, r'^error: .*File too large.*result\.json')
+        self.assertRegex(text, r"(^|\n)error: .*File too large: 'result\.json'\n$")
         self.assertEqual(self.files(self.folder), {})
         self.assertEqual(self.run_program(self.folder, 'learn')[0], 0)
         self.assertEqual(self.files(self.folder), self.files(expected))
@@ -363,7 +366,7 @@ class FaultsTest(parameterized.TestCase):
         self.assertEqual(before['run/checkpoint.pt'], 128)
         status, text, _ = self.run_program(self.folder, 'train', limit=4000)
         self.assertEqual(status, 2, text)
-        self.assertRegex(text, r'^error: .*File too large.*run/[a-z]')
+        self.assertRegex(text, r"(^|\n)error: .*File too large: 'run/[a-z]+\.[a-z]+'\n$")
         self.assertEqual(self.files(self.folder)['run/checkpoint.pt'], 128)
         self.assertEqual(self.run_program(self.folder, 'train')[0], 0)
         self.assertEqual(self.files(self.folder), self.files(expected))
