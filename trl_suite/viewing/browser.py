@@ -82,7 +82,7 @@ class Browser:
           port: the first that is tried, then the next ones.
 
         Raises:
-          ValueError: an unknown id or policy, or a policy that does not fit.
+          ValueError: an unknown id, policy or port, or a policy that does not fit.
           FileNotFoundError: there is no such file.
           ImportError: the extra 'viewer' is not installed.
           OSError: nothing can listen on this address.
