@@ -11,7 +11,6 @@ import codecs
 import contextlib
 import hashlib
 import io
-import os
 import pathlib
 import re
 from collections.abc import Iterator
@@ -21,11 +20,6 @@ import numpy as np
 import torch
 
 from trl_suite.util import files
-
-try:
-    import fcntl
-except ImportError:  # not on Windows, where two runs in one folder are not detected
-    fcntl = None  # type: ignore[assignment]
 
 FORMAT = b'trl_suite checkpoint 1\n'
 # Globals in pickled arrays.
@@ -84,17 +78,6 @@ def only_run(folder: pathlib.Path) -> Iterator[None]:
       RuntimeError: another process trains in the folder; the message has its id.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / '.lock').open('a+') as file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                file.seek(0)
-                raise RuntimeError(
-                    f'{folder}: process {file.read().strip() or "?"} trains in this folder; wait for '
-                    'it, or pass another --output'
-                ) from None
-            file.truncate(0)
-            file.write(f'{os.getpid()}\n')
-            file.flush()
+    what = f'trains in {folder}; wait for it, or give another --output'
+    with files.locked(folder / '.lock', what):
         yield

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import shutil
+import socket
 import time
 import unittest
 
@@ -132,6 +133,23 @@ class SceneTest(parameterized.TestCase):
         heights = environment.task.arena.height(near[None, :, 0], near[None, :, 1])[0]
         np.testing.assert_allclose(near[:, 2], heights, atol=1e-5)
         self.assertGreater((mesh.face_normals[:, 2] > 0).mean(), 0.999)
+
+    def test_ports(self):
+        """The next free one is taken; where there is none, no server waits for ever."""
+        first = web_scene.start_server('127.0.0.1', 0)
+        self.addCleanup(web_scene.stop_server, first)
+        second = web_scene.start_server('127.0.0.1', first.get_port())
+        self.addCleanup(web_scene.stop_server, second)
+        self.assertGreater(second.get_port(), first.get_port())
+        for port in (65536, 10**8, -1, 2.5):
+            with self.assertRaisesRegex(ValueError, f'port is {port}; expected a whole number'):
+                web_scene.start_server('127.0.0.1', port)
+        with socket.socket() as taken:
+            taken.bind(('127.0.0.1', 65535))
+            with self.assertRaisesRegex(OSError, 'in use'):
+                web_scene.start_server('127.0.0.1', 65535)
+        with self.assertRaises(OSError):
+            web_scene.start_server('nosuch.invalid', 8080)
 
     @parameterized.parameters((DOG, {'box', 'tube', 'sphere'}), (SOCCER, {'box', 'sphere', 'cone'}))
     def test_shapes_of_what_mujoco_draws(self, id_, expected):

@@ -478,6 +478,14 @@ class RolloutTest(CommandTest):
         for i, line in enumerate(episodes, 1):
             self.assertRegex(line, rf'^ +{i} +3 +[\d.]+ +[\d.]+  truncated$')
 
+    def test_steps_are_kept_for_a_trajectory_only(self):
+        """A rollout of any length takes the same memory."""
+        environment = suite.make(GAPS, {'random': 0})
+        for keep in (False, True):
+            record = rollout._Record(environment, keep)
+            record.add(environment.reset(), np.zeros(11))
+            self.assertLen(record._rows, keep)
+
     def test_many_episodes_are_summarised(self):
         out = self.output('rollout', GAPS, '--steps', '600', '--seed', '1')
         lines = out.splitlines()

@@ -302,6 +302,33 @@ class CacheTest(FolderTest):
         self.assertEqual(found, ['11.0', '20.0'])
         self.assertEqual(warned.count('no folder for compiled code is writable'), 1)
 
+    def test_a_full_disk(self):
+        """The folder can be made, and no file be written: the code is compiled, and not kept."""
+        found, warned = self.ask("""
+            import resource
+            from trl_suite.util import compiled
+            compiled.cache_folder()
+            resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+            from trl_suite.outer import outer
+            print(outer(1.0))
+        """)
+        self.assertEqual(found, ['11.0'])
+        self.assertEqual(warned.count('compiled code cannot be kept in'), 1)
+        self.assertEmpty([path for path in self.cache.rglob('*') if path.is_file()])
+
+    @parameterized.parameters('*.nbi', '*.nbc')
+    def test_damaged_files(self, pattern):
+        """Those that are cut off, as after a crash of the machine, are written again."""
+        self.ask()
+        whole = {path: path.read_bytes() for path in self.cache.rglob(pattern)}
+        self.assertNotEmpty(whole)
+        for size in (0, 20):
+            for path, content in whole.items():
+                path.write_bytes(content[: size or 0])
+            self.assertEqual(self.ask(), (['11.0'], ''))
+            for path, content in whole.items():
+                self.assertGreater(path.stat().st_size, 0.9 * len(content))
+
     def test_numbas_setting_is_not_changed(self):
         found, _ = self.ask("""
             import numba

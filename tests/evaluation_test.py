@@ -191,7 +191,12 @@ class EvaluateTest(parameterized.TestCase):
         for message, *arguments in (
             ('episodes is 0', GAPS, policy, 0),
             ('episodes is 1.5', GAPS, policy, 1.5),
+            ("episodes is 'x'; expected a whole number", GAPS, policy, 'x'),
+            ('episodes is 1000000000; expected .* to 1000000', GAPS, policy, 10**9),
             ('seed is -1', GAPS, policy, 1, -1),
+            ("seed is 'x'; expected 0 or a positive integer", GAPS, policy, 1, 'x'),
+            ("seed is 'x'; expected a whole number from 0 to 4294967295", GAPS, policy, 1, ['x']),
+            ('seed is 4294967296; expected a whole number', GAPS, policy, 1, [2**32]),
             ('num_threads is -1', GAPS, policy, 1, 0, -1),
             ('did you mean', GAPS[:-1], policy),
             ('unknown option', GAPS, policy, 1, 0, 0, {'x': 1}),

@@ -79,7 +79,7 @@ class JobsTest(parameterized.TestCase):
         )
         with (
             checkpoints.only_run(folder),
-            self.assertRaisesRegex(RuntimeError, 'trains in this folder'),
+            self.assertRaisesRegex(RuntimeError, 'process [0-9]+ trains in '),
         ):
             work('PD_Biped2D_Flat-v0', 1)
         self.assertTrue(folder.exists())
@@ -155,6 +155,21 @@ class TrimTest(absltest.TestCase):
         ):
             self.assertEqual(train_all.program(id_).__name__, program)
             self.assertIn('samples', train_all.settings(id_))
+
+
+class ProgramsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        *(
+            path.name
+            for path in sorted(pathlib.Path(ppo.__file__).parent.glob('*.py'))
+            if '__main__' in path.read_text() or 'argparse' in path.read_text()
+        )
+    )
+    def test_every_program_ends_errors_in_one_line(self, name):
+        """Either when it is run, or before it parses its arguments; modules of others parse none."""
+        text = (pathlib.Path(ppo.__file__).parent / name).read_text()
+        body = text.split("if __name__ == '__main__':")[-1]
+        self.assertRegex(body, r'(?m)^(    )?begin_script\(\)$')
 
 
 class TransferTest(parameterized.TestCase):

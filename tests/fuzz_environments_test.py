@@ -156,10 +156,12 @@ def state_test(id_):
                 world = np.array(state['world'])
                 world[..., data.draw(st.integers(0, world.shape[-1] - 1))] = value
                 state['world'] = world
-            elif key == 'made_for' or key is None:
-                state = data.draw(anything) if key is None else {**state, key: data.draw(anything)}
-            else:
+            elif key is None:
+                state = data.draw(anything)
+            elif key in ('task', 'fresh') or data.draw(st.booleans()):
                 del state[key]
+            else:
+                state[key] = data.draw(anything)
             before = pickle.dumps(environment.get_state())
             try:
                 environment.set_state(state)

@@ -15,6 +15,7 @@ import tempfile
 import warnings
 
 import hypothesis
+import imageio.v3 as iio
 import numpy as np
 import own_clip_test
 import own_test
@@ -24,7 +25,7 @@ from absl.testing import absltest, parameterized
 from dm_control import mjcf
 from hypothesis import strategies as st
 
-from trl_suite import characters, motion, policies, retargeting, terrain
+from trl_suite import characters, motion, policies, retargeting, sequences, terrain
 
 FAST = 30  # changed files of each format
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '2000'))
@@ -141,6 +142,32 @@ def ground(path):
     np.testing.assert_array_equal(np.isfinite(heights), True)
 
 
+def surface(path):
+    """Reads a mesh or a picture; its heights are finite."""
+    if path.suffix == '.png':
+        made = terrain.from_image(path, 0.5)
+    else:
+        made = terrain.from_mesh(path, 0.5)
+    heights = terrain.SpatialGround(made, 0).height(np.linspace(-5, 5, 50), 0.0)
+    np.testing.assert_array_equal(np.isfinite(heights), True)
+
+
+def result():
+    """The result of a sequence of two environments."""
+    scores, ids = (
+        [[0.5, 0.25], [0.25, 0.75]],
+        ['PD_Dog2D_Flat_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'],
+    )
+    found = {
+        'format': sequences.results.FORMAT, 'trl_suite': '0', 'learner': 'a:B', 'sequence': 'mine',
+        'ids': ids, 'budget': 9, 'episodes': 2, 'seed': 0, 'initial': [0.1, 0.2], 'scores': scores,
+        'samples': [[9, 0], [0, 9]], 'seconds': [1.0, 2.0],
+        'curves': 2 * [[None] * sequences.stage.POINTS],
+        'metrics': sequences.metrics(scores, [0.1, 0.2]),
+    }  # fmt: skip
+    return {**found, 'digest': sequences.results.digest(found)}
+
+
 def files(folder):
     """Valid files by format: their bytes, suffix, and how they are read."""
     figure = own_clip_test.Figure('biped3d_mocap', motion.load('biped3d_mocap_walk'), 4)
@@ -163,6 +190,11 @@ def files(folder):
         'Frames': [frame, [*frame[:1], 0.5, *frame[2:]]],
     }
     presets = pathlib.Path(terrain.__file__).parent
+    grid = np.add.outer(np.linspace(-0.2, 0.3, 9), np.linspace(0, 0.2, 8))
+    hill = terrain.SpatialGround(terrain.from_heights(grid, 0.5, 'hill'), 0)
+    for suffix in ('stl', 'obj', 'glb'):
+        terrain.save_mesh(hill, folder / f'hill.{suffix}', -1.4, 1.4)
+    iio.imwrite(folder / 'hill.png', (255 * grid).astype(np.uint8))
     planar = json.loads((presets / 'presets.json').read_text())['slopes_mixed']
     spatial = json.loads((presets / 'presets3d.json').read_text())['steps3d']
     return {
@@ -178,14 +210,19 @@ def files(folder):
         'clip': ((folder / 'walk.npz').read_bytes(), 'npz', clip),
         'steps': ((folder / 'steps.npz').read_bytes(), 'npz', motion.load_steps),
         'policy': ((folder / 'policy.npz').read_bytes(), 'npz', policy),
+        **{
+            suffix: ((folder / f'hill.{suffix}').read_bytes(), suffix, surface)
+            for suffix in ('stl', 'obj', 'glb', 'png')
+        },
+        'result': (json.dumps(result()).encode(), 'json', sequences.read),
         'planar': (json.dumps(planar).encode(), 'txt', ground),
         'spatial': (json.dumps(spatial).encode(), 'json', ground),
     }  # fmt: skip
 
 
 FORMATS = (
-    'mjcf', 'urdf', 'bvh', 'amc', 'asf', 'terrainrl', 'deepmimic', 'clip', 'steps', 'policy', 'planar',
-    'spatial',
+    'mjcf', 'urdf', 'bvh', 'amc', 'asf', 'terrainrl', 'deepmimic', 'clip', 'steps', 'policy', 'stl',
+    'obj', 'glb', 'png', 'result', 'planar', 'spatial',
 )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import zipfile
 import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
+from PIL import Image
 
 from trl_suite import motion, policies, rendering, retargeting, suite, terrain
 from trl_suite.vector import VectorEnvironment
@@ -83,6 +84,13 @@ class LimitsTest(parameterized.TestCase):
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         self.assertLess(most, 5e6)  # it was not read
+
+    def test_of_an_animated_picture_the_first_frame_is_read(self):
+        """The number of frames would be no bound of their size."""
+        low, high = (Image.fromarray(np.full((5, 5), grey, np.uint8)) for grey in (0, 255))
+        low.save(self.folder / 'a.png', save_all=True, append_images=[high, high])
+        ground = terrain.SpatialGround(terrain.from_image(self.folder / 'a.png', 0.1), 0)
+        self.assertEqual(float(ground.height(0, 0)), 0.0)
 
 
 if __name__ == '__main__':

@@ -356,6 +356,7 @@ class ReadingTest(FolderTest):
         ('name thorax', 'name root', "'name root': the name is taken"),
         ('\nend\n', '\nthorax to_thorax\nend\n', "'to_thorax' has a parent already"),
         ('\nend\n', '\nthorax tooth\nend\n', "unknown bone 'tooth'"),
+        ('root to_thorax', 'thorax to_thorax', "'thorax to_thorax': a bone whose parent is not"),
         ('\nend\n', '\nthorax root\nend\n', "'root' has a parent already"),
     )  # fmt: skip
     def test_bad_skeletons(self, before, after, message):

@@ -142,6 +142,25 @@ class CharacterTest(Folder):
         model = environment.physics.model
         self.assertEqual((model.neq, model.ntendon, model.nexclude), (1, 1, 1))
 
+    def test_unnamed_elements_beside_each_other(self):
+        """Their names differ from each other, and from those in the file."""
+        plain = '<body><geom size=".1" name="{}"/></body>'
+        hinged = '<body name="{}"><joint axis="0 1 0" range="-9 9"/><geom size=".1"/></body>'
+        bodies = (
+            plain.format('trunk_2') + plain.format('trunk_geom0') + hinged.format('trunk_1')
+            + hinged.format('hinged').replace('name="hinged"', '')
+            + hinged.format('left').replace('<joint', '<joint name="left_thigh"')
+            + hinged.format('right').replace('<joint', '<joint name="right"').replace('name="right"', '', 1)
+        )  # fmt: skip
+        text = MJCF.replace('<geom size=".15', f'{bodies}<geom size=".15')
+        spec = self.planar(text)
+        self.assertLen(spec.links, 11)
+        self.assertLen(set(spec.links), 11)
+        self.assertLen(spec.joints, 8)
+        environment = suite.build(spec, task='walk', task_kwargs={'random': 0})
+        environment.reset()
+        self.assertTrue(np.isfinite(environment.step(np.zeros(8)).reward))
+
     def test_given_joint_parameters_replace_those_of_the_file(self):
         mine = characters.Joint(kp=10, kd=1, weight=0.5)
         self.assertIs(self.planar(joints={'left_hip': mine}).joints['left_hip'], mine)
@@ -228,7 +247,11 @@ class CharacterTest(Folder):
         ('none', {'fall_links': ()}, 'expected a sequence of one name or more'),
         ('text', {'fall_links': 'trunk'}, 'expected a sequence'),
         ('figures', {'joints': {'left_hipp': None}}, "unknown joint 'left_hipp'; did you mean 'left_hip'"),
-        ('name', {'name': 'dog'}, "name is 'dog'; expected one without a slash"),
+        ('name', {'name': 'dog'}, "has a character named 'dog'"),
+        ('slash', {'name': 'a/b'}, "name is 'a/b'; expected a name without '/'"),
+        ('number', {'fall_links': 3}, 'fall links are 3; expected a sequence of one name or more'),
+        ('effectors', {'end_effectors': 3}, 'end effectors are 3; expected a sequence'),
+        ('exempt', {'stumble_exempt': 3}, 'stumble-exempt links are 3; expected a sequence'),
         ('no_name', {'name': ''}, "name is ''; expected a name, or None"),
         ('spatial', {'spatial': 'x'}, "spatial is 'x'; expected True or False or None"),
         ('short_turn', {'turn': (0, 0, 90)}, r'turn is \(0, 0, 90\); expected a quaternion wxyz'),
@@ -256,6 +279,9 @@ class CharacterTest(Folder):
             TypeError, r"joints\['left_hip'\] is 3; expected a characters.J"
         ):
             self.planar(joints={'left_hip': 3})
+        for joints in (3, ['left_hip']):
+            with self.assertRaisesRegex(TypeError, 'joints is .*; expected a dict of characters.J'):
+                self.planar(joints=joints)
         with self.assertRaisesRegex(TypeError, 'character is 3; expected a name, or what'):
             characters.make(3)
 
@@ -337,6 +363,9 @@ class CharacterTest(Folder):
         ('nan', 'name="left_knee" axis', 'name="left_knee" armature="nan" axis', 'armature="nan" of .left_knee. .<joint>.; expected finite'),
         ('infinity', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="0 0 inf"', 'line 1: pos="0 0 inf" of .trunk.'),
         ('empty', MJCF[MJCF.index('<worldbody>'):MJCF.index('</mujoco>')], '<worldbody/>', 'there is no body'),
+        ('copies', '<geom type="capsule"', '<replicate count="100"><replicate count="100"><geom size="1"/></replicate></replicate><geom type="capsule"', 'line [0-9]+: bodies, joints, geoms and sites are more than 10000'),
+        ('grid', '<geom type="capsule"', '<composite type="particle" count="99 99 99" spacing="1"/><geom type="capsule"', 'geoms and sites are more than 10000'),
+        ('many', '<geom type="capsule"', 10_001 * '<geom size="1"/>' + '<geom type="capsule"', 'geoms and sites are more than 10000'),
         ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
     )  # fmt: skip
     def test_invalid_files_are_rejected(self, before, after, message):

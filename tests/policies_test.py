@@ -571,6 +571,9 @@ class ReferenceTest(FolderTest):
         for id_ in (dog, 'plaid/dog_gaps'):
             self.assertEqual(suite.reference_policy(id_).id, dog)
             self.assertEqual(trl_suite.reference_policy(id_).id, dog)
+        for id_ in (3, None, [GAPS]):
+            with self.assertRaisesRegex(TypeError, 'the id of an environment is a string, not '):
+                policies.reference(id_)
         with self.assertRaisesRegex(FileNotFoundError, f'closest ids with a policy: {dog}, {GAPS}'):
             policies.reference('PD_Dog2D_Steps_Terrain-v0')
         with self.assertRaisesRegex(ValueError, "unknown environment 'x'"):

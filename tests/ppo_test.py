@@ -156,7 +156,7 @@ class RunTest(parameterized.TestCase):
 
     def test_two_runs_in_one_folder(self):
         with checkpoints.only_run(self.folder / 'run'):
-            message = f'process {os.getpid()} trains in this folder'
+            message = f'process {os.getpid()} trains in .*run; wait for it'
             with self.assertRaisesRegex(RuntimeError, message):
                 self.train('run')
         self.assertNotIn('checkpoint.pt', os.listdir(self.folder / 'run'))

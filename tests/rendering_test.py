@@ -4,6 +4,7 @@ import contextlib
 import io
 import itertools
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -18,7 +19,8 @@ from dm_control import mujoco as dm_mujoco
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.rendering import cameras, overlays
+from trl_suite.rendering import cameras, drawing, overlays
+from trl_suite.util import program
 
 GAPS = 'PD_Biped2D_Gaps_Terrain-v0'
 SMALL = {'height': 120, 'width': 160}
@@ -370,6 +372,23 @@ except OSError as error:
         self.assertLen(done.stdout.splitlines(), 1)
         self.assertEqual(path.read_text(), 'old')
         self.assert_only(name)
+
+    @parameterized.parameters(signal.SIGINT, signal.SIGTERM)
+    def test_a_signal_waits_for_the_context(self, number):
+        """Half of one would print a traceback when it is freed."""
+
+        class Physics:
+            made = False
+
+            @property
+            def contexts(self):
+                signal.raise_signal(number)
+                self.made = True
+
+        physics = Physics()
+        with self.assertRaises(KeyboardInterrupt), program.terminable():
+            drawing.check_gl(physics)
+        self.assertTrue(physics.made)
 
     def test_an_encoder_that_ends_says_why(self):
         with (

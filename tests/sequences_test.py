@@ -489,6 +489,11 @@ class CommandTest(cli_test.CommandTest):
             "unknown learner of the module my_learner: 'Nothin'; did you mean 'Nothing'",
             'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothin',
         )  # fmt: skip
+        for other in ('os:path', 'pathlib:Path'):
+            self.assert_refused(
+                f"--learner is '{other}', which has no train and policy; expected a class",
+                'sequences', 'run', 'plaid_biped', '--learner', other,
+            )  # fmt: skip
         self.assert_refused(
             "'my_learner'; expected module:Class",
             'sequences', 'run', 'plaid_biped', '--learner', 'my_learner',

@@ -386,6 +386,7 @@ class LoadTest(parameterized.TestCase):
         (lambda: suite.make(GAPS, {'randm': 3}), "unknown option.*'random'"),
         (lambda: suite.make(GAPS, {'actuation_model': 'torque'}), 'unknown option'),
         (lambda: suite.make(GAPS, None, {'flat': 1}), "unknown option.*'flat_observation'"),
+        (lambda: suite.make(GAPS, None, {'flat_observation': 'x'}), "flat_observation is 'x'; exp"),
         (lambda: suite.make('FSM_Dog2D_Terrain_Gap-v0'), "'FSM_Dog2D_Terrain_Gaps-v0'"),
         (lambda: suite.load('terrainrl', 'dog_gap'), "unknown task.*'dog_gaps'"),
         (lambda: suite.make('terrainrl/dog_gaps', {'start_phase': 0.5}), 'unknown option'),

@@ -405,6 +405,34 @@ class PartialBatchTest(parameterized.TestCase):
             environments.set_state(partial)
         self.assertEqual(pickle.dumps(environments.get_state()), before)
 
+    def test_entries_of_a_state_of_another_type_or_shape(self):
+        """The environment keeps its own state."""
+        environments = VectorEnvironment(FLAT, 2, 1, 0)
+        single = suite.make(FLAT, {'random': 0})
+        for each, names in (
+            (environments, ('world', 'task', 'random', 'seeds', 'steps', 'ended', 'fresh')),
+            (single, ('world', 'task', 'random', 'steps', 'reset_next_step')),
+        ):
+            each.reset()
+            state, before = each.get_state(), pickle.dumps(each.get_state())
+            for name in names:
+                for value in (
+                    None,
+                    3.5,
+                    'x',
+                    [],
+                    [1.5],
+                    ['x', 'y'],
+                    [[1], [2, 3]],
+                    np.ones((2, 3)),
+                ):
+                    with (
+                        self.subTest(name, value=value),
+                        self.assertRaisesRegex(ValueError, f"the state has .*'{name}'"),
+                    ):
+                        each.set_state({**state, name: value})
+                    self.assertEqual(pickle.dumps(each.get_state()), before)
+
     def test_options_that_are_arrays(self):
         options = [{'start_phase': np.array([[0.0, high]])} for high in (0.5, 0.5, 0.6)]
         one, same, other = (VectorEnvironment(FLAT, 2, 1, 0, task_kwargs=each) for each in options)
@@ -511,6 +539,19 @@ class RobustnessTest(parameterized.TestCase):
     def test_arguments_of_another_type(self, arguments, message):
         with self.assertRaisesRegex(TypeError, message):
             VectorEnvironment(**{'environment': FLAT, 'num_envs': 3, 'num_threads': 1, **arguments})
+
+    @parameterized.parameters(
+        ({'seed': [1.5, 2, 3]}, r'seed is \[1.5, 2, 3\]; expected an integer in'),
+        ({'seed': [True, False, True]}, r'seed is \[True.*; expected an integer in'),
+        ({'seed': [[1], [2, 3], 4]}, r'seed is .*; expected an integer in'),
+        ({'seed': [1, -2, 3]}, r'seed is .*; expected an integer in'),
+        ({'dtype': 'x'}, "dtype is 'x'; expected float64 or float32"),
+        ({'dtype': 3}, 'dtype is 3; expected float64 or float32'),
+        ({'flat_observation': 'x'}, "flat_observation is 'x'; expected True or False"),
+    )
+    def test_arguments_that_are_out_of_range(self, arguments, message):
+        with self.assertRaisesRegex(ValueError, message):
+            VectorEnvironment(FLAT, 3, 1, **arguments)
 
     @parameterized.parameters([[0.7]], [['a']], [[[0, 1]]], [[None]])
     def test_numbers_of_simulations_that_are_none(self, env_ids):

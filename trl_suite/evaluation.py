@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -21,8 +22,10 @@ from trl_suite.environments.vector import VectorEnvironment
 from trl_suite.policies import Policy
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.navigation.scripted import scripted
+from trl_suite.util import errors
 
 BatchPolicy = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, a)
+MOST_EPISODES = 1_000_000
 CHUNK = 256  # episodes that run in parallel
 PART = 64  # the same, for an executor: small enough to keep many nodes busy
 PROGRESS_DELAY = 2.0  # s before a progress bar appears
@@ -64,7 +67,7 @@ def evaluate(
       environment: id, alias, or `EnvSpec`.
       policy: observations (n, k) float64 -> actions (n, a) in [-1, 1]. n may differ between calls;
         actions of simulations whose episode has ended are ignored.
-      episodes: number of episodes.
+      episodes: number of episodes, at most `MOST_EPISODES`.
       seed: seed of the whole evaluation; or a sequence with one seed per episode.
       num_threads: threads that step the physics; 0 uses all cores, with an executor 1.
       task_kwargs: options of the task, as for `suite.load` (without seed and limits).
@@ -142,15 +145,15 @@ def evaluate_all(
 
 def _seeds(episodes: int, seed: int | Sequence[int]) -> list[int]:
     """Returns the seed of each episode."""
-    if int(episodes) != episodes or episodes < 1:
-        raise ValueError(f'episodes is {episodes}; expected a positive integer')
-    if isinstance(seed, Sequence):
-        seeds = list(map(int, seed))
-        if len(seeds) != episodes:
-            raise ValueError(f'{len(seeds)} seeds for {episodes} episodes')
-        return seeds
-    if int(seed) != seed or seed < 0:
-        raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
+    errors.check_whole('episodes', episodes, 1, MOST_EPISODES)
+    if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
+        if len(seed) != episodes:
+            raise ValueError(f'{len(seed)} seeds for {episodes} episodes')
+        for each in seed:
+            errors.check_whole('seed', each, 0, 2**32 - 1)
+        return list(map(int, seed))
+    if not isinstance(seed, numbers.Real) or seed % 1 or seed < 0:
+        raise ValueError(f'seed is {seed!r}; expected 0 or a positive integer')
     return np.random.SeedSequence(int(seed)).generate_state(int(episodes), np.uint32).tolist()
 
 

@@ -107,14 +107,16 @@ def from_file(
         errors.check_kind(option, value, kind)
     if name == '':
         raise ValueError("name is ''; expected a name, or None for that of the file")
+    if joints is not None and not isinstance(joints, Mapping):
+        raise TypeError(f'joints is {joints!r}; expected a dict of characters.Joint by name')
     rotation = _rotation(turn)
     file = existing(path, SUFFIXES)
     check_numbers(file)
     name = file.stem if name is None else name
-    if name in CHARACTERS or '/' in name:
-        raise ValueError(
-            f'name is {name!r}; expected one without a slash that no character of the suite has'
-        )
+    if '/' in name:
+        raise ValueError(f"name is {name!r}; expected a name without '/'")
+    if name in CHARACTERS:
+        raise ValueError(f'the suite has a character named {name!r}; pass another name=')
     spec = named(file)
     model = compiled(file, spec)
     number = find_root(file, model, root)
@@ -131,8 +133,8 @@ def from_file(
     found.check_names('end effector', end_effectors)
     found.check_posture(end_effectors)
     found.check_names('fall link', fall_links, solid=True)
-    exempt = tuple(end_effectors if stumble_exempt is None else stumble_exempt)
-    found.check_names('link exempt from stumbling', exempt)
+    exempt = end_effectors if stumble_exempt is None else stumble_exempt
+    found.check_names('stumble-exempt link', exempt)
     figures = found.figures()
     if left_out := found.left_out():
         found.notes.append(
@@ -151,7 +153,7 @@ def from_file(
         joints={**figures, **(joints or {})},
         fall_links=tuple(fall_links),
         end_effectors=tuple(end_effectors),
-        stumble_exempt=exempt,
+        stumble_exempt=tuple(exempt),
         description=description,
         path=str(file),
         spatial=found.spatial,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -200,7 +200,7 @@ class ModelInspector:
         return names
 
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
-        if isinstance(names, str) or not names:
+        if isinstance(names, (str, bytes)) or not isinstance(names, Collection) or not names:
             raise ValueError(f'{what}s are {names!r}; expected a sequence of one name or more')
         model = self.model
         touching = {model.body(i).name for i in model.geom_bodyid[self.geoms]}

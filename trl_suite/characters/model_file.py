@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import pathlib
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,6 +16,11 @@ from lxml import etree
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
+MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
+_PARTS = (
+    'body', 'joint', 'freejoint', 'geom', 'site', 'link', 'collision', 'composite', 'flexcomp',
+)  # fmt: skip
+_COPIES = ('replicate', 'composite', 'flexcomp')  # elements whose attribute 'count' multiplies
 # Kinds of elements, besides bodies, that need names because they are looked up later.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
@@ -31,27 +39,39 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
     spec.compiler.fusestatic = False  # bodies without joints may be end effectors
     for mesh in spec.meshes:
         mesh.file = _in_package(file, mesh.file)
-    for body in spec.bodies[1:]:
-        if not body.name:
-            body.name = body.joints[0].name if body.joints else ''
-        body.name = body.name or f'{body.parent.name}_{body.id}'
-        for kind, items in (('', body.joints), ('_geom', body.geoms)):
+    taken = {kind: {item.name for item in getattr(spec, kind)} for kind in ('bodies', *_NAMED)}
+    for number, body in enumerate(spec.bodies[1:], 1):
+        by_joint = body.joints[0].name if body.joints else ''
+        _name(body, by_joint or f'{body.parent.name}_{number}', taken['bodies'])
+        for kind, items in (('joints', body.joints), ('geoms', body.geoms)):
             for i, item in enumerate(items):
-                if not item.name:
-                    item.name = f'{body.name}{kind}{i if kind or len(items) > 1 else ""}'
+                word = '_geom' if kind == 'geoms' else ''
+                _name(item, f'{body.name}{word}{i if word or len(items) > 1 else ""}', taken[kind])
     for kind in _NAMED:
         for i, item in enumerate(getattr(spec, kind)):
-            item.name = item.name or f'unnamed_{kind}_{i}'
+            _name(item, f'unnamed_{kind}_{i}', taken[kind])
     for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
         if '/' in item.name:
             raise problem(file, f'the name {item.name!r} has a slash; expected a name without one')
     return spec
 
 
+def _name(item: Any, wanted: str, taken: set[str]) -> None:
+    """Gives an element that has no name one that no other has."""
+    if not item.name:
+        numbers = itertools.count(1)
+        name = wanted
+        while name in taken:
+            name = f'{wanted}_{next(numbers)}'
+        taken.add(name)
+        item.name = name
+
+
 def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
     """Raises an error for NaN, which MuJoCo treats as a missing value, and for infinity.
 
-    Models that load themselves are errors as well, since they would crash the process.
+    Refuses models that load themselves, too, which would crash the process, and those with so many
+    parts that MuJoCo would take all memory.
 
     Args:
       file: the file; files that it includes or loads are checked as well.
@@ -63,6 +83,7 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
         elements = [*etree.fromstring(file.read_bytes(), parser).iter(etree.Element)]
     except etree.XMLSyntaxError as error:
         raise problem(file, f'not a model: {error}') from None
+    _check_parts(file, elements)
     names = {element.get(key) for element in elements for key in ('name', 'class')}
     for element in elements:
         for key, text in element.items():
@@ -87,6 +108,26 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
             if inside.is_file():  # otherwise MuJoCo reports the missing file
                 check_numbers(inside, above)
                 break
+
+
+def _check_parts(file: pathlib.Path, elements: list[etree._Element]) -> None:
+    """Refuses more than `MOST_PARTS` parts, counting the copies that MuJoCo makes."""
+    total = 0
+    for element in elements:
+        if element.tag in _PARTS:
+            around = (element, *element.iterancestors(*_COPIES))
+            total += math.prod(_count(each) for each in around)
+            if total > MOST_PARTS:
+                raise problem(
+                    file, f'line {element.sourceline}: bodies, joints, geoms and sites are more than '
+                    f'{MOST_PARTS}; expected fewer',
+                )  # fmt: skip
+
+
+def _count(element: etree._Element) -> int:
+    """Returns how many copies an element makes."""
+    numbers = element.get('count', '') if element.tag in _COPIES else ''
+    return math.prod(int(number) for number in numbers.split() if number.isdecimal())
 
 
 def _finite(text: str) -> bool:

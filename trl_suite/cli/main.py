@@ -52,7 +52,12 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     """
     try:
         with program.terminable():
-            arguments = _parser(prog).parse_args(argv)
+            try:
+                arguments = _parser(prog).parse_args(argv)
+            except SystemExit:  # after --help and --version
+                if sys.stdout is not None:
+                    sys.stdout.flush()
+                raise
             if sys.stdout is None:
                 raise OSError('standard output is closed')
             command = engine.load(f'trl_suite.cli.{arguments.command}')

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     width, height = arguments.size
     in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))
     pictures: list[np.ndarray] = []
-    record = _Record(environment)
+    record = _Record(environment, arguments.trajectory is not None)
     with contextlib.ExitStack() as stack:
         video = arguments.video and stack.enter_context(rendering.Video(arguments.video))
 
@@ -105,21 +105,22 @@ def _run(
 
 
 class _Record:
-    """Data of a rollout: an entry per time step, and one per episode."""
+    """Data of a rollout: an entry per time step, if these are kept, and one per episode."""
 
-    def __init__(self, environment: Environment) -> None:
-        self._environment = environment
+    def __init__(self, environment: Environment, keep: bool) -> None:
+        self._environment, self._keep = environment, keep
         self._rows: list[tuple[Any, ...]] = []
         self._episodes: list[dict[str, Any]] = []
 
     def add(self, time_step: dm_env.TimeStep, action: np.ndarray) -> None:
         environment = self._environment
         first = time_step.first()
-        self._rows.append((
-            np.concatenate([np.ravel(part) for part in time_step.observation.values()]), action,
-            0.0 if first else time_step.reward, 1.0 if first else time_step.discount,
-            int(time_step.step_type), environment.physics.data.qpos.copy(),
-        ))  # fmt: skip
+        if self._keep:
+            self._rows.append((
+                np.concatenate([np.ravel(part) for part in time_step.observation.values()]), action,
+                0.0 if first else time_step.reward, 1.0 if first else time_step.discount,
+                int(time_step.step_type), environment.physics.data.qpos.copy(),
+            ))  # fmt: skip
         if first:
             self._episodes.append({'steps': 0, 'return': 0.0, 'distance': 0.0, 'end': 'unfinished'})
             return

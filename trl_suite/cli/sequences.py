@@ -69,4 +69,11 @@ def _learner(text: str) -> Any:
     if not hasattr(found, name):
         classes = [each for each in dir(found) if isinstance(getattr(found, each), type)]
         raise ValueError(errors.unknown(f'learner of the module {module}:', name, classes))
-    return getattr(found, name)
+    kind = getattr(found, name)
+    lacking = [method for method in ('train', 'policy') if not hasattr(kind, method)]
+    if not callable(kind) or lacking:
+        raise ValueError(
+            f'--learner is {text!r}, which has no {" and ".join(lacking) or "constructor"}; expected a '
+            'class with the methods train and policy'
+        )
+    return kind

@@ -143,6 +143,11 @@ class World:
             scratch = self._local.scratch = mujoco.MjData(self.models[0])
         mujoco.mj_setConst(self.models[env_id], scratch)
 
+    @property
+    def state_size(self) -> int:
+        """Size of the array that `get_state` returns."""
+        return int(mujoco.mj_stateSize(self.models[0], STATE))
+
     def get_state(self, env_id: int) -> np.ndarray:
         """Returns the full integration state of one simulation."""
         model = self.models[env_id]

@@ -77,3 +77,54 @@ def check_state(state: Any, owner: str, keys: Iterable[str]) -> None:
     missing = [key for key in keys if key not in state]
     if missing:
         raise ValueError(f'the state lacks {", ".join(map(repr, missing))}')
+
+
+def check_saved(name: str, value: Any, kinds: str, shape: tuple[int, ...]) -> None:
+    """Checks an entry of a saved state.
+
+    Args:
+      name: its key, for the message.
+      value: number, bool, or array.
+      kinds: the allowed kinds of its dtype.
+      shape: its shape.
+
+    Raises:
+      ValueError: it has another type or shape.
+    """
+    try:
+        found = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in kinds or found.shape != shape:
+        what = 'bool' if kinds == 'b' else 'whole numbers' if 'f' not in kinds else 'numbers'
+        raise ValueError(
+            f'the state has {name!r} of type {found.dtype} and shape {found.shape}; expected {what} '
+            f'of shape {shape}'
+        )
+
+
+def check_task(value: Any) -> None:
+    """Checks that the saved state of a task is a mapping.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"the state has 'task' of type {type(value).__name__}; expected a dict")
+
+
+def check_random(value: Any) -> None:
+    """Checks a saved random stream.
+
+    Raises:
+      ValueError: it is not what `numpy.random.RandomState.get_state` returns.
+    """
+    try:
+        _SCRATCH.set_state(value)
+    except (TypeError, ValueError, IndexError, KeyError) as error:
+        raise ValueError(
+            f"the state has 'random' that is no state of numpy.random.RandomState: {error}"
+        ) from None
+
+
+_SCRATCH = np.random.RandomState(0)

@@ -13,6 +13,7 @@ from dm_env import specs
 
 from trl_suite.environments import arguments
 from trl_suite.tasks.task import Task
+from trl_suite.util import errors
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
@@ -54,7 +55,8 @@ class Environment(composer.Environment):
           flat_observation: return all blocks as one vector, under the key 'observations'.
 
         Raises:
-          ValueError: a limit that is not positive, an invalid seed, or substep hooks.
+          ValueError: a limit that is not positive, an invalid seed, a `flat_observation` that is no
+            bool, or substep hooks.
           TypeError: a seed that is not an integer.
         """
         step_limit = arguments.check_step_limit(step_limit)
@@ -63,6 +65,7 @@ class Environment(composer.Environment):
             raise TypeError(f'random is {random!r}; expected a seed, an integer in [0, 2**32)')
         if isinstance(random, int) and not 0 <= random < 2**32:
             raise ValueError(f'random is {random}; expected a seed in [0, 2**32)')
+        errors.check_kind('flat_observation', flat_observation, bool)
         self._flat_observation = flat_observation
         self._step_limit = step_limit
         self._steps = 0
@@ -265,14 +268,21 @@ class Environment(composer.Environment):
 
         Raises:
           TypeError: the state is not a dict.
-          ValueError: the state belongs to another environment; this one is unchanged.
+          ValueError: the state belongs to another environment, or an entry has another type or
+            shape; this environment is unchanged. The contents of 'task' are not checked.
           RuntimeError: after `close`, or while another thread uses the environment.
         """
         with self.one_thread:
             self._check_open()
             arguments.check_state(state, self._task.signature, _STATE)
+            world = self._task.world
+            arguments.check_saved('world', state['world'], 'f', (world.state_size,))
+            arguments.check_saved('steps', state['steps'], 'iu', ())
+            arguments.check_saved('reset_next_step', state['reset_next_step'], 'b', ())
+            arguments.check_random(state['random'])
+            arguments.check_task(state['task'])
             self._task.set_state(0, state['task'])
-            self._task.world.set_state(0, state['world'])
+            world.set_state(0, state['world'])
             self._random_state.set_state(state['random'])
             self._steps = state['steps']
             self._reset_next_step = state['reset_next_step']

@@ -107,8 +107,13 @@ class VectorEnvironment:
         errors.check_whole('num_threads', num_threads, 0, MOST_THREADS, '; 0 uses all cores')
         if autoreset not in AUTORESET:
             raise ValueError(errors.unknown('autoreset', autoreset, AUTORESET))
-        if np.dtype(dtype) not in (np.dtype(np.float64), np.dtype(np.float32)):
-            raise ValueError(f'dtype is {np.dtype(dtype)}; expected float64 or float32')
+        try:
+            known = np.dtype(dtype) in (np.dtype(np.float64), np.dtype(np.float32))
+        except TypeError:
+            known = False
+        if not known:
+            raise ValueError(f'dtype is {dtype!r}; expected float64 or float32')
+        errors.check_kind('flat_observation', flat_observation, bool)
         self.spec = spec_of(environment)
         self.num_envs, self.autoreset, self.dtype = int(num_envs), autoreset, np.dtype(dtype)
         self.flat_observation = flat_observation
@@ -156,15 +161,11 @@ class VectorEnvironment:
         """
         with self._one_thread:
             self._check_usable()
-            if seed is None or np.ndim(seed) == 0:
+            if seed is None or isinstance(seed, str) or not np.iterable(seed):
                 sequence = _seed_sequence(seed)
                 seeds = sequence.generate_state(self.num_envs, np.uint32)
             else:
-                seeds = np.asarray(seed)
-                if seeds.shape != (self.num_envs,):
-                    raise ValueError(f'{seeds.size} seeds for {self.num_envs} simulations')
-                if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
-                    raise ValueError('seeds must be integers in [0, 2**32)')
+                seeds = _seeds(seed, self.num_envs)
             for env_id in self._numbers(env_ids).tolist():
                 self.seeds[env_id] = seeds[env_id]
                 self._random[env_id] = np.random.RandomState(int(seeds[env_id]))
@@ -334,7 +335,8 @@ class VectorEnvironment:
         Raises:
           TypeError: the state is not a dict.
           ValueError: the state belongs to another environment or has another number of
-            simulations, or `env_ids` is invalid; this environment is unchanged.
+            simulations, an entry has another type or shape, or `env_ids` is invalid; this
+            environment is unchanged. The contents of 'task' are not checked.
           RuntimeError: only some simulations are restored before the first reset.
         """
         with self._one_thread:
@@ -344,12 +346,21 @@ class VectorEnvironment:
                 raise RuntimeError('set_state of some simulations before the first reset')
             arguments.check_state(state, self._owner, _STATE)
             ids = self._ids(env_ids)
-            if len(state['world']) != len(ids):
-                raise ValueError(
-                    f'the state has {len(state["world"])} simulations; expected {len(ids)}'
-                )
+            for name in ('world', 'task', 'random'):
+                if not isinstance(state[name], Sequence) or len(state[name]) != len(ids):
+                    found = len(state[name]) if isinstance(state[name], Sequence) else 'no'
+                    raise ValueError(
+                        f'the state has {found} simulations in {name!r}; expected {len(ids)}'
+                    )
             if len(set(ids)) != len(ids):
                 raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
+            for name, kinds in (('seeds', 'iu'), ('steps', 'iu'), ('ended', 'b')):
+                arguments.check_saved(name, state[name], kinds, (len(ids),))
+            arguments.check_saved('fresh', state['fresh'], 'b', ())
+            for i in range(len(ids)):
+                arguments.check_saved('world', state['world'][i], 'f', (self._world.state_size,))
+                arguments.check_random(state['random'][i])
+                arguments.check_task(state['task'][i])
             for i, env_id in enumerate(ids):
                 self._task.set_state(env_id, state['task'][i])
                 self._world.set_state(env_id, state['world'][i])
@@ -493,3 +504,20 @@ def _seed_sequence(seed: Any) -> np.random.SeedSequence:
     if seed is not None and seed < 0:
         raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
     return np.random.SeedSequence(seed)
+
+
+def _seeds(seed: Sequence[int], num_envs: int) -> np.ndarray:
+    """Returns the given seeds of all simulations, (n,).
+
+    Raises:
+      ValueError: there are not n, or they are no integers in [0, 2**32).
+    """
+    try:
+        seeds = np.asarray(seed)
+    except ValueError:  # lists of different lengths
+        seeds = np.asarray(None)
+    if seeds.dtype.kind in 'iu' and seeds.shape != (num_envs,):
+        raise ValueError(f'seed has {seeds.size} seeds for {num_envs} simulations')
+    if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
+        raise ValueError(f'seed is {seed!r}; expected an integer in [0, 2**32) for each simulation')
+    return seeds

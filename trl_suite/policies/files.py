@@ -223,9 +223,12 @@ def reference(id: str) -> Policy:
       id: id of the environment; `suite.reference_policy` also accepts aliases.
 
     Raises:
+      TypeError: the id is not a string.
       FileNotFoundError: no policy is shipped for it; the message has the closest ids with a policy,
         or how to install the policies.
     """
+    if not isinstance(id, str):
+        raise TypeError(f'the id of an environment is a string, not {id!r}')
     shipped = available()
     if id not in shipped and resources.lacks_policies():
         raise FileNotFoundError(

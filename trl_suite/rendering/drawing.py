@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.util import errors
+from trl_suite.util import errors, interrupts
 
 if TYPE_CHECKING:  # plots of terrain need no engine
     from dm_control import composer
@@ -214,12 +214,13 @@ def check_gl(physics: Any) -> None:
             "rendered. Render there, or use multiprocessing's start method 'spawn'"
         )
     try:
-        _use_chosen_library()
-        _ = physics.contexts
+        with interrupts.postponed():  # half a context would print a traceback when it is freed
+            _use_chosen_library()
+            _ = physics.contexts
+            _drawn_by.add(process)
     # Errors depend on the library: RuntimeError, AttributeError, FatalError, GLError.
     except Exception as error:
         raise RuntimeError(no_gl(error)) from error
-    _drawn_by.add(process)
 
 
 def _use_chosen_library() -> None:

@@ -9,6 +9,7 @@ episode here, and the first body that moves need not be the character.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import socket
@@ -25,8 +26,10 @@ from trl_suite.arenas.scene import PARKED
 from trl_suite.rendering.overlays import Overlay
 from trl_suite.terrain import SPACING
 from trl_suite.terrain.planar.windows import PlanarWindows
+from trl_suite.util import errors
 from trl_suite.util.libraries import library
 
+PORTS, LAST_PORT = 1000, 65535  # number of ports tried; the largest port
 LIFT = 0.1  # fraction of a height difference by which the view moves per frame
 ROOM = 2000  # largest number of geoms of overlays and decoration
 TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
@@ -62,16 +65,34 @@ def start_server(host: str, port: int) -> Any:
 
     Raises:
       ImportError: the extra 'viewer' is not installed.
-      OSError: this machine cannot listen on the address.
+      OSError: nothing can listen on this address.
+      ValueError: no such port.
     """
     viser = load_viser()
-    with (
-        socket.socket() as probe
-    ):  # raises if the address is invalid, for which viser would wait forever
-        probe.bind((host, 0))
+    errors.check_whole('port', port, 0, LAST_PORT)
+    port = _free_port(host, int(port))  # where there is none, viser would wait forever
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host, port, verbose=False)
     return server
+
+
+def _free_port(host: str, port: int) -> int:
+    """Returns the first port that is free, at or after `port`; 0, any, if that is given.
+
+    Raises:
+      OSError: nothing can listen on this address.
+    """
+    last = min(port + PORTS - 1, LAST_PORT)
+    for number in range(port, last + 1):
+        try:
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, number))
+                return number
+        except OSError as error:
+            if number == last or error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise
+    return port
 
 
 def stop_server(server: Any) -> None:

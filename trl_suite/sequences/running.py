@@ -118,13 +118,14 @@ def run(
 
     Raises:
       ValueError: invalid arguments, a result with other settings, or a learner that cannot resume.
+      RuntimeError: another process writes this result.
       TypeError: the learner lacks a method.
       BudgetExceededError: the learner exceeds the budget; the result of the stage is not written.
       OSError: a file cannot be read or written.
     """
     sequence = get(sequence) if isinstance(sequence, str) else sequence
     errors.check_whole('budget', budget, 1, 2**53)
-    errors.check_whole('episodes', episodes, 1, 2**53)
+    errors.check_whole('episodes', episodes, 1, evaluation.MOST_EPISODES)
     errors.check_whole('seed', seed, 0, 2**53)
     stages = len(sequence) if stages is None else stages
     errors.check_whole('stages', stages, 1, len(sequence))
@@ -139,35 +140,38 @@ def run(
         'seed': int(seed), 'initial': [], **{name: [] for name in results.ROWS},
     }  # fmt: skip
     test = (episodes, seed, num_threads, executor)
-    if path.exists():
-        result = _resumed(path, result, learner)
-    else:
-        result['initial'] = scores(sequence, learner.policy(), *test)
-        _write(path, result)
-    done = len(result['scores'])
-    with tqdm.tqdm(
-        total=stages, initial=done, unit='stage', disable=None if progress else True
-    ) as bar:
-        for number in range(done, stages):
-            stage = Stage(sequence, number, int(budget), int(seed), num_threads)
-            bar.set_description(stage.id)
-            begin = time.perf_counter()
-            learner.train(stage)
-            stage.finish()
-            result['seconds'].append(round(time.perf_counter() - begin, 1))
-            result['samples'].append(stage.samples.tolist())
-            result['curves'].append(stage.curve())
-            result['scores'].append(scores(sequence, learner.policy(), *test))
-            if number == len(sequence) - 1:
-                result['metrics'] = metrics(result['scores'], result['initial'])
-            elif isinstance(learner, Resumable):
-                with _folder(_state(path, number + 1)) as folder:
-                    learner.save(folder)
-            # This completes the stage; the state of the one before is obsolete.
+    what = f'writes {path}; wait for it, or choose another path'
+    with files.locked(path.with_name(f'.{path.name}.lock'), what):
+        if path.exists():
+            result = _resumed(path, result, learner)
+        else:
+            result['initial'] = scores(sequence, learner.policy(), *test)
             _write(path, result)
-            shutil.rmtree(_state(path, number), ignore_errors=True)
-            bar.update()
-    return result
+        done = len(result['scores'])
+        with tqdm.tqdm(
+            total=stages, initial=done, unit='stage', disable=None if progress else True
+        ) as bar:
+            for number in range(done, stages):
+                stage = Stage(sequence, number, int(budget), int(seed), num_threads)
+                bar.set_description(stage.id)
+                begin = time.perf_counter()
+                learner.train(stage)
+                stage.finish()
+                result['seconds'].append(round(time.perf_counter() - begin, 1))
+                result['samples'].append(stage.samples.tolist())
+                result['curves'].append(stage.curve())
+                result['scores'].append(scores(sequence, learner.policy(), *test))
+                if number == len(sequence) - 1:
+                    result['metrics'] = metrics(result['scores'], result['initial'])
+                elif isinstance(learner, Resumable):
+                    with _folder(_state(path, number + 1)) as folder:
+                        learner.save(folder)
+                # This completes the stage; the states of those before are obsolete.
+                _write(path, result)
+                for earlier in range(number + 1):
+                    shutil.rmtree(_state(path, earlier), ignore_errors=True)
+                bar.update()
+        return result
 
 
 def _resumed(path: pathlib.Path, expected: dict[str, Any], learner: Learner) -> dict[str, Any]:
@@ -197,6 +201,8 @@ def _state(path: pathlib.Path, done: int) -> pathlib.Path:
 def _folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary folder that replaces `path` if no exception is raised."""
     part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    # A killed process with the same number, as in a restarted container, may have left one.
+    shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
         yield part

@@ -246,7 +246,7 @@ def from_image(
 
     Args:
       path: .png, of 8 or 16 bits per pixel, or another format that Pillow reads; of colour images
-        the mean of red, green and blue is used.
+        the mean of red, green and blue is used, and of animated ones the first frame.
       spacing: between pixels, m.
       low: height of black, m.
       high: height of white, m.
@@ -263,8 +263,9 @@ def from_image(
         raise ValueError(f'{file}: black is {low} m and white {high} m; expected two heights')
     imageio = library('imageio.v3', 'trl_suite[video]')
     try:
-        shape = imageio.improps(file, plugin='pillow').shape  # without reading pixels
-    except Exception as error:  # the reader raises its own types of exceptions
+        # Without reading pixels; an animated picture has several frames, which index 0 excludes.
+        shape = imageio.improps(file, plugin='pillow', index=0).shape
+    except Exception as error:  # of the reader's own kinds
         raise ValueError(f'{file}: not a picture that can be read ({error})') from None
     if len(shape) < 2 or math.prod(shape[:2]) > LARGEST:
         raise ValueError(
@@ -272,7 +273,7 @@ def from_image(
             f'{LARGEST:g} in all'
         )
     try:
-        pixels = np.asarray(imageio.imread(file, plugin='pillow'))
+        pixels = np.asarray(imageio.imread(file, plugin='pillow', index=0))
     except Exception as error:
         raise ValueError(f'{file}: not a picture that can be read ({error})') from None
     if not np.issubdtype(pixels.dtype, np.integer) and pixels.dtype != bool:

@@ -20,12 +20,14 @@ tuples of arrays are passed to them as packs, see `packed`.
 Numba is imported and a function is compiled when it is first called; the result is cached on disk.
 The cache is in `$NUMBA_CACHE_DIR`, or else in the user's cache folder, with one subfolder for each
 version of the package's sources, since Numba does not detect changes of functions in other modules.
-If no folder can be written, every process compiles the functions again. With `NUMBA_DISABLE_JIT=1`
+If no folder can be written, every process compiles the functions again; so it does where files of
+the cache are damaged. With `NUMBA_DISABLE_JIT=1`
 the same code runs as Python, for debugging.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import importlib.metadata
@@ -38,7 +40,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from trl_suite.util import interrupts
@@ -110,7 +111,7 @@ class Compiled:
             folder = folder / ('entries' if entry else 'rows')
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
             try:
-                return numba.njit(self.function, cache=True, **options)
+                return _forgiving(numba.njit(self.function, cache=True, **options))
             except RuntimeError:  # the function has no source file, e.g. in an interactive session
                 return numba.njit(self.function, **options)
             finally:
@@ -153,6 +154,41 @@ def packed(value: Any) -> Any:
     from trl_suite.util.pack import Pack
 
     return Pack(value)
+
+
+def _forgiving(function: Any) -> Any:
+    """Lets a function of Numba compile where its cache is damaged or cannot be written.
+
+    Numba would raise: `OSError` on a full disk, and errors of unpickling after a file was cut off.
+    """
+    cache = function._cache  # noqa: SLF001
+    load, save = cache.load_overload, cache.save_overload
+
+    def load_or_compile(*args: Any) -> Any:
+        try:
+            return load(*args)
+        except Exception:  # unpickling a damaged file raises many types of exceptions
+            with contextlib.suppress(OSError):
+                cache.flush()
+            return None
+
+    def save_if_possible(*args: Any) -> None:
+        try:
+            save(*args)
+        except OSError as error:
+            _warn_of_cache(str(error))
+
+    cache.load_overload, cache.save_overload = load_or_compile, save_if_possible
+    return function
+
+
+@functools.cache
+def _warn_of_cache(reason: str) -> None:
+    warnings.warn(
+        f'compiled code cannot be kept in {cache_folder()}, so every process compiles it again: '
+        f'{reason}',
+        stacklevel=2,
+    )
 
 
 _setting = threading.Lock()
@@ -239,7 +275,7 @@ class _Announcer:
         self.spent, self.told = 0.0, False
         self._lock = threading.Lock()
 
-    @contextmanager
+    @contextlib.contextmanager
     def compiling(self) -> Iterator[None]:
         """Adds up the time spent inside; prints a message when it exceeds `PATIENCE`."""
         timer = threading.Timer(max(PATIENCE - self.spent, 0.0), self._tell)

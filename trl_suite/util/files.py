@@ -14,6 +14,11 @@ from typing import Any
 
 import numpy as np
 
+try:
+    import fcntl
+except ImportError:  # Windows has none
+    fcntl = None  # type: ignore[assignment]
+
 Path = str | os.PathLike[str]
 LARGEST = 2**28  # bytes of a text, or of the arrays of an archive, 268 MB
 
@@ -147,6 +152,44 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
         raise
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(path: pathlib.Path, what: str) -> Iterator[None]:
+    """Holds a lock file that names this process; a process that ends in any way releases it.
+
+    Nothing is locked on systems without `fcntl`, such as Windows, and on file systems without locks.
+
+    Args:
+      path: the lock file; removed at the end.
+      what: what another process that has the lock does, for the message.
+
+    Raises:
+      RuntimeError: another process has the lock; the message has its number.
+      OSError: the file cannot be written.
+    """
+    if fcntl is None:
+        yield
+        return
+    while True:
+        with path.open('a+') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise RuntimeError(f'process {file.read().strip() or "?"} {what}') from None
+            except OSError:
+                pass  # the file system has no locks
+            if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
+                continue  # the process that had the lock has just removed this file
+            file.truncate(0)
+            file.write(f'{os.getpid()}\n')
+            file.flush()
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
 
 
 def write_json(content: Any, path: pathlib.Path) -> None:

@@ -1,4 +1,4 @@
-"""Postpones interrupts while Numba compiles.
+"""Postpones interrupts while Numba compiles, and within a block of code.
 
 Numba and LLVM call Python in callbacks of ctypes and of weak references. An interrupt that arrives in
 one of them is printed and lost, or leaves an LLVM module with two owners, which ends the process at
@@ -7,8 +7,10 @@ exit. Between two passes of the compiler an interrupt is safe.
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
@@ -38,8 +40,22 @@ def postpone_while_compiling() -> None:
         event.register(kind, Listener())
 
 
+@contextlib.contextmanager
+def postponed() -> Iterator[None]:
+    """Lets signals wait for the end of the block; in other threads than the main one nothing is changed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting = _Postponed()
+    waiting.enter()
+    try:
+        yield
+    finally:
+        waiting.leave()
+
+
 class _Postponed:
-    """The signals received since the last end of a compiler pass."""
+    """The signals received since the last end of a compiler pass, or since the begin of a block."""
 
     def __init__(self) -> None:
         self._depth = 0

@@ -73,7 +73,7 @@ class Browser:
           port: the first port to try, then the following ones.
 
         Raises:
-          ValueError: an unknown id or policy, or a policy that does not fit.
+          ValueError: an unknown id, policy or port, or a policy that does not fit.
           FileNotFoundError: there is no such file.
           ImportError: the extra 'viewer' is not installed.
           OSError: this machine cannot listen on the address.
