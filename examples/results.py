@@ -35,8 +35,7 @@ PLANS = (  # tag, title, text
         'Measured by `examples/evaluate_plans.py` in whole episodes of 200 s, seed 0, with the scripted '
         'and the reference policy. *Reward*: normalised cumulative reward, 0 after a fall. *Speed*: '
         'towards the goal (soccer: of the ball), m/s. *Trail*: median distance along the trail, m. *Ball '
-        'at goal*: share of the time. *2017*: the reward reported in the DeepLoco paper for its trained '
-        'policies, in another simulator (quoted from memory, not checked).',
+        'at goal*: share of the time.',
     ),
     (
         'flat_control',
@@ -48,21 +47,9 @@ PLANS = (  # tag, title, text
     ),
 )
 PLAN_COLUMNS = (
-    'environment', 'policy', 'episodes', 'reward', '2017', 'no fall in 60 s', 'no fall', 'speed',
+    'environment', 'policy', 'episodes', 'reward', 'no fall in 60 s', 'no fall', 'speed',
     'goals per minute', 'trail', 'ball at goal', 'falls per km',
 )  # fmt: skip
-PUBLISHED_REWARDS = {  # share of the maximum; Peng et al. 2017, quoted from memory
-    'PD_Biped3D_HLC_Soccer-v0': 0.77,
-    'PD_Biped3D_HLC_LargeBlocks-v0': 0.70,
-    'PD_Biped3D_HLC_DynamicsObstacles-v0': 0.18,
-    'PD_Biped3D_HLC_Forest-v0': 0.56,
-    'PD_Biped3D_HLC_PathFollowing-v0': 0.55,
-}
-PUBLISHED_DISTANCES = {  # m, mean; Peng, Berseth, van de Panne 2016, quoted from memory
-    'FSM_Dog2D_Terrain_Mixed-v0': 2094,
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0': 1364,
-    'FSM_Raptor2D_Terrain_Mixed-v0': 1111,
-}
 
 
 def load() -> dict[str, dict[str, Any]]:
@@ -142,13 +129,11 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
         own, default = (
             float(np.median(each['distances'])) for each in (run['evaluation'], stored[id_])
         )
-        published = PUBLISHED_DISTANCES.get(id_)
         low, high = run['evaluation']['distance_interval']
         rows.append([
             f'`{id_}`', f'{own:.1f}', f'{default:.1f}', f'{own / default:.1f}',
             f'{run["evaluation"]["distance"]:.1f} ({low:.1f} to {high:.1f})',
             f'{stored[id_]["distance"]:.1f}', f'{run["evaluation"]["speed"]:.2f}',
-            f'{published}' if published else '–',
             f'{run["curve"][-1]["samples"] / 1e3:.0f} k', str(run['seed']),
         ])  # fmt: skip
     return rows
@@ -164,7 +149,7 @@ def shared_rows() -> list[list[str]]:
         rows.append([
             f'`{id_}`', f'`{entry["policy"]}`', f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
             f'{own["median_distance"]:.0f}', f'{own["speed"]:.2f}', f'{before["distance"]:.0f}',
-            str(PUBLISHED_DISTANCES.get(id_, '–')), str(own['episodes']),
+            str(own['episodes']),
         ])  # fmt: skip
     return rows
 
@@ -206,7 +191,6 @@ def plan_rows(tag: str) -> list[list[str]]:
     return [
         [
             f'`{id_}`', name, str(found['episodes']), f'{found["reward"]:.2f}',
-            f'{PUBLISHED_REWARDS[id_]:.2f}' if name == 'reference' and id_ in PUBLISHED_REWARDS else '–',
             f'{found["survived_minute"]:.0%}', f'{found["survived"]:.0%}', f'{found["speed"]:.2f}',
             '–' if 'Soccer' in id_ else f'{found["goals_per_minute"]:.1f}',
             f'{found["trail"]:.0f}' if found['trail'] else '–',
@@ -272,9 +256,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which are truncated after '
             f'{terrainrl.STEP_LIMIT} cycles; the mean with its 95 % interval; speed in m/s. *Decisions*: with '
             '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
-            '`examples/learn_gaits.py`, simulated cycles. *2016*: the mean reported by Peng, Berseth and '
-            'van de Panne for about 10 million cycles, in another simulator (quoted from memory, not '
-            'checked).',
+            '`examples/learn_gaits.py`, simulated cycles.',
             table(
                 (
                     'environment',
@@ -284,7 +266,6 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'mean',
                     'default',
                     'speed',
-                    '2016',
                     'decisions',
                     'seed',
                 ),
@@ -305,7 +286,6 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'median',
                     'speed',
                     'before',
-                    '2016',
                     'episodes',
                 ),
                 rows,
