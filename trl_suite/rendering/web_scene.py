@@ -33,6 +33,7 @@ TILE = 1.0  # m; edge of the squares of the ground, by which speeds can be seen
 SHADES = (1.0, 0.88)  # of the squares
 PLANE = 60.0  # m; half side of what is drawn of a plane without end
 DEPTH = 1.0  # m; of planar ground below its lowest point
+STEP = 2.0**-9  # m; heights of height fields are multiples of it, so that they take less to send
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are not in use
 SECTIONS = 24  # of round shapes
 GAMMA = 2.2  # colours of batched meshes are linear ones, those of MuJoCo are not
@@ -366,7 +367,7 @@ def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
 
 
 def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
-    """Returns the surface of a height field in world coordinates."""
+    """Returns the surface of a height field in world coordinates, to `STEP` in height."""
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     start = int(model.hfield_adr[field])
@@ -380,6 +381,7 @@ def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
         [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
     )
     turned = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    turned[:, 2] = STEP * np.round(turned[:, 2] / STEP)
     return trimesh.Trimesh(turned.astype(np.float32), faces, process=False)
 
 
