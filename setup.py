@@ -85,7 +85,7 @@ setup(
         'torchrl': ['gymnasium>=1.1', 'torchrl>=0.13.3,<0.15', TORCH],
         'rllib': ['gymnasium>=1.1', f'ray[rllib]{RAY}', TORCH],
         'cluster': [f'ray{RAY}', 'fsspec'],
-        'shimmy': ['shimmy>=2.0,<3'],
+        'shimmy': ['shimmy[dm-control]>=2.0,<3'],
         'clips': [BVH],
         'train': [TORCH, 'scipy'],
         'tune': ['cma'],

@@ -63,6 +63,7 @@ napoleon_use_ivar = True  # the fields of a NamedTuple are listed once
 
 html_theme = 'furo'
 html_title = 'trl_suite'
+html_favicon = '_static/favicon.svg'
 html_static_path = ['_static']
 html_css_files = ['site.css']
 html_js_files = [('sortable.min.js', {'defer': ''}), ('tables.js', {'defer': ''})]

@@ -131,7 +131,7 @@ class SceneTest(parameterized.TestCase):
         mesh = web_scene._height_field(model, data, field)
         near = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(1) < 10]
         heights = environment.task.arena.height(near[None, :, 0], near[None, :, 1])[0]
-        np.testing.assert_allclose(near[:, 2], heights, atol=1e-5)
+        np.testing.assert_allclose(near[:, 2], heights, atol=0.5 * web_scene.STEP + 1e-5)
         self.assertGreater((mesh.face_normals[:, 2] > 0).mean(), 0.999)
 
     def test_ports(self):
@@ -182,8 +182,11 @@ class SceneTest(parameterized.TestCase):
 
 
 class ReplayTest(FolderTest):
-    @parameterized.parameters(DOG, GOAT, HILLS, SOCCER, BELTS)
-    def test_ten_seconds_take_no_more_than_3_mb(self, id_):
+    @parameterized.parameters(
+        (DOG, 0.2), (GOAT, 0.2), (HILLS, 1.0), (SOCCER, 0.2), (BELTS, 0.2)
+    )  # fmt: skip
+    def test_ten_seconds_take_no_more_than_3_mb(self, id_, largest):
+        """On hills with falls every second, each of which lays another height field."""
         environment = suite.make(id_, {'random': 1})
         random = np.random.default_rng(0)
         path = self.folder / 'replay.html'
@@ -199,7 +202,7 @@ class ReplayTest(FolderTest):
             time_step = environment.reset()
             while states < 300:
                 with rendering.watching(environment, add) as watched:
-                    action = random.uniform(-0.2, 0.2, environment.action_spec().shape)
+                    action = random.uniform(-largest, largest, environment.action_spec().shape)
                     time_step = environment.step(action)
                 if not watched or time_step.first():
                     add()

@@ -1,5 +1,7 @@
 """Moving pictures: what is in view, and the files."""
 
+from unittest import mock
+
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
@@ -75,6 +77,25 @@ class MovingTest(FolderTest):
             saved.seek(1)
             saved.load()
             self.assertEqual(saved.info['duration'], 67)
+
+    def test_another_seed_is_taken_where_that_of_a_scene_fails(self):
+        lasting = {1: 3, 2: 5, 4: 9}  # states of episodes; of seed 4 to the end
+
+        def take(environment, policy, seed, begin, seconds):
+            asked.append((seed, begin))
+            return moving.Shot([{}] * lasting.get(seed, 1), np.zeros((1, 3)), seed == 4)
+
+        for id_, first, begin in ((DOG, 1, 0.0), (FOREST, 2, 7.0)):
+            asked = []
+            with (
+                mock.patch.object(moving, 'SCENES', {FOREST: (2, 7.0)}),
+                mock.patch.object(moving, '_take', take),
+                mock.patch.object(moving, '_draw', lambda environment, shot, size: shot),
+            ):
+                shot = moving.moving_picture(id_)
+            self.assertEqual(asked[0], (first, begin))
+            self.assertEqual(asked[-1], (4, begin))
+            self.assertLen(shot.states, 9)
 
     def test_every_environment_has_one(self):
         paths = [item.path for item in gallery.moving_items()]

@@ -5,8 +5,10 @@ import importlib.util
 import json
 import pathlib
 import re
+import shlex
 import sys
 import types
+from unittest import mock
 
 import pytest
 from absl.testing import absltest, parameterized
@@ -130,6 +132,75 @@ class StoredTest(parameterized.TestCase):
                 preset = getattr(node.value, 'value', None)
                 if isinstance(preset, str):
                     terrain.load(preset)
+
+
+class PublishedTest(parameterized.TestCase):
+    """What the first cell installs, and the badges."""
+
+    def install(self, cell, folder, installed=False):
+        """Runs the first cell in a folder; returns what it asks pip for."""
+        asked = []
+        code = re.sub(r'%pip install --quiet (.*)', r'pip(packages)', cell)
+        code = re.sub(r'!apt-get.*', 'pass', code)
+        found = object() if installed else None
+        with (
+            mock.patch.object(pathlib.Path, 'cwd', return_value=folder),
+            mock.patch.object(importlib.util, 'find_spec', return_value=found),
+        ):
+            exec(code, {'pip': lambda packages: asked.extend(shlex.split(packages))})
+        return asked
+
+    @parameterized.parameters(*NAMES)
+    def test_first_cell(self, name):
+        cell = sources(read(name), 'code')[0]
+        elsewhere = pathlib.Path('/content')
+        self.assertEqual(self.install(cell, FOLDER, installed=True), [])
+        suite, policies = self.install(cell, FOLDER)
+        self.assertStartsWith(suite, f'{ROOT}[video')
+        self.assertEqual(policies, f'{ROOT}/trained')
+        (release,) = self.install(cell, elsewhere)
+        self.assertStartsWith(release, 'trl_suite[video')
+        self.assertEndsWith(release, 'policies]')
+        known = setup_extras()
+        self.assertLessEqual(set(release[len('trl_suite[') : -1].split(',')), known)
+
+    @parameterized.parameters(*NAMES)
+    def test_badges(self, name):
+        sys.path.insert(0, str(FOLDER))
+        self.addCleanup(sys.path.remove, str(FOLDER))
+        import badges
+
+        before = (FOLDER / f'{name}.ipynb').read_text(encoding='utf-8')
+        marked = badges.mark(before, 'someone/terrain', name, released=False)
+        notebook = json.loads(marked)
+        self.assertIn(
+            f'(https://colab.research.google.com/github/someone/terrain/blob/main/colab/{name}.ipynb)',
+            sources(notebook, 'markdown')[0],
+        )
+        cell = sources(notebook, 'code')[0]
+        suite, policies = self.install(cell, pathlib.Path('/content'))
+        self.assertEndsWith(suite, ' @ git+https://github.com/someone/terrain')
+        self.assertEqual(
+            policies,
+            'trl_suite_policies @ git+https://github.com/someone/terrain#subdirectory=trained',
+        )
+        released = badges.mark(marked, 'someone/terrain', name, released=True)
+        self.assertLen(self.install(sources(json.loads(released), 'code')[0], ROOT / 'x' / 'y'), 1)
+        self.assertEqual(badges.mark(released, 'someone/terrain', name, released=False), marked)
+
+    def test_links(self):
+        sys.path.insert(0, str(FOLDER))
+        self.addCleanup(sys.path.remove, str(FOLDER))
+        import badges
+
+        linked = badges.link((FOLDER / 'README.md').read_text(encoding='utf-8'), 'some/one')
+        self.assertEqual(linked.count('[Colab](https://colab'), len(NAMES))
+        self.assertEqual(badges.link(linked, 'some/one'), linked)
+
+
+def setup_extras():
+    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    return set(re.findall(r"^        '(\w+)': \[", text, re.MULTILINE))
 
 
 class RunTest(parameterized.TestCase):

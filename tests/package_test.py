@@ -43,6 +43,11 @@ class PinTest(absltest.TestCase):
         self.assertIn("'mujoco>=3.17,<4'", required)
         self.assertIn("'dm-control>=1.0.50'", required)
 
+    def test_the_extra_shimmy_installs_what_shimmy_imports(self):
+        # Without Shimmy's own extra, `import shimmy` raises for want of imageio.
+        setup = (CHECKOUT / 'setup.py').read_text(encoding='utf-8')
+        self.assertIn("'shimmy': ['shimmy[dm-control]", setup)
+
     def test_the_distributions_have_one_version(self):
         policies = tomllib.loads((CHECKOUT / 'trained' / 'pyproject.toml').read_text('utf-8'))
         self.assertEqual(policies['project']['version'], trl_suite.__version__)

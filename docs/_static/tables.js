@@ -67,6 +67,19 @@ function makeFilters(tables) {
   update();
 }
 
+// Names of ids and modules are longer than a narrow screen is wide: they may break between their parts.
+function makeBreakable(element) {
+  const walker = document.createTreeWalker(element, NodeFilter.SHOW_TEXT);
+  const nodes = [];
+  while (walker.nextNode()) nodes.push(walker.currentNode);
+  nodes.forEach((node) => {
+    const parts = node.data.split(/(?<=\w[_.])(?=\w)|(?<=[a-z])(?=[A-Z])/);
+    node.replaceWith(...parts.flatMap((part, i) => (i ? [document.createElement('wbr'), part] : [part])));
+  });
+}
+
+document.querySelectorAll('article h1, article td :is(a, code), article td:first-child')
+  .forEach(makeBreakable);
 const tables = [...document.querySelectorAll('article table')].filter((table) => table.tHead);
 tables.forEach(makeSortable);
 const index = tables.filter((table) => {

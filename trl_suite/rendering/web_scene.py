@@ -36,6 +36,7 @@ TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
 SHADES = (1.0, 0.88)  # brightness of the squares
 PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
 DEPTH = 1.0  # m; thickness of planar ground below its lowest point
+STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
 SECTIONS = 24  # number of faces around a cylinder or cone
 GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
@@ -385,7 +386,7 @@ def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
 
 
 def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
-    """Returns the surface of a height field in world coordinates."""
+    """Returns the surface of a height field in world coordinates, to `STEP` in height."""
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     start = int(model.hfield_adr[field])
@@ -399,6 +400,7 @@ def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
         [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
     )
     turned = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+    turned[:, 2] = STEP * np.round(turned[:, 2] / STEP)
     return trimesh.Trimesh(turned.astype(np.float32), faces, process=False)
 
 
