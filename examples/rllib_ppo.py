@@ -14,8 +14,10 @@ import math
 from gymnasium import VectorizeMode
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.rllib.core.rl_module.apis import TargetNetworkAPI
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
+from trl_suite.adapters.ray import connect
 from trl_suite.util.program import begin_script
 
 STEPS = 32  # steps of every simulation between updates
@@ -27,12 +29,15 @@ NOISE = (
 def on_runners(algorithm, id_, runners=2, num_envs=32, seed=0):
     """Returns an `AlgorithmConfig` whose runners step `num_envs` simulations on one core each."""
 
+    def set_noise(learner, **_):
+        policy = learner.module['default_policy']
+        policy.pi.log_std.data.fill_(math.log(NOISE))
+        if isinstance(policy, TargetNetworkAPI):  # of APPO; copies made before
+            for network, target in policy.get_target_network_pairs():
+                target.load_state_dict(network.state_dict())
+
     def less_noise(algorithm, **_):
-        algorithm.learner_group.foreach_learner(
-            lambda learner, **_: learner.module['default_policy'].pi.log_std.data.fill_(
-                math.log(NOISE)
-            )
-        )
+        algorithm.learner_group.foreach_learner(set_noise)
         algorithm.env_runner_group.sync_weights(
             from_worker_or_learner_group=algorithm.learner_group, inference_only=True
         )
@@ -68,13 +73,15 @@ def main(configuration, description):
     parser.add_argument('--runners', type=int, default=2, help='at most the number of cores')
     parser.add_argument('--updates', type=int, default=50)
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--address', help="of Ray: 'auto', or HOST:PORT; default: this machine's")
     arguments = parser.parse_args()
+    connect(arguments.address)
     algorithm = configuration(
         arguments.environment, arguments.runners, seed=arguments.seed
     ).build_algo()
     for _ in range(arguments.updates):
         found = algorithm.train()['env_runners']
-        # APPO's first report may come before the first samples.
+        # A report of APPO may come between two samples.
         steps = found.get('num_env_steps_sampled_lifetime', 0)
         mean = found.get('episode_return_mean', math.nan)
         print(f'{steps:8.0f} steps, return {mean:5.1f}', flush=True)

@@ -20,6 +20,7 @@ from ray import tune
 from ray.tune import schedulers
 from ray.tune.search.basic_variant import BasicVariantGenerator
 
+from trl_suite.adapters.ray import connect
 from trl_suite.util.program import begin_script
 
 SPACE = {
@@ -61,7 +62,7 @@ def main(words=None):
     parser.add_argument('--address', help="of Ray: 'auto', or HOST:PORT")
     chosen = parser.parse_args(words)
     if not ray.is_initialized():
-        ray.init(chosen.address, log_to_driver=False, logging_level='ERROR')
+        connect(chosen.address)
     search = BasicVariantGenerator(random_state=chosen.seed)
     halving = schedulers.ASHAScheduler(
         'samples', SCORE, 'max', max_t=int(chosen.samples), reduction_factor=2,

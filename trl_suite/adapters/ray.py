@@ -12,7 +12,9 @@
 
 from __future__ import annotations
 
+import os
 import platform
+import socket
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -21,11 +23,41 @@ from trl_suite.util import compiled
 
 try:
     import ray
+    from ray._private import services
 except ImportError as error:
     message = f"trl_suite.adapters.ray needs an extra ({error}): pip install 'trl_suite[cluster]'"
     raise ImportError(message) from None
 
 RETRIES = 10  # of a task whose process or node was lost
+PATIENCE = 10.0  # s to wait for an answer of a cluster; Ray itself waits for many minutes
+
+
+def connect(address: str | None = None) -> None:
+    """Connects this process to a cluster of Ray, or starts Ray on this machine.
+
+    Args:
+      address: 'auto' for the cluster that this machine belongs to, or 'HOST:PORT' of its first
+        node; 'local' starts Ray on this machine. None: the cluster of this machine or of
+        `$RAY_ADDRESS` if there is one, otherwise 'local'.
+
+    Raises:
+      ConnectionError: there is no cluster at this address.
+      ray.exceptions.AuthenticationError: the cluster has a token, and this machine has not.
+    """
+    if not (address or os.environ.get('RAY_ADDRESS', '')).startswith('ray://'):
+        found = services.canonicalize_bootstrap_address(address)  # HOST:PORT; None for 'local'
+        try:
+            if found is not None:
+                host, _, port = found.rpartition(':')
+                socket.create_connection((host.strip('[]'), int(port)), PATIENCE).close()
+        except OSError as error:
+            if address is not None or os.environ.get('RAY_ADDRESS'):
+                raise ConnectionError(
+                    f'no cluster of Ray answers at {found} ({error}); `ray start --head` on its first '
+                    'machine starts one'
+                ) from error
+            address = 'local'  # that cluster has ended without `ray stop`
+    ray.init(address, log_to_driver=False, logging_level='ERROR')
 
 
 class RayExecutor:
@@ -43,9 +75,7 @@ class RayExecutor:
         """Connects to a cluster, unless this process is connected to one.
 
         Args:
-          address: 'auto' for the cluster that this machine belongs to, or 'HOST:PORT' of its first
-            node; 'local' starts Ray on this machine. None: the cluster of this machine or of
-            `$RAY_ADDRESS` if there is one, otherwise 'local'.
+          address: of the cluster, as for `connect`.
           num_cpus: cores that a task needs.
           memory: memory that a task needs, bytes.
           retries: how often a task is started again after the loss of its process or node.
@@ -53,10 +83,11 @@ class RayExecutor:
 
         Raises:
           ConnectionError: there is no cluster at this address.
+          ray.exceptions.AuthenticationError: the cluster has a token, and this machine has not.
         """
         self._begun = not ray.is_initialized()
         if self._begun:
-            ray.init(address, log_to_driver=False, logging_level='ERROR')
+            connect(address)
         needed = {'CPU': num_cpus, 'memory': memory}
         if not any(
             all(node['Resources'].get(name, 0) >= number for name, number in needed.items())
