@@ -6,6 +6,7 @@
     trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy reference --html dog.html
     trl-suite view PD_Dog2D_Gaps_Terrain-v0 --browser
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
+    trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --option randomize=robot --option sensors=mild
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite try robot.urdf --spatial
@@ -25,6 +26,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import json
 import os
 import pathlib
 import re
@@ -108,6 +110,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
             help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped one',
         )  # fmt: skip
 
+    def add_options(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            '--option', type=_option, action='append', metavar='NAME=JSON', dest='options',
+            help="option of the task, as randomize=robot or 'sensors={\"noise\": 0.01}'; may be repeated",
+        )  # fmt: skip
+
     command = add('list', 'list the environments of the catalogue')
     for name in FILTERS:
         command.add_argument(f'--{name}', help=f'only those of one {name}')
@@ -121,6 +129,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
     command.add_argument('--steps', type=_positive, default=256, help='control steps')
     add_policy(command, 'random')
+    add_options(command)
     command.add_argument('--video', type=pathlib.Path, metavar='FILE', help='an .mp4 or .gif')
     command.add_argument(
         '--html', type=pathlib.Path, metavar='FILE', help='an .html replay, seen from all sides'
@@ -139,6 +148,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that exists',
     )  # fmt: skip
     command.add_argument('--seed', type=int, default=0, help='of the environment and the policy')
+    add_options(command)
     command.add_argument(
         '--browser', action='store_true',
         help="serve web browsers, with many controls; without it, F1 shows dm_control's keys",
@@ -149,6 +159,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command = add('evaluate', 'run a policy for whole episodes, and summarise them')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     add_policy(command, 'reference')
+    add_options(command)
     command.add_argument('--episodes', type=_positive, default=50, help='how many')
     command.add_argument('--seed', type=int, default=0, help='of all episodes')
     command.add_argument('--threads', type=int, default=0, help='of the physics; 0: all cores')
@@ -271,6 +282,19 @@ def _positive(text: str) -> int:
         if int(text) > 0:
             return int(text)
     raise argparse.ArgumentTypeError(f'{text!r} is not a positive integer')
+
+
+def _option(text: str) -> tuple[str, object]:
+    """Returns name and value of an option; a value that is not JSON is a string."""
+    name, equals, value = text.partition('=')
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'{text!r} is not NAME=JSON, such as randomize=robot')
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        if value[:1] in ('{', '[', '"'):
+            raise argparse.ArgumentTypeError(f'the value of {text!r} is not JSON') from None
+        return name, value
 
 
 def _policy_name(text: str) -> str:

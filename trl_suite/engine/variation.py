@@ -18,8 +18,6 @@ from trl_suite.engine.world import World
 
 # Fields of `Properties` that change masses, so that derived quantities must be recomputed.
 HEAVY = ('mass', 'link_mass', 'inertia', 'com_offset')
-# Fields of MjModel.stat that are only for rendering; mj_setConst overwrites them.
-_SHOWN = ('extent', 'center', 'meansize')
 
 
 class Properties(NamedTuple):
@@ -124,13 +122,11 @@ class Variation:
         model.body_mass[self._links] = self._mass * factor
         model.body_inertia[self._links] = self._inertia * (factor * own.inertia[env_id])[:, None]
         model.body_ipos[self._links[0]] = self._centre + own.com_offset[env_id]
-        shown = {name: np.copy(getattr(model.stat, name)) for name in _SHOWN}
         self._world.set_const(env_id)
-        for name, value in shown.items():
-            if np.ndim(value):
-                getattr(model.stat, name)[:] = value
-            else:
-                setattr(model.stat, name, float(value))
+        # Not recomputed by mj_setConst; the tolerance of the solver is relative to it. Summed in
+        # the order of the compiler.
+        model.stat.meaninertia = np.cumsum(model.dof_M0)[-1] / model.nv
+        model.stat.meanmass = np.cumsum(model.body_mass[1:])[-1] / (model.nbody - 1)
         if self._constants is not None:
             self._constants(model)
 

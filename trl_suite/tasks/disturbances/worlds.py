@@ -231,7 +231,7 @@ def draw(
     """
     for name in Properties._fields:
         array = getattr(properties, name)
-        share = random.random(array.shape[1:] or None)
+        share: Any = random.random(array.shape[1:] or None)
         given = getattr(config, name)
         if name == 'com_offset':
             if given is not None:
