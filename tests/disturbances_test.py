@@ -416,6 +416,11 @@ class SensorTest(parameterized.TestCase):
                 break
         self.assertGreater(k, delay)
 
+    def test_delays_of_presets_are_for_steps_of_a_thirtieth_of_a_second(self):
+        for id_, depth in ((PLANAR, 3), (GAIT, 0), (PLAN, 0)):
+            environment = made(id_, sensors='robot')
+            self.assertEqual(environment.task._sensor_state.history.shape[1], depth)
+
     def test_delay_of_an_episode_is_drawn(self):
         environments = VectorEnvironment(
             PLANAR, 256, 1, 0, task_kwargs={'sensors': {'delay': {'terrain': (1, 3)}}}

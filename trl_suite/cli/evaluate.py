@@ -25,7 +25,8 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.threads, options, factory=baseline is not None, progress=True,
     )  # fmt: skip
     if arguments.json is not None:
-        files.write_json({**result, 'policy': arguments.policy, 'options': options}, arguments.json)
+        given = {'options': dict(arguments.options)} if arguments.options else {}
+        files.write_json({**result, 'policy': arguments.policy, **given}, arguments.json)
     interval, distances = result['return_interval'], result['distance_interval']
     lines = (
         ('policy', arguments.policy),

@@ -55,8 +55,8 @@ class SensorConfig(Config):
     )  # fmt: skip
     delay: Any = option(
         0,
-        'age of what is observed, in steps of the environment; a pair of bounds: drawn for each episode and '
-        'block',
+        'age of what is observed, in steps of the environment (in gaits, cycles); a pair of bounds: drawn '
+        'for each episode and block',
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -120,6 +120,18 @@ def configure(value: Any) -> SensorConfig | None:
       ValueError: unknown names, or values out of range.
     """
     return preset_and_options('sensors', value, SensorConfig, PRESETS)
+
+
+def fitting(config: SensorConfig, long_steps: bool) -> SensorConfig:
+    """Returns options without the delay of a preset, if steps are gait cycles or footsteps.
+
+    The delays of presets are meant for steps of 1/30 s. An explicit delay counts steps, however
+    long they are.
+    """
+    preset = PRESETS.get(config.preset or '', {})
+    if long_steps and config.delay == preset.get('delay'):
+        return dataclasses.replace(config, delay=0)
+    return config
 
 
 class SensorState(NamedTuple):
@@ -211,7 +223,7 @@ def check(config: SensorConfig, blocks: Mapping[str, slice]) -> None:
     preset = PRESETS.get(config.preset or '', {})
     for name in ('noise', 'bias', 'delay'):
         given = getattr(config, name)
-        if given is preset.get(name) or not isinstance(given, Mapping):
+        if given == preset.get(name) or not isinstance(given, Mapping):
             continue
         for block in given:
             if block not in blocks:

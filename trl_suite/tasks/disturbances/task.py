@@ -54,6 +54,9 @@ class Disturbed(Task):
         Raises:
           ValueError: options that the task cannot have.
         """
+        if sensor is not None:
+            # Tasks whose steps last longer than 1/30 s have a callback within steps.
+            sensor = sensors.fitting(sensor, hasattr(task, 'watch'))
         self.task, self._world_config, self._sensor_config = task, world, sensor
         self._push: PushConfig | None = world.push if world is not None else None
         if world is not None:
