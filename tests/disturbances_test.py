@@ -186,6 +186,15 @@ class WorldTest(parameterized.TestCase):
                 getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-12, err_msg=name
             )
         self.assertAlmostEqual(found.stat.meaninertia, expected.stat.meaninertia, places=9)
+        # Bounding volumes are in the inertial frame, which com_offset moves.
+        root = links(environment)[0]
+        start, count = found.body_bvhadr[root], found.body_bvhnum[root]
+        self.assertGreater(count, 0)
+        np.testing.assert_allclose(
+            found.bvh_aabb[start : start + count],
+            expected.bvh_aabb[start : start + count],
+            atol=1e-9,
+        )
         solid = (found.geom_contype | found.geom_conaffinity) != 0
         np.testing.assert_allclose(found.geom_friction[solid], expected.geom_friction[solid])
 
@@ -539,6 +548,17 @@ class IdentityTest(parameterized.TestCase):
                 np.testing.assert_array_equal(getattr(b, name), value, name)
         np.testing.assert_array_equal(b.opt.gravity, a.opt.gravity)
         self.assertEqual(b.stat.meaninertia, a.stat.meaninertia)
+
+    @parameterized.parameters(PLANAR, PLAN)
+    def test_hooks_of_composer_change_nothing(self, id_):
+        options = {'randomize': EVERY, 'sensors': MEASURED}
+        plain, hooked = made(id_, **options), made(id_, **options)
+        hooked.add_extra_hook('before_step', lambda physics, action, random_state: None)
+        plain.reset(), hooked.reset()
+        for _ in range(4):
+            a, b = plain.step(zeros(plain)), hooked.step(zeros(hooked))
+            np.testing.assert_array_equal(observed(a), observed(b))
+            np.testing.assert_array_equal(plain.info['impulse'], hooked.info['impulse'])
 
     def test_copied_simulations_continue_alike(self):
         options = {'randomize': EVERY, 'sensors': MEASURED}

@@ -191,7 +191,7 @@ def preset_and_options(
             f'{name} is {value!r}; expected {", ".join(map(repr, presets))}, or a dict of options'
         )
     preset = value.get('preset')
-    if preset is not None and preset not in presets:
+    if preset is not None and (not isinstance(preset, str) or preset not in presets):
         raise ValueError(errors.unknown(f'preset of {name}', preset, presets))
     options = {**({} if preset is None else presets[preset]), **value}
     return config.of(name, options) if options else None
