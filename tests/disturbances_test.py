@@ -1,19 +1,27 @@
 """Tests of trl_suite.tasks.disturbances: worlds that vary, pushes, sensors."""
 
+import contextlib
 import copy
+import io
+import json
+import pathlib
 import pickle
+import runpy
+import sys
+from unittest import mock
 
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
-from helpers import advance, assert_goes_on, assert_rows_are_singles, assert_uniform
+from helpers import FolderTest, advance, assert_goes_on, assert_rows_are_singles, assert_uniform
 
 from trl_suite import suite
 from trl_suite.engine import PhysicsWorld, light_model, variation
 from trl_suite.tasks.disturbances import Disturbed, sensors, worlds
 from trl_suite.vector import VectorEnvironment
 
+ROOT = pathlib.Path(__file__).resolve().parents[1]
 PLANAR, TERRAIN3D = 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0'
 GAIT, STEPS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_LLC_General_Step-v0'
 PLAN, MOVERS = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_HLC_DynamicsObstacles-v0'
@@ -689,6 +697,46 @@ class ExtremeTest(parameterized.TestCase):
             self.assertTrue(np.isfinite(observed(time_step)).all())
             self.assertTrue(np.isfinite(environment.info['clean_observation']).all())
             self.assertTrue(np.isfinite(time_step.reward or 0.0))
+
+
+class ProgramsTest(FolderTest):
+    """The example, and the program that evaluates policies under disturbances."""
+
+    def test_example(self):
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            runpy.run_path(str(ROOT / 'examples/randomized_worlds.py'), run_name='example')[
+                'main'
+            ]()
+        self.assertRegex(out.getvalue(), r'friction 0\.4 to 0\.8: \d+ steps on average')
+
+    def test_robustness(self):
+        sys.path.insert(0, str(ROOT / 'benchmarks'))
+        self.addCleanup(sys.path.remove, str(ROOT / 'benchmarks'))
+        import robustness
+
+        ids, path = ['PD_Biped2D_Flat-v0', PLANAR], self.folder / 'found.json'
+        strong = (
+            'push',
+            'm/s',
+            False,
+            [('9', {'randomize': {'push': {'speed': 9, 'interval': 0}}})],
+        )
+        ground = ('terrain_dropout', '', True, [('0.5', {'sensors': {'terrain_dropout': 0.5}})])
+        self.enterContext(mock.patch.object(robustness, 'DISTURBANCES', [strong, ground]))
+        self.enterContext(mock.patch.object(robustness, 'IDS', ids))
+        found = robustness.run(ids, 2, 0, 1, 40, path)
+        self.assertEqual(json.loads(path.read_text()), found)
+        flat, gaps = (found['rows'][id_] for id_ in ids)
+        self.assertLess(flat['push: 9']['return'], 0.8 * flat['none']['return'])
+        self.assertNotIn('terrain_dropout: 0.5', flat)
+        self.assertIn('terrain_dropout: 0.5', gaps)
+        with mock.patch.object(robustness.evaluation, 'evaluate', side_effect=AssertionError):
+            self.assertEqual(robustness.run(ids, 2, 0, 1, 40, path), found)  # nothing is left
+        with self.assertRaisesRegex(ValueError, 'other settings'):
+            robustness.run(ids, 3, 0, 1, 40, path)
+        share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
+        self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
 
 
 if __name__ == '__main__':
