@@ -21,12 +21,13 @@ from typing import Any
 
 from trl_suite import characters, describe, policies, suite, terrain
 from trl_suite.actuation.muscles import MUSCLES
-from trl_suite.describe import common
+from trl_suite.describe import common, options
 from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.terrain import checks
+from trl_suite.tasks.disturbances import sensors, worlds
 from trl_suite.util import files, resources
 from trl_suite.viewing import gallery
 
@@ -61,6 +62,8 @@ SOLVED = '<!-- solved, written by docs/generate.py -->', '<!-- /solved -->'
 MACHINE = (  # that of benchmarks/vector_environment.json
     'two cores of a shared virtual machine (x86-64, Python 3.11, MuJoCo 3.17), otherwise idle'
 )
+# A page with tables of options and of costs between such comments.
+REALISM = 'realism_worlds.md'
 FIRST_LINES = 'Made by `python docs/generate.py`; do not edit.'
 
 
@@ -91,6 +94,7 @@ def pages() -> dict[str, str]:
     found['terrains/README.md'] = terrain_index()
     found['speed.md'] = speed_page()
     found['leaderboard.md'] = leaderboard()
+    found[REALISM] = realism()
     found[README] = readme()
     return found
 
@@ -145,6 +149,7 @@ def home() -> str:
                 ('[Clients](clients.md)', 'Gymnasium, Stable-Baselines3, TorchRL, RLlib, Shimmy'),
                 ('[Multi-task and continual learning](continual_learning.md)', 'sequences, forgetting'),
                 ('[Clusters](cluster.md)', 'Ray: evaluation, sequences and training on several machines'),
+                (f'[Worlds and sensors]({REALISM})', 'randomized worlds, pushes, noise, and what they do to policies'),
                 ('[Reliability](reliability.md)', 'guarantees, threads, untrusted files, random tests'),
                 ('[Results](results.md)', 'evaluation of the shipped policies'),
                 ('[Comparison with the papers](findings.md)', 'claims of the papers, and results obtained here'),
@@ -504,6 +509,43 @@ PROJECTED = '1024 simulations, 2 threads'
 def speeds() -> dict[str, Any]:
     path = DOCS.parent / 'benchmarks' / 'vector_environment.json'
     return json.loads(path.read_text(encoding='utf-8'))
+
+
+def realism() -> str:
+    """Returns the page on worlds and sensors with its tables."""
+    configs = {
+        'randomize': worlds.WorldConfig, 'push': worlds.PushConfig, 'sensors': sensors.SensorConfig,
+    }  # fmt: skip
+    tables_ = {
+        f'options of {name}': describe.markdown([options.table_of(config)])
+        for name, config in configs.items()
+    }
+    tables_['cost'] = cost()
+    text = (DOCS / REALISM).read_text(encoding='utf-8')
+    for name, written in tables_.items():
+        start, end = f'<!-- {name}, written by docs/generate.py -->', f'<!-- /{name} -->'
+        before, _, rest = text.partition(start)
+        text = f'{before}{start}\n{written}\n{end}{rest.partition(end)[2]}'
+    return text
+
+
+def cost() -> str:
+    """Returns what worlds and sensors cost, from benchmarks/disturbances.json."""
+    path = DOCS.parent / 'benchmarks/disturbances.json'
+    if not path.exists():
+        return ''
+    found = json.loads(path.read_text())
+    ids = list(found)
+    cells = [
+        (name, *(f'{found[id_][name][what]:.0f}' for id_ in ids for what in ('step', 'reset')))
+        for name in found[ids[0]]
+    ]
+    titles = [f'`{id_}`: {what} (µs)' for id_ in ids for what in ('step', 'reset')]
+    return (
+        'CPU time of one simulation on one thread, with actions of zero, measured by `python '
+        'benchmarks/disturbances.py` on a shared virtual machine that was busy; the smallest of the repeats:\n\n'
+        + table(('options', *titles), cells)
+    )
 
 
 def readme() -> str:

@@ -313,7 +313,8 @@ class InfoTest(CommandTest):
         ):  # fmt: skip
             self.assertRegex(out, rf'\n  {name} +{weight}  exp\(-')
         self.assertRegex(out, r'within 0\.5 m of the goal and within 2 m of\s+the walker')
-        self.assertNotRegex(out, r'\n  (speed|upright) ')
+        reward = out.partition('\nReward')[2].partition('\nTermination')[0]
+        self.assertNotRegex(reward, r'\n  (speed|upright) ')
 
     def test_an_alias_gives_the_same_text(self):
         self.assertEqual(self.output('info', 'plaid/biped_gaps'), self.output('info', GAPS))
@@ -412,6 +413,13 @@ class InfoTest(CommandTest):
                 out = info(id_).split('\nDifferences')[1]
                 self.assertEqual({v for k, v in differences.items() if k in out}, expected)
 
+    def test_options_of_worlds_and_sensors(self):
+        out = info(GAPS)
+        for name in ('Options of randomize', 'friction', 'slope_direction', 'interval'):
+            self.assertIn(name, out)
+        for name in ('Options of sensors', 'terrain_dropout', "sensors='robot'"):
+            self.assertIn(name, out)
+
     def test_unknown_ids_suggest_the_closest(self):
         self.assert_refused("did you mean 'PD_Biped2D_Gaps_Terrain-v0'", 'info', GAPS[:-1])
         self.assert_refused("did you mean 'plaid/dog_gaps'", 'info', 'plaid/dog_gap')
@@ -466,6 +474,18 @@ class RolloutTest(CommandTest):
         for i, length in enumerate(lengths[: rollout.SHOWN_EPISODES], 1):
             end = 'unfinished' if i == episodes and t['step_types'][-1] != 2 else 'fell'
             self.assertRegex(out, rf'\n +{i} +{length} +[\d.]+ +-?[\d.]+ +{end}\n')
+
+    def test_options_of_the_task(self):
+        self.output(
+            'rollout', GAPS, '--seed', '3', '--steps', '2', '--trajectory', 'a.npz', '--option',
+            'randomize=harsh', '--option', 'sensors={"noise": 0.1}',
+        )  # fmt: skip
+        options = {'random': 3, 'randomize': 'harsh', 'sensors': {'noise': 0.1}}
+        first = suite.make(GAPS, options, {'flat_observation': True}).reset()
+        with np.load('a.npz') as data:
+            np.testing.assert_array_equal(
+                data['observations'][0], first.observation['observations']
+            )
 
     def test_a_truncated_episode(self):
         def short(id_, task_kwargs):
@@ -586,6 +606,9 @@ class RolloutTest(CommandTest):
         (r'random is -1; expected a seed in \[0', GAPS, '--seed', '-1'),
         ('required: ID', '--seed', '1'),
         ('unrecognized arguments: --sped 2', GAPS, '--sped', '2'),
+        ("'randomize' is not NAME=JSON, such as randomize=robot", GAPS, '--option', 'randomize'),
+        ('is not JSON', GAPS, '--option', 'sensors={"noise": 0.1'),
+        ("did you mean 'randomize'", GAPS, '--option', 'randomise=robot'),
     )  # fmt: skip
     def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'rollout', *arguments)

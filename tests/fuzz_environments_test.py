@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from trl_suite import suite
 from trl_suite.registry import catalogue
 from trl_suite.registry.task_types import TASK_TYPES
+from trl_suite.tasks.disturbances import sensors, worlds
 from trl_suite.vector import VectorEnvironment
 
 SLOW = int(os.environ.get('FUZZ_EXAMPLES', '200'))
@@ -117,6 +118,47 @@ def option_test(task_type, step):
     @hypothesis.given(st.sampled_from(names), anything)
     def test(name, value):
         check_option(task_type, name, value, step)
+
+    return test
+
+
+def _world(name, value):
+    return {name: value, **({'slope': 0.1} if name == 'slope_direction' else {})}
+
+
+def _push(name, value):
+    return {'push': {**({} if name == 'speed' else {'force': 1.0}), name: value}}
+
+
+def _sensor(name, value):
+    return {name: value}
+
+
+DISTURBANCES = [  # option of the task, option in it, and a function that makes its value
+    (kind, option.name, make)
+    for kind, config, make in (
+        ('randomize', worlds.WorldConfig, _world), ('randomize', worlds.PushConfig, _push),
+        ('sensors', sensors.SensorConfig, _sensor),
+    )
+    for option in config.options()
+]  # fmt: skip
+
+
+def disturbance_test(id_):
+    """An option of worlds, pushes or sensors is refused by its name, or the environment works."""
+
+    @hypothesis.given(st.sampled_from(DISTURBANCES), anything)
+    def test(chosen, value):
+        kind, name, make = chosen
+        try:
+            environment = suite.make(id_, {'random': 0, kind: make(name, value)})
+        except REFUSALS as error:
+            assert name in str(error), f'{kind}, {name}={value!r}: {error}'
+            return
+        environment.reset()
+        time_step = environment.step(np.zeros(len(environment.action_map)))
+        assert np.isfinite(flat(time_step)).all() and np.isfinite(time_step.reward)
+        environment.close()
 
     return test
 
@@ -271,6 +313,9 @@ class FastTest(parameterized.TestCase):
     def test_options(self, task_type):
         many(option_test(task_type, False), 100)
 
+    def test_worlds_and_sensors(self):
+        many(disturbance_test(GAPS), 40)
+
     def test_arguments(self):
         many(argument_test(GAPS), 40)
 
@@ -287,6 +332,10 @@ class SlowTest(parameterized.TestCase):
     @parameterized.parameters(*TASK_TYPES)
     def test_options(self, task_type):
         drawn(option_test(task_type, True), SLOW)
+
+    @parameterized.parameters(*IDS)
+    def test_worlds_and_sensors(self, id_):
+        drawn(disturbance_test(id_), SLOW)
 
     @parameterized.parameters(*IDS)
     def test_arguments(self, id_):

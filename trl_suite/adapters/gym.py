@@ -282,10 +282,15 @@ def action_space(shape: tuple[int, ...], dtype: Any) -> spaces.Box:
 
 
 def flat(info: Info) -> Info:
-    """Returns info without nested dicts, which few programs support: 'reward_NAME' for each term."""
-    rest = {name: value for name, value in info.items() if name != 'reward_terms'}
-    terms = info.get('reward_terms', {})
-    return {**rest, **{f'reward_{name}': value for name, value in terms.items()}}
+    """Returns info without nested dicts, which few programs support.
+
+    The entries are 'reward_NAME' for each term, and 'world_NAME' for each property of the world.
+    """
+    rest = {name: value for name, value in info.items() if not isinstance(value, dict)}
+    for group in ('reward_terms', 'world'):
+        prefix = group.removesuffix('_terms')
+        rest |= {f'{prefix}_{name}': value for name, value in info.get(group, {}).items()}
+    return rest
 
 
 def unlimited(environment: str, **options: Any) -> SuiteEnv:

@@ -138,7 +138,7 @@ class SpatialArena(composer.Arena):
         own[self._dof] = False
         self._own = np.flatnonzero(own)
         for model in world.models:
-            self._set_inertia(model)
+            self.set_inertia(model)
         placed = [*self.boxes[:1], *self.belts[:1], *(body.geom[0] for body in self.movers)]
         placed += [geom for geom in (self.plane, self.field) if geom is not None]
         geoms = world.geom_ids([geom.full_identifier for geom in placed])
@@ -328,7 +328,8 @@ class SpatialArena(composer.Arena):
         model.body_pos[self._bodies], model.geom_size[self._mover_geoms] = position, size
         self._world.qvel[env_id, self._dof] = around.direction[env_id] * around.speed[env_id]
 
-    def _set_inertia(self, model: mujoco.MjModel) -> None:
+    def set_inertia(self, model: mujoco.MjModel) -> None:
+        """Leaves moving boxes out of the mean inertia; necessary after every `mj_setConst`."""
         if len(self._dof) and len(self._own):
             model.stat.meaninertia = model.dof_M0[self._own].mean()
 

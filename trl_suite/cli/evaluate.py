@@ -17,13 +17,16 @@ def run(arguments: argparse.Namespace) -> None:
     from trl_suite import evaluation
 
     baseline = evaluation.BASELINES.get(arguments.policy)
-    limits = {} if arguments.step_limit is None else {'step_limit': arguments.step_limit}
+    options = dict(arguments.options or ())
+    if arguments.step_limit is not None:
+        options['step_limit'] = arguments.step_limit
     result = evaluation.evaluate(
         spec, baseline or acting.trained(arguments.policy, spec.id), arguments.episodes, arguments.seed,
-        arguments.threads, limits, factory=baseline is not None, progress=True,
+        arguments.threads, options, factory=baseline is not None, progress=True,
     )  # fmt: skip
     if arguments.json is not None:
-        files.write_json({**result, 'policy': arguments.policy}, arguments.json)
+        given = {'options': dict(arguments.options)} if arguments.options else {}
+        files.write_json({**result, 'policy': arguments.policy, **given}, arguments.json)
     interval, distances = result['return_interval'], result['distance_interval']
     lines = (
         ('policy', arguments.policy),

@@ -6,6 +6,7 @@
     trl-suite rollout PD_Dog2D_Gaps_Terrain-v0 --policy reference --html dog.html
     trl-suite view PD_Dog2D_Gaps_Terrain-v0 --browser
     trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --policy clip --episodes 100
+    trl-suite evaluate PD_Dog2D_Gaps_Terrain-v0 --option randomize=robot --option sensors=mild
     trl-suite terrain slopes_mixed --output slopes.png
     trl-suite clip walk.bvh --character biped2d_full --cycle --output walk.npz
     trl-suite try robot.urdf --spatial
@@ -25,6 +26,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import json
 import os
 import pathlib
 import re
@@ -111,6 +113,12 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         command.add_argument(
             '--policy', default=default, type=_policy_name, metavar='POLICY',
             help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped policy',
+        )  # fmt: skip
+
+    def add_options(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            '--option', type=_option, action='append', metavar='NAME=JSON', dest='options',
+            help="option of the task, as randomize=robot or 'sensors={\"noise\": 0.01}'; may be repeated",
         )  # fmt: skip
 
     command = add('list', 'list the environments of the catalogue')
@@ -330,6 +338,19 @@ def _positive(text: str) -> int:
         if int(text) > 0:
             return int(text)
     raise argparse.ArgumentTypeError(f'{text!r} is not a positive integer')
+
+
+def _option(text: str) -> tuple[str, object]:
+    """Returns name and value of an option; a value that is not JSON is a string."""
+    name, equals, value = text.partition('=')
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'{text!r} is not NAME=JSON, such as randomize=robot')
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        if value[:1] in ('{', '[', '"'):
+            raise argparse.ArgumentTypeError(f'the value of {text!r} is not JSON') from None
+        return name, value
 
 
 def _policy_name(text: str) -> str:

@@ -34,7 +34,8 @@ def run(arguments: argparse.Namespace) -> None:
         if path is not None:  # checked before the rollout
             files.check_path(path, suffixes)
     suite = engine.load()
-    environment = suite.make(arguments.id, {'random': arguments.seed})
+    options = dict(arguments.options or ())
+    environment = suite.make(arguments.id, {**options, 'random': arguments.seed})
     policy = acting.policy(arguments.policy, environment, arguments.id, arguments.seed)
     width, height = arguments.size
     in_strip = set(rendering.spread(arguments.steps + 1, arguments.columns))

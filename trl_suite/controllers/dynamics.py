@@ -141,7 +141,7 @@ def com_speed(i: int, skeleton: Skeleton, M: np.ndarray, qvel: np.ndarray) -> fl
         entry = skeleton.entry[0, k]
         if entry >= 0:
             momentum += M[i, entry] * qvel[i, skeleton.dof[k]]
-    return momentum / skeleton.mass
+    return momentum / M[i, skeleton.entry[0, 0]]  # the current total mass
 
 
 @compiled_inline

@@ -37,6 +37,8 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     for title, parts_ in parts(spec, environment):
         yield title, tables.text(parts_)
+    for title, parts_ in options.disturbances():
+        yield title, tables.text(parts_)
     yield (
         'Differences from the original (reasons in docs/differences.md)',
         '\n'.join(f'  - {text}' for text in differences_of(spec)),

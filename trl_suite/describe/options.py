@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
+from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.util.options import Config
 from trl_suite.util.tables import Section, Table, section
 
 _EVERYWHERE = (
@@ -17,6 +19,20 @@ _EVERYWHERE = (
         '-',
         '',
         'custom functions; see docs/make_your_own.md',
+    ),
+    (
+        'randomize',
+        '-',
+        '',
+        "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a dict, see "
+        'docs/realism.md',
+    ),
+    (
+        'sensors',
+        '-',
+        '',
+        "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
+        'docs/realism.md',
     ),
     ('random', '-', '', 'seed; by default drawn from the operating system'),
     ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
@@ -33,6 +49,43 @@ def options(spec: EnvSpec) -> Section:
     cells += _EVERYWHERE
     cells.append(('step_limit', spec.step_limit, '', 'steps after which an episode is truncated'))
     return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
+
+
+def disturbances() -> Iterator[Section]:
+    """Yields the options of worlds, pushes and sensors, which are the same for all environments."""
+    yield section(
+        'Options of randomize',
+        'Each is a number, or two bounds between which it is drawn at the start of an episode.',
+        table_of(worlds.WorldConfig),
+        'Options of push, in randomize:',
+        table_of(worlds.PushConfig),
+        _presets('randomize', worlds.PRESETS),
+    )
+    yield section(
+        'Options of sensors',
+        table_of(sensors.SensorConfig),
+        _presets('sensors', sensors.PRESETS),
+    )
+
+
+def table_of(config: type[Config]) -> Table:
+    """Returns a table of the options of a config, with their bounds."""
+    cells = []
+    for field in dataclasses.fields(config):
+        data, limits = field.metadata, []
+        for key, bound in data['bounds'].items():
+            if bound is not None:
+                limits.append(f'{key.replace("_", " ")} {bound:.4g}')
+        cells.append(
+            (field.name, _shown(field.default), data['unit'], ', '.join(limits), data['meaning'])
+        )
+    return Table(('option', 'default', 'unit', 'bounds', 'meaning'), cells)
+
+
+def _presets(option: str, presets: Mapping[str, Any]) -> str:
+    """Returns the presets of an option as a list."""
+    lines = [f'- {option}={name!r}: {dict(values)}' for name, values in presets.items()]
+    return '\n'.join(lines)
 
 
 def _shown(value: Any) -> str:

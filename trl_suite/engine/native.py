@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from trl_suite.engine import pushes
 from trl_suite.util.compiled import Compiled, compiled, compiled_loop
 
 # Functions of type void f(const mjModel*, mjData*), in the order of `Engine.functions`.
@@ -20,6 +21,8 @@ _PATTERNS = ('libmujoco.so*', 'libmujoco*.dylib', 'mujoco.dll')
 _TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 # The warnings of bad position, velocity and acceleration have consecutive numbers.
 _BAD = (int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+_NUMBER = 8  # bytes
+_FORCE_STRIDE = 6 * _NUMBER  # of `xfrc_applied`, which has force and torque of each body
 _WARNING_STRIDE = 8  # bytes; mjWarningStat has two ints, the second of which is the counter
 
 
@@ -37,6 +40,7 @@ class Engine(NamedTuple):
       time: simulated time, (n,) s.
       steps: physics steps since the world was made, (n,).
       timestep: duration of a physics step, s.
+      pushes: forces that act while the simulations are advanced.
     """
 
     functions: np.ndarray
@@ -50,6 +54,7 @@ class Engine(NamedTuple):
     time: np.ndarray
     steps: np.ndarray
     timestep: float
+    pushes: pushes.Pushes
 
 
 @functools.cache
@@ -196,6 +201,9 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     """
     model, data = engine.models[i], engine.data[i]
     write(i, engine)
+    pushed = pushes.advance(i, engine.time[i], nstep * engine.timestep, engine.pushes)
+    if pushed:
+        begin_push(i, engine.pushes)
     call(engine.functions[STEP2], model, data)
     for _ in range(nstep - 1):
         call(engine.functions[STEP], model, data)
@@ -203,7 +211,26 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     for _ in range(nstep):  # one addition per step, for the same rounding as in MuJoCo
         engine.time[i] += engine.timestep
     engine.steps[i] += nstep
+    if pushed:
+        end_push(i, engine.pushes)
     read(i, engine)
+
+
+@compiled
+def begin_push(i: int, given: pushes.Pushes) -> None:
+    """Adds the force in `scratch[i, 3:]` to the forces on the body."""
+    force, place = given.forces[i] + _FORCE_STRIDE * given.body[0], given.places[i]
+    _copy_numbers(place, force, 3)
+    for k in range(3):
+        given.scratch[i, 3 + k] += given.scratch[i, k]
+    _copy_numbers(force, place + 3 * _NUMBER, 3)
+
+
+@compiled
+def end_push(i: int, given: pushes.Pushes) -> None:
+    """Restores the forces on the body, bit for bit."""
+    force = given.forces[i] + _FORCE_STRIDE * given.body[0]
+    _copy_numbers(force, given.places[i], 3)
 
 
 @compiled

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from trl_suite.engine import native
+from trl_suite.engine import native, pushes
 from trl_suite.util.compiled import packed
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
@@ -116,6 +116,7 @@ class World:
             time=np.zeros(self.n),
             steps=np.zeros(self.n, int),
             timestep=models[0].opt.timestep,
+            pushes=pushes.no_pushes(np.array([_address(each.xfrc_applied) for each in data])),
         )
         self.pack = packed(self.engine)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from trl_suite.tasks.components.footstep_plan import SIDE
 from trl_suite.tasks.composed import Composed
+from trl_suite.tasks.disturbances import Disturbed
 from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import PLAN_NAMES
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
@@ -50,7 +51,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
       ValueError: the task is not a high-level one, or has the interface 'frame'.
     """
     task = environments.task
-    if isinstance(task, Composed):
+    while isinstance(task, (Composed, Disturbed)):
         task = task.task
     if not isinstance(task, HierarchicalNavigation):
         raise ValueError(

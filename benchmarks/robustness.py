@@ -1,0 +1,197 @@
+"""Evaluates the shipped policies under each disturbance of world and sensors at three strengths.
+
+    python benchmarks/robustness.py [IDS ...] [--episodes 32] [--seed 0] [--threads 1]
+        [--json benchmarks/robustness.json] [--page docs/realism_worlds.md]
+
+Every cell has the same seeds, so that terrain and start of an episode are the same with and without
+the disturbance. The JSON file is written after every cell, and an unfinished run is resumed. The
+table of the page has the return divided by that without disturbance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import pathlib
+import re
+from typing import Any
+
+import numpy as np
+import tqdm
+
+from trl_suite import evaluation, policies
+from trl_suite.registry import catalogue
+from trl_suite.tasks.disturbances import sensors
+from trl_suite.util import files
+from trl_suite.util.program import begin_script
+
+IDS = (
+    'PD_Biped2D_LLC_Imitate_Flat-v0', 'MTU_Raptor2D_LLC_Imitate_Flat-v0',
+    'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'PD_Raptor2D_Steps_Terrain-v0',
+    'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0',
+    'PD_Biped3D_LLC_General_Step-v0', 'PD_Biped3D_HLC_Forest-v0',
+    'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Gaps-v0',
+)  # fmt: skip
+LEVELS = ('mild', 'robot', 'harsh')
+
+
+def _worlds(name: str, *values: Any) -> list[tuple[str, dict[str, Any]]]:
+    return [(_text(value), {'randomize': {name: value}}) for value in values]
+
+
+def _sensors(name: str, *values: Any, ground: bool = False) -> list[tuple[str, dict[str, Any]]]:
+    options = [{'terrain': value} if ground else value for value in values]
+    return [
+        (_text(value), {'sensors': {name: option}})
+        for value, option in zip(values, options, strict=True)
+    ]
+
+
+def _text(value: Any) -> str:
+    return ' to '.join(f'{each:g}' for each in np.ravel(value))
+
+
+# Disturbances: name, unit, whether the ground must be observed, and three strengths with options.
+DISTURBANCES: list[tuple[str, str, bool, list[tuple[str, dict[str, Any]]]]] = [
+    ('`randomize` preset', '', False, [(name, {'randomize': name}) for name in LEVELS]),
+    ('`sensors` preset', '', False, [(name, {'sensors': name}) for name in LEVELS]),
+    ('friction', '', False, _worlds('friction', 0.6, 0.4, 0.2)),
+    ('mass', 'factor', False, _worlds('mass', 1.1, 1.3, 1.6)),
+    ('link_mass', 'factor', False, _worlds('link_mass', (0.9, 1.1), (0.75, 1.25), (0.5, 1.5))),
+    ('com_offset', 'm', False, _worlds('com_offset', 0.02, 0.05, 0.1)),
+    ('damping', 'factor', False, _worlds('damping', 2.0, 4.0, 8.0)),
+    ('gravity', 'm/s²', False, _worlds('gravity', 10.8, 12.8, 15.8)),
+    ('slope', 'rad', False, _worlds('slope', (-0.03, 0.03), (-0.1, 0.1), (-0.2, 0.2))),
+    (
+        'push, every 2 s for 0.2 s', 'm/s', False,
+        [(f'{speed:g}', {'randomize': {'push': {'speed': speed, 'interval': 2.0}}}) for speed in (0.2, 0.5, 1.0)],
+    ),
+    (
+        'noise', 'of the preset', False,
+        [(name, {'sensors': {'preset': name, 'bias': 0.0, 'delay': 0, 'terrain_dropout': sensors.PRESETS[name]['terrain_dropout'], 'noise': sensors.PRESETS[name]['noise']}}) for name in LEVELS],
+    ),
+    ('bias of all blocks', '', False, _sensors('bias', 0.01, 0.03, 0.1)),
+    ('delay of all blocks', 'steps', False, _sensors('delay', 1, 2, 4)),
+    ('delay of the ground', 'steps', True, _sensors('delay', 2, 5, 10, ground=True)),
+    ('terrain_dropout', '', True, _sensors('terrain_dropout', 0.05, 0.2, 0.5)),
+]  # fmt: skip
+_MARK, _END = '<!-- robustness, written by benchmarks/robustness.py -->', '<!-- /robustness -->'
+
+
+def cells() -> list[tuple[str, bool, dict[str, Any]]]:
+    """Returns key, whether the ground must be observed, and options of every cell."""
+    found: list[tuple[str, bool, dict[str, Any]]] = [('none', False, {})]
+    for name, _, ground, strengths in DISTURBANCES:
+        found += [(f'{name}: {text}', ground, options) for text, options in strengths]
+    return found
+
+
+def run(
+    ids: list[str],
+    episodes: int,
+    seed: int,
+    threads: int,
+    step_limit: int | None,
+    path: pathlib.Path,
+) -> dict[str, Any]:
+    """Evaluates all cells that the file does not have yet; returns all."""
+    settings = {'episodes': episodes, 'seed': seed, 'step_limit': step_limit}
+    found: dict[str, Any] = {**settings, 'rows': {}}
+    if path.exists():
+        found = json.loads(path.read_text())
+        if {name: found[name] for name in settings} != settings:
+            raise ValueError(f'{path} has other settings; remove it, or give another --json')
+    jobs = [(id_, *cell) for cell in cells() for id_ in ids]
+    for id_, key, ground, options in tqdm.tqdm(jobs):
+        row = found['rows'].setdefault(id_, {})
+        if key in row or (ground and not _sees_ground(id_)):
+            continue
+        limits = {} if step_limit is None else {'step_limit': step_limit // _shorter(id_)}
+        result = evaluation.evaluate(
+            id_, policies.reference(id_), episodes, seed, threads, {**options, **limits}
+        )
+        row[key] = {
+            name: result[name]
+            for name in ('return', 'return_interval', 'completion_rate', 'distance', 'diverged')
+        }
+        files.write_json(found, path)
+    return found
+
+
+def _shorter(id_: str) -> int:
+    """Returns by what the step limit is divided, since steps are cycles or footsteps."""
+    return 8 if 'FSM_' in id_ or 'HLC_' in id_ else 1
+
+
+def _sees_ground(id_: str) -> bool:
+    return any(name in id_ for name in ('_Terrain', 'FSM_', 'HLC_'))
+
+
+def table(found: dict[str, Any]) -> str:
+    """Returns the results as Markdown: a row for each disturbance, a column for each environment."""
+    ids = [id_ for id_ in IDS if id_ in found['rows']]
+    limit = found['step_limit']
+    length = (
+        ''
+        if limit is None
+        else f', at most {limit} steps each, or {limit // 8} cycles and footsteps'
+    )
+    lines = [
+        f'Mean return of {found["episodes"]} episodes (seed {found["seed"]}{length}) of the shipped policies, '
+        'which were trained without any disturbance, divided by their return without it, in percent; three '
+        'strengths from left to right. A dash: the ground is not observed, or not evaluated.',
+        '',
+        '| disturbance | strengths | ' + ' | '.join(f'`{id_}`' for id_ in ids) + ' |',
+        '|---' * (2 + len(ids)) + '|',
+    ]
+    for name, unit, _, strengths in DISTURBANCES:
+        texts = ', '.join(text for text, _ in strengths)
+        entries = []
+        for id_ in ids:
+            row = found['rows'][id_]
+            shares = [
+                f'{100 * row[key]["return"] / row["none"]["return"]:.0f}' if key in row else '–'
+                for key in (f'{name}: {text}' for text, _ in strengths)
+            ]
+            entries.append('–' if set(shares) == {'–'} else ' '.join(shares))
+        lines.append(f'| {name} | {texts} {unit} | ' + ' | '.join(entries) + ' |')
+    none = ' | '.join(
+        f'{found["rows"][id_]["none"]["return"]:.0f} ± {found["rows"][id_]["none"]["return_interval"] or math.nan:.0f}'
+        for id_ in ids
+    )
+    lines.append(f'| return without | (95 %) | {none} |')
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('ids', nargs='*', default=list(IDS))
+    parser.add_argument('--episodes', type=int, default=32)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--threads', type=int, default=1)
+    parser.add_argument(
+        '--step-limit', type=int, help='of an episode; gaits and planners: an eighth of it'
+    )
+    parser.add_argument(
+        '--json', type=pathlib.Path, default=pathlib.Path('benchmarks/robustness.json')
+    )
+    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
+    arguments = parser.parse_args()
+    for id_ in arguments.ids:
+        catalogue.find(id_)
+    found = run(
+        arguments.ids, arguments.episodes, arguments.seed, arguments.threads, arguments.step_limit,
+        arguments.json,
+    )  # fmt: skip
+    text = table(found)
+    print(text)
+    if arguments.page is not None:
+        page = arguments.page.read_text()
+        pattern = re.compile(f'{re.escape(_MARK)}.*{re.escape(_END)}', re.DOTALL)
+        arguments.page.write_text(pattern.sub(lambda _: f'{_MARK}\n{text}\n{_END}', page))
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

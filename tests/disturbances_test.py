@@ -1,0 +1,743 @@
+"""Tests of trl_suite.tasks.disturbances: worlds that vary, pushes, sensors."""
+
+import contextlib
+import copy
+import io
+import json
+import pathlib
+import pickle
+import runpy
+import sys
+from unittest import mock
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+from helpers import FolderTest, advance, assert_goes_on, assert_rows_are_singles, assert_uniform
+
+from trl_suite import suite
+from trl_suite.engine import PhysicsWorld, light_model, variation
+from trl_suite.tasks.disturbances import Disturbed, sensors, worlds
+from trl_suite.vector import VectorEnvironment
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PLANAR, TERRAIN3D = 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0'
+GAIT, STEPS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_LLC_General_Step-v0'
+PLAN, MOVERS = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_HLC_DynamicsObstacles-v0'
+BALL = 'PD_Biped3D_HLC_Soccer-v0'
+EVERY = {  # all that can be varied
+    'friction': (0.4, 1.2), 'mass': (0.8, 1.2), 'link_mass': (0.9, 1.1), 'inertia': (0.9, 1.1),
+    'com_offset': (0.0, 0.03), 'damping': (0.5, 2.0), 'gravity': (9.0, 10.5), 'slope': (-0.05, 0.05),
+    'push': {'force': (50, 200), 'duration': (0.02, 0.2), 'interval': (0.0, 0.3)},
+}  # fmt: skip
+SENSORS = {'noise': 0.01, 'bias': 0.01, 'delay': (0, 2)}
+MEASURED = {'preset': 'harsh', 'delay': (0, 3)}
+
+
+def made(id_, seed=1, **options):
+    return suite.make(id_, {'random': seed, **options}, {'flat_observation': True})
+
+
+def observed(time_step):
+    return time_step.observation['observations']
+
+
+def zeros(environment):
+    return np.zeros(len(environment.action_map))
+
+
+def links(environment):
+    return environment.task.figure.links
+
+
+def aloft(id_, height=50.0, **options):
+    """An environment whose character is high above the ground, in the middle of an episode."""
+    environment = made(id_, **options)
+    environment.reset()
+    spatial = environment.task.character.spec.spatial
+    place = environment.task.figure.pose_qpos[2 if spatial else 1]
+    environment.physics.data.qpos[place] += height
+    environment.physics.forward()
+    return environment
+
+
+def momentum(environment):
+    """Linear momentum of the character, kg m/s."""
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    mujoco.mj_subtreeVel(model, data)
+    root = links(environment)[0]
+    return model.body_subtreemass[root] * data.subtree_linvel[root].copy()
+
+
+def world_of(xml):
+    physics = mjcf.Physics.from_mjcf_model(mjcf.from_xml_string(xml))
+    return physics, PhysicsWorld(physics)
+
+
+class WorldTest(parameterized.TestCase):
+    """What is drawn is what the physics does."""
+
+    @parameterized.parameters((0.0, 0.4), (0.3, 0.4), (0.2, 0.0), (-0.25, 0.2))
+    def test_box_slides_as_coulomb_says(self, slope, friction):
+        """The impulse of friction is the coefficient times that of the normal force."""
+        physics, world = world_of("""
+            <mujoco><option timestep="0.001" cone="elliptic" impratio="100" integrator="implicitfast"/>
+            <worldbody><geom type="plane" size="0 0 1" friction="0.9"/>
+            <body name="box" pos="0 0 0.05"><joint type="slide" axis="1 0 0"/>
+            <joint type="slide" axis="0 0 1"/><geom type="box" size="0.2 0.2 0.05" mass="3"/>
+            </body></worldbody></mujoco>""")
+        varied = variation.Variation(
+            world, ('friction', 'slope'), world.body_ids(['box']), np.zeros(0, int)
+        )
+        varied.properties.friction[0], varied.properties.slope[0] = friction, slope
+        varied.apply(0)
+        physics.data.qvel[0] = 20.0
+        for _ in range(1500):  # until contacts have settled
+            physics.step()
+        before, time = physics.data.qvel.copy(), 0.5
+        for _ in range(500):
+            physics.step()
+        along, up = physics.data.qvel - before
+        pressed = up + 9.81 * np.cos(slope) * time  # impulse of the ground over the mass
+        expected = -9.81 * np.sin(slope) * time - friction * pressed
+        self.assertAlmostEqual(along, expected, delta=2e-3)
+
+    @parameterized.parameters(
+        (PLANAR, 3.7, 0.0), (PLANAR, 9.8, 0.3), ('PD_Biped3D_Imitate-v0', 1.6, -0.2)
+    )
+    def test_free_fall(self, id_, gravity, slope):
+        """Momentum changes by mass times gravity, which slopes rotate backwards."""
+        found = []
+        for given in (0.0, gravity):  # the joints move alike
+            environment = aloft(id_, randomize={'gravity': given, 'slope': slope, 'mass': 1.5})
+            for _ in range(6):
+                environment.step(zeros(environment))
+            found.append(momentum(environment))
+        mass = environment.physics.model.ptr.body_mass[links(environment)].sum()
+        expected = 0.2 * mass * gravity * np.array([-np.sin(slope), 0, -np.cos(slope)])
+        np.testing.assert_allclose(found[1] - found[0], expected, atol=1e-4 * mass)
+
+    def test_tilted_gravity_in_three_dimensions(self):
+        """Its horizontal part points downhill: against the direction of ascent."""
+        x, y, z = variation.tilted(10.0, 0.1, np.pi / 2)
+        np.testing.assert_allclose((x, y, z), (0, -10 * np.sin(0.1), -10 * np.cos(0.1)), atol=1e-12)
+
+    @parameterized.parameters(PLANAR, GAIT, MOVERS, BALL)
+    def test_masses(self, id_):
+        nominal = made(id_)
+        environment = made(id_, randomize={'mass': (0.5, 1.5), 'link_mass': (0.8, 1.2)})
+        nominal.reset()
+        for _ in range(2):
+            environment.reset()
+        before, after = (each.physics.model.ptr for each in (nominal, environment))
+        world, own = environment.info['world'], links(environment)
+        expected = before.body_mass.copy()
+        expected[own] *= world['mass'] * world['link_mass']
+        np.testing.assert_allclose(after.body_mass, expected, rtol=1e-14)
+        self.assertAlmostEqual(after.body_subtreemass[0], expected.sum(), places=9)
+        ratio = after.body_inertia[own] / before.body_inertia[own]
+        np.testing.assert_allclose(
+            ratio, (after.body_mass[own] / before.body_mass[own])[:, None].repeat(3, 1)
+        )
+
+    @parameterized.parameters(PLANAR, STEPS)
+    def test_centre_of_mass_damping_and_friction(self, id_):
+        nominal = made(id_)
+        environment = made(id_, randomize={'com_offset': 0.05, 'damping': 3.0, 'friction': 0.37})
+        nominal.reset(), environment.reset()
+        before, after = (each.physics.model.ptr for each in (nominal, environment))
+        root, figure = links(environment)[0], environment.task.figure
+        offset = after.body_ipos[root] - before.body_ipos[root]
+        self.assertAlmostEqual(np.linalg.norm(offset), 0.05)
+        np.testing.assert_allclose(offset, environment.info['world']['com_offset'], atol=1e-12)
+        spatial = environment.task.character.spec.spatial
+        self.assertEqual(offset[1] == 0, not spatial)
+        joints = figure.pose_dof[6 if spatial else 3 :]
+        self.assertGreater(before.dof_damping[joints].min(), 0)
+        np.testing.assert_allclose(after.dof_damping[joints], 3 * before.dof_damping[joints])
+        seen = 0
+        for _ in range(20):
+            environment.step(zeros(environment))
+            contacts = environment.physics.data.ptr.contact
+            np.testing.assert_array_equal(contacts.friction[:, :2], 0.37)
+            seen += len(contacts.friction)
+        self.assertGreater(seen, 0)
+
+    @parameterized.parameters(PLANAR, STEPS)
+    def test_model_equals_one_that_is_compiled_with_these_values(self, id_):
+        """Also in everything that MuJoCo derives from them."""
+        environment = made(id_, randomize={name: EVERY[name] for name in EVERY if name != 'push'})
+        for _ in range(3):
+            environment.reset()
+        found = environment.physics.model.ptr
+        root = environment.task.root_entity.mjcf_model
+        spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
+        world = environment.info['world']
+        for number in links(environment):
+            body = spec.body(found.body(number).name)
+            body.explicitinertial, body.mass = True, found.body_mass[number]
+            body.inertia, body.fullinertia = found.body_inertia[number], np.full(6, np.nan)
+            body.ipos, body.iquat = found.body_ipos[number], found.body_iquat[number]
+        for name in [joint.full_identifier for joint in environment.task.character.joints]:
+            spec.joint(name).damping[:] = spec.joint(name).damping * world['damping']
+        for geom in spec.geoms:
+            geom.friction[0] = world['friction']
+        spec.option.gravity = found.opt.gravity
+        expected = spec.compile()
+        for name in (
+            'body_mass', 'body_inertia', 'body_ipos', 'body_subtreemass', 'body_invweight0',
+            'dof_invweight0', 'dof_M0', 'dof_damping', 'actuator_acc0', 'tendon_invweight0',
+            'body_sameframe', 'dof_simplenum', 'body_simple',
+        ):  # fmt: skip
+            np.testing.assert_allclose(
+                getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-12, err_msg=name
+            )
+        self.assertAlmostEqual(found.stat.meaninertia, expected.stat.meaninertia, places=9)
+        # Bounding volumes are in the inertial frame, which com_offset moves.
+        root = links(environment)[0]
+        start, count = found.body_bvhadr[root], found.body_bvhnum[root]
+        self.assertGreater(count, 0)
+        np.testing.assert_allclose(
+            found.bvh_aabb[start : start + count],
+            expected.bvh_aabb[start : start + count],
+            atol=1e-9,
+        )
+        solid = (found.geom_contype | found.geom_conaffinity) != 0
+        np.testing.assert_allclose(found.geom_friction[solid], expected.geom_friction[solid])
+
+    def test_every_reset_starts_from_the_nominal_values(self):
+        """Bounds that are equal to the nominal values leave the model as it is, after any draws."""
+        environment = made(PLANAR, randomize={'mass': (0.5, 2.0), 'com_offset': (0.0, 0.1)})
+        nominal = made(PLANAR)
+        for _ in range(5):
+            environment.reset()
+        variation_ = environment.task.variation
+        variation_.properties.mass[0], variation_.properties.com_offset[0] = 1.0, 0.0
+        variation_.apply(0)
+        found, expected = (each.physics.model.ptr for each in (environment, nominal))
+        for name in ('body_mass', 'body_inertia', 'body_ipos', 'body_invweight0', 'dof_M0'):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+    def test_draws_are_uniform_and_independent(self):
+        environments = VectorEnvironment(PLANAR, 64, 1, 0, task_kwargs={'randomize': EVERY})
+        drawn = []
+        for _ in range(4):
+            environments.reset()
+            drawn.append(environments.info['world'])
+        pooled = {name: np.concatenate([each[name] for each in drawn]) for name in drawn[0]}
+        for name in ('friction', 'mass', 'inertia', 'damping', 'gravity', 'slope'):
+            assert_uniform(pooled[name], *EVERY[name])
+        assert_uniform(pooled['link_mass'], *EVERY['link_mass'])
+        assert_uniform(np.linalg.norm(pooled['com_offset'], axis=1), *EVERY['com_offset'])
+        angles = np.arctan2(pooled['com_offset'][:, 2], pooled['com_offset'][:, 0])
+        assert_uniform(angles, -np.pi, np.pi)
+        columns = np.stack([pooled[name] for name in ('friction', 'mass', 'gravity', 'slope')])
+        off = np.corrcoef(columns) - np.eye(4)
+        self.assertLess(np.abs(off).max(), 4 / np.sqrt(256))
+
+    def test_draw_of_one_property_does_not_depend_on_the_others(self):
+        alone, among = (
+            made(PLANAR, randomize=given)
+            for given in ({'gravity': (9, 10)}, {**EVERY, 'gravity': (9, 10)})
+        )
+        alone.reset(), among.reset()
+        self.assertEqual(alone.info['world']['gravity'], among.info['world']['gravity'])
+
+    @parameterized.parameters(PLANAR, GAIT, PLAN)
+    def test_terrain_and_start_are_those_without_the_options(self, id_):
+        # Links are observed by their centres of mass, so com_offset displaces that of the root.
+        world = {name: EVERY[name] for name in EVERY if name not in ('com_offset', 'link_mass')}
+        plain, varied = made(id_), made(id_, randomize=world, sensors=MEASURED)
+        for _ in range(2):
+            expected = observed(plain.reset())
+            varied.reset()
+            np.testing.assert_allclose(varied.info['clean_observation'], expected, atol=1e-9)
+
+    def test_a_task_that_draws_nothing_has_new_worlds_all_the_same(self):
+        environment = made(PLANAR, randomize={'friction': (0, 1)})
+        inner = environment.task.task
+        inner.reset, found = lambda env_ids, random_states: None, set()
+        for _ in range(4):
+            environment.reset()
+            found.add(environment.info['world']['friction'])
+        self.assertLen(found, 4)
+
+    def test_presets_are_extended_and_reduced(self):
+        config = worlds.configure({'preset': 'robot', 'friction': 0.3, 'push': None})
+        self.assertEqual(config.friction, (0.3, 0.3))
+        self.assertIsNone(config.push)
+        self.assertEqual(config.link_mass, worlds.configure('robot').link_mass)
+        for name in worlds.PRESETS:
+            self.assertIsNotNone(worlds.configure(name).push)
+            sensors.configure(name)
+
+    def test_nothing_asked_for_is_the_plain_task(self):
+        for options in ({}, {'randomize': None, 'sensors': None}, {'randomize': {}, 'sensors': {}}):
+            self.assertNotIsInstance(made(PLANAR, **options).task, Disturbed)
+
+
+class PushTest(parameterized.TestCase):
+    """Impulse is force times duration, whatever a step is."""
+
+    @parameterized.parameters(
+        (PLANAR, 0.011), (PLANAR, 0.2), (GAIT, 0.011), (GAIT, 0.2), ('PD_Biped3D_Imitate-v0', 0.011),
+        ('PD_Biped3D_Imitate-v0', 0.2), (PLAN, 0.2),
+    )  # fmt: skip
+    def test_momentum_of_one_push(self, id_, duration):
+        found, interval = [], 0.05
+        for force in (0.0, 80.0):  # the joints move alike, except for the turn by the push
+            push = {'force': force, 'duration': duration, 'interval': interval, 'direction': 0.5}
+            environment = aloft(id_, randomize={'gravity': 0.0, 'push': push})
+            environment.task.world.engine.pushes.ranges[2] = 1e5  # the next one is far away
+            total = np.zeros(3)
+            while environment.physics.time() < interval + duration:
+                environment.step(zeros(environment))
+                total += environment.info['impulse']
+            found.append(momentum(environment))
+        spatial = environment.task.character.spec.spatial
+        ahead = (np.cos(0.5), np.sin(0.5), 0.0) if spatial else (1.0, 0.0, 0.0)
+        size = 80.0 * duration
+        np.testing.assert_allclose(total, size * np.array(ahead), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found[1] - found[0], total, atol=0.03 + 0.03 * size)
+
+    def test_speed_is_impulse_over_nominal_mass(self):
+        push = {'speed': 0.5, 'duration': (0.05, 0.3), 'interval': 0.1, 'direction': np.pi}
+        environment = aloft(PLANAR, randomize={'gravity': 0.0, 'push': push, 'mass': 2.0})
+        environment.task.world.engine.pushes.ranges[2] = 1e5
+        total = np.zeros(3)
+        for _ in range(15):
+            environment.step(zeros(environment))
+            total += environment.info['impulse']
+        nominal = made(PLANAR)
+        mass = nominal.physics.model.ptr.body_mass[links(nominal)].sum()
+        np.testing.assert_allclose(total, (-0.5 * mass, 0, 0), rtol=1e-9)
+
+    def test_times_and_forces_are_drawn_from_their_ranges(self):
+        push = {'force': (10, 20), 'duration': (0.1, 0.2), 'interval': (0.3, 0.5)}
+        environment = made('PD_Biped3D_Imitate-v0', randomize={'push': push}, step_limit=None)
+        environment.reset()
+        state, found = environment.task.world.engine.pushes.state, []
+        for _ in range(3000):
+            now = state.begin[0], state.end[0], *state.force[0]
+            if not found or found[-1] != now:
+                found.append(now)
+            environment.task.world.step(10)
+        begin, end, x, y, z = np.array(found).T
+        assert_uniform(end - begin, 0.1, 0.2)
+        assert_uniform(begin[1:] - end[:-1], 0.3, 0.5)
+        assert_uniform(np.hypot(x, y), 10, 20)
+        assert_uniform(np.arctan2(y, x), -np.pi, np.pi)
+        self.assertFalse(z.any())
+
+    @parameterized.parameters((PLANAR, True), (PLANAR, False), (STEPS, True))
+    def test_pushed_body(self, id_, foot):
+        """It is like a constant force that a user applies to this body."""
+        plain = made(id_)
+        number = -1 if foot else 0
+        push = {
+            'force': 50.0, 'duration': 10.0, 'interval': 0.0, 'direction': 0.0,
+            'body': plain.task.character.spec.links[-1] if foot else None,
+        }  # fmt: skip
+        pushed = made(id_, randomize={'push': push})
+        plain.reset(), pushed.reset()
+        plain.physics.data.xfrc_applied[links(plain)[number], 0] = 50.0
+        for _ in range(3):
+            expected = plain.step(zeros(plain))
+            found = pushed.step(zeros(pushed))
+            np.testing.assert_allclose(observed(found), observed(expected), rtol=1e-6, atol=1e-8)
+        self.assertFalse(pushed.physics.data.xfrc_applied.any())
+
+    def test_forces_of_the_task_and_of_users_are_kept(self):
+        own = {'force': (30, 60), 'duration': (0.2, 0.4), 'interval': (0.0, 0.1)}
+        push = {'force': 100, 'duration': 0.5, 'interval': 0.0, 'body': 'torso'}
+        environment = made(STEPS, pushes=own, randomize={'push': push})
+        environment.reset()
+        torso, feet = environment.task._torso, links(environment)[-1]
+        environment.physics.data.xfrc_applied[feet, 2] = 0.125
+        state, both = environment.task.state, 0
+        for _ in range(20):
+            environment.step(zeros(environment))
+            forces = environment.physics.data.xfrc_applied
+            acts = environment.task.clock.steps[0] - 1 < state.push_end[0]
+            np.testing.assert_array_equal(forces[torso, :3], state.push[0] * acts)
+            self.assertEqual(forces[feet, 2], 0.125)
+            both += acts and environment.info['impulse'].any()
+        self.assertGreater(both, 3)
+
+    def test_plain_composer_environment_is_rejected(self):
+        task = made(PLANAR, randomize={'push': {'force': 10}}).task
+        environment = composer.Environment(suite.make(PLANAR, {'randomize': 'mild'}).task)
+        environment.reset()
+        with self.assertRaisesRegex(RuntimeError, 'no pushes'):
+            environment.step(np.zeros(len(task.action_map)))
+
+
+class SensorTest(parameterized.TestCase):
+    """What is observed is the exact observation with the noise that was asked for."""
+
+    @parameterized.parameters(PLANAR, TERRAIN3D)
+    def test_noise_and_bias(self, id_):
+        noise, bias = {'terrain': 0.05, 'pose': 0.01}, {'velocity': 0.2, 'terrain': 0.3}
+        options = {'sensors': {'noise': noise, 'bias': bias}}
+        environments = VectorEnvironment(id_, 32, 1, 0, step_limit=None, task_kwargs=options)
+        blocks = environments.blocks
+        found, action = [], np.zeros((32, len(environments.action_map)))
+        environments.reset()
+        for _ in range(12):
+            step = environments.step(action, ~environments._ended)
+            found.append(step.observation - step.info['clean_observation'])
+        error = np.array(found)  # (steps, n, size)
+        going = ~environments._ended
+        error = error[:, going]
+        np.testing.assert_array_equal(error[..., blocks['phase']], 0)
+        pose = error[..., blocks['pose']]
+        self.assertAlmostEqual(pose.std(), 0.01, delta=5e-4)
+        self.assertAlmostEqual(pose.mean(), 0, delta=5e-4)
+        self.assertLess(abs(np.corrcoef(pose[1:].ravel(), pose[:-1].ravel())[0, 1]), 0.05)
+        velocity = error[..., blocks['velocity']]
+        np.testing.assert_allclose(velocity - velocity[:1], 0, atol=1e-12)  # constant
+        self.assertAlmostEqual(velocity[0].std(), 0.2, delta=0.03)
+        terrain = error[..., blocks['terrain']]
+        offset = terrain.mean((0, 2))  # one number for the whole map
+        self.assertAlmostEqual((terrain - offset[:, None]).std(), 0.05, delta=2e-3)
+        self.assertBetween(offset.std(), 0.15, 0.5)
+
+    def test_missing_heights(self):
+        options = {'sensors': {'terrain_dropout': 0.2}}
+        environments = VectorEnvironment(TERRAIN3D, 8, 1, 0, step_limit=None, task_kwargs=options)
+        environments.reset()
+        part, found = environments.blocks['terrain'], []
+        for _ in range(6):
+            step = environments.step(np.zeros((8, 17)))
+            seen, exact = step.observation[:, part], step.info['clean_observation'][:, part]
+            np.testing.assert_array_equal(seen[seen != 0], exact[seen != 0])
+            found.append((seen == 0)[exact != 0])
+        found = np.concatenate(found)
+        self.assertAlmostEqual(found.mean(), 0.2, delta=5 * 0.4 / np.sqrt(len(found)))
+
+    @parameterized.parameters((PLANAR, 3), (GAIT, 1), (PLAN, 2))
+    def test_delay(self, id_, delay):
+        environment = made(id_, sensors={'delay': {'terrain': delay}}, step_limit=None)
+        part = environment.blocks['terrain']
+        time_step, exact = environment.reset(), []
+        for k in range(8):
+            exact.append(environment.info['clean_observation'][part])
+            np.testing.assert_array_equal(observed(time_step)[part], exact[max(0, k - delay)])
+            rest = slice(part.stop, None)
+            np.testing.assert_array_equal(
+                observed(time_step)[rest], environment.info['clean_observation'][rest]
+            )
+            time_step = environment.step(zeros(environment))
+            if time_step.last():
+                break
+        self.assertGreater(k, delay)
+
+    def test_delays_of_presets_are_for_steps_of_a_thirtieth_of_a_second(self):
+        for id_, depth in ((PLANAR, 3), (GAIT, 0), (PLAN, 0)):
+            environment = made(id_, sensors='robot')
+            self.assertEqual(environment.task._sensor_state.history.shape[1], depth)
+
+    def test_delay_of_an_episode_is_drawn(self):
+        environments = VectorEnvironment(
+            PLANAR, 256, 1, 0, task_kwargs={'sensors': {'delay': {'terrain': (1, 3)}}}
+        )
+        environments.reset()
+        delay = environments.task._sensor_state.delay[:, environments.blocks['terrain']]
+        self.assertTrue((delay == delay[:, :1]).all())
+        counts = np.bincount(delay[:, 0], minlength=4)
+        self.assertEqual(counts[0], 0)
+        self.assertGreater(counts[1:].min(), 256 / 3 - 4 * 7.6)
+
+    def test_flags_flip(self):
+        environments = VectorEnvironment(
+            STEPS, 32, 1, 0, step_limit=None, task_kwargs={'sensors': {'noise': {'contact': 0.25}}}
+        )
+        environments.reset()
+        part, wrong = environments.blocks['contact'], []
+        for _ in range(20):
+            step = environments.step(np.zeros((32, 17)))
+            seen, exact = step.observation[:, part], step.info['clean_observation'][:, part]
+            self.assertContainsSubset(np.unique(seen), (0, 1))
+            wrong.append(seen != exact)
+        self.assertAlmostEqual(np.mean(wrong), 0.25, delta=0.05)
+
+    def test_reading_twice_gives_the_same_values(self):
+        for id_ in (PLANAR, TERRAIN3D):
+            environment = made(id_, sensors=MEASURED)
+            environment.reset()
+            for _ in range(5):
+                time_step = environment.step(zeros(environment))
+            environment.task.observe()
+            np.testing.assert_array_equal(
+                environment.observation()['observations'], observed(time_step)
+            )
+
+    def test_rewards_and_endings_are_those_of_the_true_state(self):
+        plain, noisy = made(PLANAR), made(PLANAR, sensors=MEASURED)
+        plain.reset(), noisy.reset()
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            action = rng.uniform(-1, 1, 11)
+            a, b = plain.step(action), noisy.step(action)
+            self.assertEqual(
+                (a.reward, a.discount, a.step_type), (b.reward, b.discount, b.step_type)
+            )
+            np.testing.assert_array_equal(noisy.info['clean_observation'], observed(a))
+            self.assertFalse(np.array_equal(observed(a), observed(b)))
+
+    def test_custom_blocks_have_noise_and_custom_functions_read_the_truth(self):
+        given = {
+            'observations': {'x': (2, lambda task: task.world.qpos[:, :2])},
+            'rewards': {'first': (1.0, lambda task: task.observation[:, 0])},
+        }
+        environment = made(PLANAR, sensors={'noise': {'x': 0.5, 'terrain': 0.1}}, **given)
+        environment.reset()
+        time_step, clean = environment.step(np.zeros(11)), environment.info['clean_observation']
+        part = environment.blocks['x']
+        np.testing.assert_array_equal(clean[part], environment.physics.data.qpos[:2])
+        self.assertTrue((observed(time_step)[part] != clean[part]).all())
+        self.assertEqual(environment.info['reward_terms']['first'], clean[0])
+
+
+class IdentityTest(parameterized.TestCase):
+    """Single, batch, threads, restored: the same bits."""
+
+    @parameterized.parameters(PLANAR, TERRAIN3D, GAIT, STEPS, PLAN, MOVERS, BALL)
+    def test_simulations_equal_single_environments(self, id_):
+        options = {'randomize': EVERY, 'sensors': MEASURED}
+        if id_ == STEPS:
+            options['pushes'] = {'interval': (0.1, 0.2)}
+        steps = 6 if id_ in (GAIT, PLAN, MOVERS, BALL) else 25
+        found, ends = assert_rows_are_singles(id_, 5, steps, steps // 2, options, scale=0.3)
+        self.assertGreater(ends, 0)
+        self.assertTrue(any(step.info['impulse'].any() for step in found))
+
+    def test_number_of_threads_does_not_matter(self):
+        found = []
+        for threads in (1, 2, 3):
+            environments = VectorEnvironment(
+                GAIT, 12, threads, 5, task_kwargs={'randomize': EVERY, 'sensors': MEASURED}
+            )
+            environments.reset()
+            steps = [environments.step(np.zeros((12, 29))).observation for _ in range(3)]
+            found.append(np.array(steps))
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[0], found[2])
+
+    @parameterized.parameters(PLANAR, GAIT, STEPS, PLAN, MOVERS)
+    def test_restored_environment_continues(self, id_):
+        options = {'randomize': EVERY, 'sensors': MEASURED, 'step_limit': 1000}
+        environment, other = (
+            suite.make(id_, {'random': 3, **options}),
+            suite.make(id_, {'random': 4, **options}),
+        )
+        environment.reset(), other.reset()
+        steps = 3 if id_ in (GAIT, PLAN, MOVERS) else 12
+        for each in (environment, other):
+            advance(each, 0, steps, 0.3)
+
+        def look(each):
+            world = each.info['world']
+            return [np.ravel(value) for value in (*world.values(), each.info['impulse'])]
+
+        assert_goes_on(environment, other, lambda each, seed: advance(each, seed, steps, 0.3, look))
+
+    @parameterized.parameters(PLANAR, MOVERS)
+    def test_restored_world_is_the_saved_one(self, id_):
+        one, other = made(id_, 1, randomize=EVERY), made(id_, 2, randomize=EVERY)
+        one.reset(), other.reset()
+        one.step(zeros(one))
+        other.set_state(pickle.loads(pickle.dumps(one.get_state())))
+        a, b = one.physics.model.ptr, other.physics.model.ptr
+        for name in dir(a):
+            value = getattr(a, name)
+            if isinstance(value, np.ndarray) and not name.startswith(('_', 'bvh')):
+                np.testing.assert_array_equal(getattr(b, name), value, name)
+        np.testing.assert_array_equal(b.opt.gravity, a.opt.gravity)
+        self.assertEqual(b.stat.meaninertia, a.stat.meaninertia)
+
+    @parameterized.parameters(PLANAR, PLAN)
+    def test_hooks_of_composer_change_nothing(self, id_):
+        options = {'randomize': EVERY, 'sensors': MEASURED}
+        plain, hooked = made(id_, **options), made(id_, **options)
+        hooked.add_extra_hook('before_step', lambda physics, action, random_state: None)
+        plain.reset(), hooked.reset()
+        for _ in range(4):
+            a, b = plain.step(zeros(plain)), hooked.step(zeros(hooked))
+            np.testing.assert_array_equal(observed(a), observed(b))
+            np.testing.assert_array_equal(plain.info['impulse'], hooked.info['impulse'])
+
+    def test_copied_simulations_continue_alike(self):
+        options = {'randomize': EVERY, 'sensors': MEASURED}
+        one, other = (VectorEnvironment(STEPS, 4, 1, seed, task_kwargs=options) for seed in (1, 2))
+        one.reset(), other.reset()
+        for _ in range(5):
+            one.step(np.zeros((4, 17)))
+        other.copy_from(one, [2, 0], [0, 3])
+        for _ in range(5):
+            a, b = one.step(np.zeros((4, 17))), other.step(np.zeros((4, 17)))
+            np.testing.assert_array_equal(a.observation[[2, 0]], b.observation[[0, 3]])
+            np.testing.assert_array_equal(a.info['impulse'][[2, 0]], b.info['impulse'][[0, 3]])
+
+    def test_models_of_a_batch_are_independent_of_each_other(self):
+        environments = VectorEnvironment(PLANAR, 3, 1, 0, task_kwargs={'randomize': EVERY})
+        environments.reset()
+        masses = [model.body_mass.sum() for model in environments.task.world.models]
+        self.assertLen(set(masses), 3)
+        kept = copy.copy(environments.task.world.models[0])
+        environments.reset([1])
+        np.testing.assert_array_equal(environments.task.world.models[0].body_mass, kept.body_mass)
+
+    def test_light_and_full_model_derive_the_same_numbers(self):
+        task = made(PLANAR).task
+        light = light_model(task.root_entity.mjcf_model)
+        full = task.world.models[0]
+        np.testing.assert_array_equal(light.body_invweight0, full.body_invweight0)
+
+
+class GymnasiumTest(parameterized.TestCase):
+    """Adapters show world and exact observation."""
+
+    def test_info(self):
+        import gymnasium
+
+        import trl_suite.gym  # noqa: F401
+
+        options = {'task_kwargs': {'randomize': 'harsh', 'sensors': 'robot'}}
+        single = gymnasium.make(f'trl_suite/{PLANAR}', **options)
+        observation, info = single.reset(seed=3)
+        self.assertEqual(info['clean_observation'].shape, observation.shape)
+        self.assertBetween(info['world_friction'], 0.3, 1.5)
+        several = gymnasium.make_vec(
+            f'trl_suite/{PLANAR}', 2, max_episode_steps=2, autoreset_mode='SameStep', **options
+        )
+        observation, info = several.reset(seed=[3, 4])
+        self.assertEqual(info['clean_observation'].shape, observation.shape)
+        self.assertEqual(info['world_friction'][0], single.reset(seed=3)[1]['world_friction'])
+        for _ in range(2):
+            *_, info = several.step(np.zeros((2, 11)))
+        final = info['final_info']['clean_observation']
+        self.assertFalse(np.array_equal(final, info['clean_observation']))
+
+
+class RefusalTest(parameterized.TestCase):
+    """Contradictory, absurd and unknown settings are named."""
+
+    @parameterized.parameters(
+        ({'frction': 1}, "did you mean 'friction'"),
+        ('robust', "did you mean 'robot'"),
+        ({'preset': 'hash'}, "did you mean 'harsh'"),
+        (3, "expected 'mild', 'robot', 'harsh', or a dict"),
+        ({'friction': -0.1}, 'friction is -0.1; expected a number at least 0'),
+        ({'friction': (1.2, 0.5)}, 'friction is .*lower and an upper'),
+        ({'friction': (0.1, 0.2, 0.3)}, 'lower and an upper'),
+        ({'mass': 0}, 'mass is 0; .* at least 0.01'),
+        ({'gravity': 1e4}, 'gravity is .* at most 100'),
+        ({'slope': 2.0}, 'slope is 2.0; .* rad'),
+        ({'slope_direction': 1.0}, 'slope_direction has no effect without slope'),
+        ({'slope': 0.1, 'slope_direction': 1.0}, 'three-dimensional'),
+        ({'com_offset': 5}, 'com_offset is 5; .* m'),
+        ({'friction': 'much'}, 'friction is .much.; expected a number'),
+        ({'push': {}}, 'neither force and speed'),
+        ({'push': {'force': 1, 'speed': 1}}, 'both force and speed'),
+        ({'push': 150}, "push is 150; expected a mapping such as {'force': 150}"),
+        ({'push': {'force': 1, 'body': 'rooot'}}, 'unknown link in push: body'),
+        ({'push': {'force': 1, 'duration': 0}}, 'duration is 0; .* s'),
+        ({'push': {'force': np.inf}}, 'force is inf'),
+    )  # fmt: skip
+    def test_worlds(self, given, message):
+        with self.assertRaisesRegex(ValueError, message):
+            made(PLANAR, randomize=given)
+
+    @parameterized.parameters(
+        ({'nois': 1}, "did you mean 'noise'"),
+        ({'noise': {'terain': 0.1}}, "did you mean 'terrain'"),
+        ({'noise': {'phase': 0.1}}, "phase is the controller's own clock"),
+        ({'noise': {'pose': -1}}, r"noise\['pose'\] is -1"),
+        ({'noise': 'much'}, 'noise is .much.'),
+        ({'bias': {'pose': np.nan}}, 'bias.* is nan'),
+        ({'terrain_dropout': 1.5}, 'terrain_dropout is 1.5'),
+        ({'delay': 1.5}, 'whole numbers of steps'),
+        ({'delay': (3, 1)}, 'whole numbers of steps'),
+        ({'delay': {'pose': 10**6}}, 'up to 1000'),
+    )
+    def test_sensors(self, given, message):
+        with self.assertRaisesRegex(ValueError, message):
+            made(PLANAR, sensors=given)
+
+    def test_options_without_effect(self):
+        with self.assertRaisesRegex(ValueError, 'does not observe the ground'):
+            made('PD_Biped2D_Flat-v0', sensors={'terrain_dropout': 0.1})
+        made('PD_Biped2D_Flat-v0', sensors='robot')  # a preset fits every task
+
+    def test_state_of_other_options_is_rejected(self):
+        one, other = made(PLANAR, randomize='mild'), made(PLANAR)
+        one.reset(), other.reset()
+        with self.assertRaises(ValueError):
+            other.set_state(one.get_state())
+
+
+class ExtremeTest(parameterized.TestCase):
+    """Nothing returns NaN."""
+
+    @parameterized.product(
+        id_=(PLANAR, GAIT, STEPS, PLAN, BALL),
+        world=(
+            {'friction': 0.0}, {'mass': 10.0}, {'mass': 0.1, 'inertia': 0.1}, {'gravity': 0.0},
+            {'push': {'force': 1e4, 'duration': 0.5, 'interval': 0.1}}, {'slope': 1.5},
+            {'gravity': 100.0, 'com_offset': 1.0, 'damping': 1000.0},
+        ),
+    )  # fmt: skip
+    def test_numbers_stay_finite(self, id_, world):
+        environment = made(id_, randomize=world, sensors={'noise': 10.0, 'delay': 5})
+        rng, time_step = np.random.default_rng(0), environment.reset()
+        for _ in range(6 if id_ in (GAIT, PLAN, BALL) else 60):
+            time_step = environment.step(rng.uniform(-1, 1, len(environment.action_map)))
+            self.assertTrue(np.isfinite(observed(time_step)).all())
+            self.assertTrue(np.isfinite(environment.info['clean_observation']).all())
+            self.assertTrue(np.isfinite(time_step.reward or 0.0))
+
+
+class ProgramsTest(FolderTest):
+    """The example, and the program that evaluates policies under disturbances."""
+
+    def test_example(self):
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            runpy.run_path(str(ROOT / 'examples/randomized_worlds.py'), run_name='example')[
+                'main'
+            ]()
+        self.assertRegex(out.getvalue(), r'friction 0\.4 to 0\.8: \d+ steps on average')
+
+    def test_robustness(self):
+        sys.path.insert(0, str(ROOT / 'benchmarks'))
+        self.addCleanup(sys.path.remove, str(ROOT / 'benchmarks'))
+        import robustness
+
+        ids, path = ['PD_Biped2D_Flat-v0', PLANAR], self.folder / 'found.json'
+        strong = (
+            'push',
+            'm/s',
+            False,
+            [('9', {'randomize': {'push': {'speed': 9, 'interval': 0}}})],
+        )
+        ground = ('terrain_dropout', '', True, [('0.5', {'sensors': {'terrain_dropout': 0.5}})])
+        self.enterContext(mock.patch.object(robustness, 'DISTURBANCES', [strong, ground]))
+        self.enterContext(mock.patch.object(robustness, 'IDS', ids))
+        found = robustness.run(ids, 2, 0, 1, 40, path)
+        self.assertEqual(json.loads(path.read_text()), found)
+        flat, gaps = (found['rows'][id_] for id_ in ids)
+        self.assertLess(flat['push: 9']['return'], 0.8 * flat['none']['return'])
+        self.assertNotIn('terrain_dropout: 0.5', flat)
+        self.assertIn('terrain_dropout: 0.5', gaps)
+        with mock.patch.object(robustness.evaluation, 'evaluate', side_effect=AssertionError):
+            self.assertEqual(robustness.run(ids, 2, 0, 1, 40, path), found)  # nothing is left
+        with self.assertRaisesRegex(ValueError, 'other settings'):
+            robustness.run(ids, 3, 0, 1, 40, path)
+        share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
+        self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
+
+
+if __name__ == '__main__':
+    absltest.main()

@@ -1,0 +1,38 @@
+"""Worlds that vary between episodes, pushes, and sensors with noise, for every task.
+
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={
+        'randomize': {'friction': (0.5, 1.2), 'push': {'force': 150, 'interval': 3}},
+        'sensors': {'noise': {'pose': 0.01, 'velocity': 0.1}, 'terrain_dropout': 0.05},
+    })
+    environment = suite.make('PD_Biped2D_Gaps_Terrain-v0', task_kwargs={'randomize': 'robot'})
+
+`VectorEnvironment` and Gymnasium environments take the same `task_kwargs`. `worlds` and `sensors`
+have the options and the presets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.tasks.disturbances.task import Disturbed
+from trl_suite.tasks.task import Task
+
+OPTIONS = ('randomize', 'sensors')
+
+
+def disturb(task: Task, options: Mapping[str, Any]) -> Task:
+    """Returns a `Disturbed` task with these options; the task itself if there are none.
+
+    Args:
+      task: any task that no other environment uses.
+      options: values of `OPTIONS`, see `worlds.configure` and `sensors.configure`.
+
+    Raises:
+      ValueError: unknown names, values out of range, or options that contradict each other or that
+        the task cannot have.
+    """
+    world = worlds.configure(options.get('randomize'))
+    sensor = sensors.configure(options.get('sensors'))
+    return task if world is None and sensor is None else Disturbed(task, world, sensor)

@@ -1,0 +1,251 @@
+"""Options of worlds that vary between episodes, and their random draws.
+
+Each property is drawn at the beginning of an episode, uniformly between two bounds, and stays
+constant until the next one; pushes are drawn one after the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trl_suite.engine.variation import Properties
+from trl_suite.util import errors
+from trl_suite.util.options import Config, option
+
+Range = float | Sequence[float] | None
+_EVEN = 'uniform between two bounds, or a number: constant'
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PushConfig(Config):
+    """Options of pushes: horizontal forces on a link, at its centre of mass."""
+
+    force: Range = option(None, 'force', unit='N', at_least=0, at_most=1e6)
+    speed: Range = option(
+        None,
+        "impulse over the character's nominal mass, instead of a force: the change of velocity of a "
+        'free body',
+        unit='m/s', at_least=0, at_most=100,
+    )  # fmt: skip
+    duration: float | Sequence[float] = option(
+        0.2, 'duration', unit='s', at_least=0.001, at_most=1000
+    )
+    interval: float | Sequence[float] = option(
+        (2.0, 4.0),
+        'time from the end of a push, or the start of the episode, to the next push',
+        unit='s', at_least=0, at_most=1e6,
+    )  # fmt: skip
+    direction: float | Sequence[float] = option(
+        (-math.pi, math.pi),
+        'direction, to the left of +x; planar characters are pushed along +x if its cosine is positive, '
+        'otherwise along -x',
+        unit='rad', at_least=-2 * math.pi, at_most=2 * math.pi,
+    )  # fmt: skip
+    body: str | None = option(None, 'link that is pushed; by default the root')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.force is None) == (self.speed is None):
+            given = 'neither' if self.force is None else 'both'
+            raise ValueError(f'push has {given} force and speed; expected one of them')
+        for name in ('force', 'speed', 'duration', 'interval', 'direction'):
+            value = getattr(self, name)
+            if value is not None:
+                self._set(name, bounds(f'push: {name}', value))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorldConfig(Config):
+    """Options of worlds; a property that is None is not varied."""
+
+    preset: str | None = option(
+        None, 'preset that the other options change', choices=('mild', 'robot', 'harsh')
+    )
+    friction: Range = option(
+        None, 'coefficient of sliding friction of all contacts; 0.81 otherwise', at_least=0, at_most=10
+    )  # fmt: skip
+    mass: Range = option(
+        None, 'factor of mass and inertia of all links', at_least=0.01, at_most=100
+    )
+    link_mass: Range = option(
+        None,
+        'factor of mass and inertia, drawn for each link; in addition to mass',
+        at_least=0.01,
+        at_most=100,
+    )
+    inertia: Range = option(
+        None,
+        'factor of the inertia of all links about their centres of mass; in addition to mass',
+        at_least=0.01,
+        at_most=100,
+    )
+    com_offset: Range = option(
+        None,
+        "displacement of the root link's centre of mass, in a random direction",
+        unit='m',
+        at_least=0,
+        at_most=1,
+    )
+    damping: Range = option(
+        None,
+        'factor of the passive damping of joints; the joints of gaits have none',
+        at_least=0,
+        at_most=1000,
+    )
+    gravity: Range = option(
+        None, 'magnitude of gravity; 9.8 otherwise', unit='m/s^2', at_least=0, at_most=100
+    )
+    slope: Range = option(
+        None,
+        'angle by which the whole ground is tilted: gravity is rotated, and positions, headings and heights '
+        'are relative to the ground',
+        unit='rad', at_least=-1.5, at_most=1.5,
+    )  # fmt: skip
+    slope_direction: Range = option(
+        None,
+        'direction of ascent of the slope, to the left of +x, in three dimensions; by default 0',
+        unit='rad',
+        at_least=-2 * math.pi,
+        at_most=2 * math.pi,
+    )
+    push: Any = option(None, 'forces on the character: a mapping of options of pushes')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in Properties._fields:
+            value = getattr(self, name)
+            if value is not None:
+                self._set(name, bounds(name, value))
+        if self.slope_direction is not None and self.slope is None:
+            raise ValueError('slope_direction has no effect without slope; give both')
+        if self.push is not None and not isinstance(self.push, PushConfig):
+            if not isinstance(self.push, Mapping):
+                raise ValueError(
+                    f"push is {self.push!r}; expected a mapping such as {{'force': 150}}"
+                )
+            self._set('push', PushConfig.of('push', self.push))
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Names of the properties that are varied."""
+        return tuple(name for name in Properties._fields if getattr(self, name) is not None)
+
+
+# Friction, mass of links, and pushes of 'robot' are within the ranges with which policies for
+# robots are trained: friction 0.5 to 1.25 and changes of velocity of up to 1 m/s every 15 s in
+# legged_gym (`legged_robot_config.py`; Rudin et al. 2022, 'Learning to walk in minutes using
+# massively parallel deep reinforcement learning'); friction 0.4 to 1 and factors of masses of
+# links from 0.9 to 1.1 in MuJoCo Playground. The other numbers are chosen.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    'mild': {
+        'friction': (0.7, 0.95), 'mass': (0.97, 1.03), 'link_mass': (0.97, 1.03),
+        'com_offset': (0.0, 0.01), 'damping': (0.9, 1.1), 'slope': (-0.01, 0.01),
+        'push': {'speed': (0.0, 0.15), 'duration': (0.1, 0.2), 'interval': (4.0, 8.0)},
+    },
+    'robot': {
+        'friction': (0.5, 1.2), 'mass': (0.95, 1.05), 'link_mass': (0.9, 1.1),
+        'com_offset': (0.0, 0.03), 'damping': (0.8, 1.25), 'slope': (-0.03, 0.03),
+        'push': {'speed': (0.0, 0.4), 'duration': (0.1, 0.2), 'interval': (3.0, 6.0)},
+    },
+    'harsh': {
+        'friction': (0.3, 1.5), 'mass': (0.85, 1.15), 'link_mass': (0.8, 1.2), 'inertia': (0.8, 1.25),
+        'com_offset': (0.0, 0.06), 'damping': (0.5, 2.0), 'gravity': (9.3, 10.3),
+        'slope': (-0.1, 0.1),
+        'push': {'speed': (0.3, 1.0), 'duration': (0.1, 0.3), 'interval': (2.0, 4.0)},
+    },
+}  # fmt: skip
+
+
+def configure(value: Any) -> WorldConfig | None:
+    """Returns the options of worlds.
+
+    Args:
+      value: None; the name of a preset; a mapping of options by name, in which 'preset' may name a
+        preset that the other options change, None removing one; or a `WorldConfig`.
+
+    Raises:
+      ValueError: anything else, unknown names, or values out of range.
+    """
+    return preset_and_options('randomize', value, WorldConfig, PRESETS)
+
+
+def preset_and_options(
+    name: str, value: Any, config: Any, presets: Mapping[str, Mapping[str, Any]]
+) -> Any:
+    """Returns a config from a preset, a mapping, or a config; None if nothing is asked for.
+
+    Raises:
+      ValueError: another value, an unknown name, or a value out of range.
+    """
+    if value is None or isinstance(value, config):
+        return value
+    if isinstance(value, str):
+        value = {'preset': value}
+    if not isinstance(value, Mapping):
+        raise ValueError(
+            f'{name} is {value!r}; expected {", ".join(map(repr, presets))}, or a dict of options'
+        )
+    preset = value.get('preset')
+    if preset is not None and (not isinstance(preset, str) or preset not in presets):
+        raise ValueError(errors.unknown(f'preset of {name}', preset, presets))
+    options = {**({} if preset is None else presets[preset]), **value}
+    return config.of(name, options) if options else None
+
+
+def bounds(name: str, value: Any) -> tuple[float, float]:
+    """Returns a pair of bounds, from such a pair or from a number, which stands for both.
+
+    Raises:
+      ValueError: neither, or the first bound is the larger one.
+    """
+    pair = np.ravel(np.asarray(value, float))
+    low, high = (pair[0], pair[-1]) if len(pair) in (1, 2) else (1.0, 0.0)
+    if not low <= high:
+        raise ValueError(f'{name} is {value}; expected a number, or a lower and an upper bound')
+    return float(low), float(high)
+
+
+def draw(
+    env_id: int,
+    config: WorldConfig,
+    random: np.random.Generator,
+    spatial: bool,
+    properties: Properties,
+) -> None:
+    """Draws the properties of one simulation.
+
+    A number is drawn for every property, in a fixed order, whether it is varied or not, so that the
+    draws of one do not depend on which others are varied.
+
+    Args:
+      env_id: number of the simulation.
+      config: the options.
+      random: the random numbers.
+      spatial: whether the character is three-dimensional.
+      properties: written in place.
+    """
+    for name in Properties._fields:
+        array = getattr(properties, name)
+        share: Any = random.random(array.shape[1:] or None)
+        given = getattr(config, name)
+        if name == 'com_offset':
+            if given is not None:
+                size = given[0] + (given[1] - given[0]) * share[0]
+                array[env_id] = size * direction(share[1], share[2], spatial)
+        elif given is not None:
+            array[env_id] = given[0] + (given[1] - given[0]) * share
+
+
+def direction(first: float, second: float, spatial: bool) -> np.ndarray:
+    """Returns a unit vector, uniform on the sphere, or on the circle of x and z, from two draws."""
+    angle = 2 * np.pi * first
+    if not spatial:
+        return np.array([np.cos(angle), 0.0, np.sin(angle)])
+    z = 2 * second - 1
+    radius = np.sqrt(max(1 - z * z, 0.0))
+    return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
