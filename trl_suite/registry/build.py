@@ -12,7 +12,7 @@ from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.registry.task_types import TASK_TYPES
-from trl_suite.tasks import composed
+from trl_suite.tasks import actuated, composed
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
 from trl_suite.util import errors
@@ -66,7 +66,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     Args:
       spec: spec of the environment.
       options: options of the task, which override those of the spec; in addition, every task has
-        the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`.
+        the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`, and
+        `actuators`, see `trl_suite.actuation.Actuators`.
 
     Raises:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
@@ -74,7 +75,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     """
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
-    type_, others = task_type(spec), (*composed.OPTIONS, 'random')
+    actuators = merged.pop('actuators', {})
+    type_, others = task_type(spec), (*composed.OPTIONS, 'actuators', 'random')
     config_type, config = config_of(spec), None
     if config_type is None:
         known = {option.name for option in task_options(spec)}
@@ -96,13 +98,16 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
         )
     parts = _parts(spec, type_)
     if type_ is not None:
-        return composed.compose(type_.make(parts, config), extras)
+        task = type_.make(parts, config)
+        task = actuated.actuate(task, actuators, parts.actuation, parts.character)
+        return composed.compose(task, extras)
     given: dict[str, Any] = merged if config is None else {'config': config}
     if spec.clip is not None:
         given['clip'] = parts.motion
     task = spec.own['task_type'](
         parts.character, parts.arena, actuation_model=parts.actuation, **given
     )
+    task = actuated.actuate(task, actuators, parts.actuation, parts.character)
     return composed.compose(task, extras)
 
 
