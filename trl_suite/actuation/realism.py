@@ -18,7 +18,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from trl_suite.characters.character import Character
+from trl_suite.actuation import series, strength_curves
+from trl_suite.actuation.strength_curves import Curve
+from trl_suite.characters.character import Character, CharacterSpec
 from trl_suite.engine import World, motors
 from trl_suite.util.options import Config, option
 
@@ -28,8 +30,13 @@ _AXES = ('_x', '_y', '_z')
 _LATERAL = 1  # the y axis
 _NOT_FOR_MUSCLES = {
     'torque_speed': 'the force of a muscle depends on its velocity already',
+    'torque_pose': 'the force of a muscle depends on its length already',
+    'backlash': 'muscles pull on links without gears',
+    'flex': 'muscles act on links by rigid tendons, which span several joints',
 }
-_REQUIRED = {'no_load_speed': 'torque_speed', 'braking': 'torque_speed'}  # option -> the one it modifies
+_REQUIRED = {
+    'no_load_speed': 'torque_speed', 'braking': 'torque_speed', 'flex_damping': 'flex',
+}  # fmt: skip  # option -> the one that it modifies
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,12 +56,31 @@ class Actuators(Config):
         'largest torque against the motion, in torque limits; with torque_speed',
         at_least=1, at_most=10,
     )  # fmt: skip
+    torque_pose: Any = option(
+        None,
+        "factors of the torque limits by joint angle and direction: True for the character's own (bipeds: "
+        "human legs), 'human', a JSON file, or a table of joint -> angle (rad), positive, negative",
+    )
     delay: float | Sequence[float] = option(
         0.0,
         'time until a control takes effect, rounded to physics steps; of two bounds, between which it is '
         'drawn for each episode',
         unit='ms', at_least=0, at_most=LONGEST_DELAY,
     )  # fmt: skip
+    backlash: float = option(
+        0.0,
+        'free play between motor and link of every joint; of a ball joint the opening angle of a cone',
+        unit='rad', at_least=0, at_most=0.5,
+    )  # fmt: skip
+    flex: float = option(
+        0.0,
+        'deflection of a spring between motor and link of every joint at the torque limit; its stiffness '
+        'is torque limit / flex',
+        unit='rad', at_least=0, at_most=1,
+    )  # fmt: skip
+    flex_damping: float = option(
+        0.005, 'damping of these springs relative to their stiffness', unit='s', at_least=0.005, at_most=1
+    )
     noise: float = option(
         0.0,
         'standard deviation of torque noise, in torque limits; an Ornstein-Uhlenbeck process for each '
@@ -70,6 +96,8 @@ class Actuators(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.torque_pose is False:
+            self._set('torque_pose', None)
         for name in ('delay', 'strength'):
             self._set(name, _interval(name, getattr(self, name)))
         for name, needed in _REQUIRED.items():
@@ -170,28 +198,67 @@ class Units:
         self.dof_limits = np.repeat(self.limits, sizes)
 
 
-def limits(actuators: Actuators, units: Units, model: mujoco.MjModel) -> motors.Limits:
-    """Returns the limits of motors that depend on speed."""
-    if not actuators.torque_speed:
+def curves_of(actuators: Actuators, character: Character) -> dict[str, Curve]:
+    """Returns the factors of torque limits by joint angle, by joint."""
+    if actuators.torque_pose is None:
+        return {}
+    spec = character.spec
+    return strength_curves.load(
+        actuators.torque_pose, spec.torque_curves, spec.name, tuple(spec.joints)
+    )
+
+
+def limits(
+    actuators: Actuators, units: Units, model: mujoco.MjModel, curves: Mapping[str, Curve]
+) -> motors.Limits:
+    """Returns the limits of motors that depend on speed and pose."""
+    if not (actuators.torque_speed or curves):
         return motors.limits()
+    ball = model.jnt_type[units.joints] == mujoco.mjtJoint.mjJNT_BALL
+    place = {name: k for k, name in enumerate(curves)}
+    turns = dict(zip(units.names, ball, strict=True))
+    # The engine takes rotations of ball joints about y, and the tables have those about -y.
+    rows = [
+        Curve(-curve.angle[::-1], curve.negative[::-1], curve.positive[::-1])
+        if turns[name] else curve
+        for name, curve in curves.items()
+    ]  # fmt: skip
     single: list[tuple[Any, ...]] = []
     balls: list[tuple[Any, ...]] = []
     for unit, (ids, joint, limit) in enumerate(
         zip(units.actuators, units.joints, units.limits, strict=True)
     ):
         qpos, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
-            single.append((ids[0], qpos, dof, limit, unit, -1, 1))
+        curve = place.get(units.names[unit], -1)
+        if not ball[unit]:
+            single.append((ids[0], qpos, dof, limit, unit, curve, 1))
         elif len(ids) == 3 and model.actuator_biastype[ids[0]] != mujoco.mjtBias.mjBIAS_NONE:
             # Velocity servos, each with a limit of its own.
             each = model.actuator_forcerange[ids[0], 1]
-            single += [(ids[k], qpos, dof + k, each, unit, -1, -1) for k in range(3)]
+            single += [
+                (ids[k], qpos, dof + k, each, unit, curve if k == _LATERAL else -1, -1)
+                for k in range(3)
+            ]
         else:
             group = [*ids, -1, -1][:3]
-            balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, -1))
+            balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, curve))
+    speed = actuators.no_load_speed if actuators.torque_speed else np.inf
+    braking = actuators.braking if actuators.torque_speed else 1.0
     return motors.limits(
-        _columns(single, 3), _columns(balls, 4), None, actuators.no_load_speed, actuators.braking
+        _columns(single, 3), _columns(balls, 4), _table(rows), speed, braking
     )
+
+
+def _table(curves: Sequence[Curve]) -> motors.Curves | None:
+    """Returns curves as a table, whose rows repeat their last knots; None if there are no curves."""
+    if not curves:
+        return None
+    most = max(len(curve.angle) for curve in curves)
+    columns = [
+        [np.pad(values, (0, most - len(values)), 'edge') for values in field]
+        for field in zip(*curves, strict=True)
+    ]
+    return motors.Curves(*map(np.array, columns))
 
 
 def _columns(rows: list[tuple[Any, ...]], reals: int) -> tuple[np.ndarray, ...] | None:
@@ -216,13 +283,13 @@ class Strength:
     """Scales the torques of motors and muscles in the models of simulations."""
 
     def __init__(self, actuators: Actuators, units: Units, world: World) -> None:
-        """Widens the models' own limits where the motors' limits replace them."""
+        """Keeps the nominal values; limits that the engine writes replace those of the models."""
         self._units, self._models, model = units, world.models, world.models[0]
         self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
         self._force, self._joint = model.actuator_forcerange.copy(), model.jnt_actfrcrange.copy()
-        if actuators.torque_speed:
-            self._joint *= actuators.braking
-            for each in world.models:
+        if actuators.torque_speed or actuators.torque_pose is not None:
+            for each in world.models:  # only the motors' limits count
+                each.jnt_actfrclimited[units.joints] = False
                 for ids in units.actuators:
                     each.actuator_forcelimited[ids] = True
 
@@ -241,8 +308,8 @@ class Strength:
                 model.jnt_actfrcrange[joint] = self._joint[joint] * factor
 
 
-def check(actuators: Actuators, actuation: str, character: Character) -> None:
-    """Checks that the options suit an actuation model and a character.
+def check(actuators: Actuators, actuation: str) -> None:
+    """Checks that the options suit an actuation model.
 
     Raises:
       ValueError: they do not; the message has the name of the option.

@@ -307,9 +307,17 @@ def give(i: int, motors: Motors) -> None:
     state, slots = motors.state, motors.state.times.shape[1]
     if slots == 0:
         return
-    slot = state.given[i] % slots
+    count, size = state.given[i], state.controls.shape[2]
+    if count > 0:  # the same controls again need no place
+        same = True
+        for k in range(size):
+            last = state.controls[i, (count - 1) % slots, k]
+            same &= last == get(motors.fields[i, CTRL], k)
+        if same:
+            return
+    slot = count % slots
     state.times[i, slot] = state.age[i]
-    for k in range(state.controls.shape[2]):
+    for k in range(size):
         state.controls[i, slot, k] = get(motors.fields[i, CTRL], k)
     state.given[i] += 1
 

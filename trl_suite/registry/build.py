@@ -8,6 +8,7 @@ from typing import Any
 
 from trl_suite import characters, motion, policies
 from trl_suite import terrain as terrains
+from trl_suite.actuation import Actuators, realism
 from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
@@ -75,7 +76,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     """
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
-    actuators = merged.pop('actuators', {})
+    actuators = Actuators.parse(merged.pop('actuators', {}))
+    realism.check(actuators, spec.actuation)
     type_, others = task_type(spec), (*composed.OPTIONS, 'actuators', 'random')
     config_type, config = config_of(spec), None
     if config_type is None:
@@ -96,10 +98,10 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
-    parts = _parts(spec, type_)
+    parts = _parts(spec, type_, actuators)
     if type_ is not None:
         task = type_.make(parts, config)
-        task = actuated.actuate(task, actuators, parts.actuation, parts.character)
+        task = actuated.actuate(task, actuators, parts.character)
         return composed.compose(task, extras)
     given: dict[str, Any] = merged if config is None else {'config': config}
     if spec.clip is not None:
@@ -107,7 +109,7 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     task = spec.own['task_type'](
         parts.character, parts.arena, actuation_model=parts.actuation, **given
     )
-    task = actuated.actuate(task, actuators, parts.actuation, parts.character)
+    task = actuated.actuate(task, actuators, parts.character)
     return composed.compose(task, extras)
 
 
@@ -125,7 +127,7 @@ def _policy(name: str, source: Any) -> Any:
     return policies.reference(find(source).id)
 
 
-def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
+def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators) -> Parts:
     """Makes the parts of the task."""
     character, ground = character_of(spec), terrains.load(spec.part('terrain'))
     if ground.spatial != character.spatial:
@@ -139,7 +141,8 @@ def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
     tracked = None if kind is None or spec.clip is None else _motion(spec, kind)
     make_arena = SpatialArena if character.spatial else PlanarArena
     arena = make_arena(ground, look=scene.LOOKS.get(spec.domain, scene.OLIVE))
-    return Parts(characters.make(character), arena, tracked, spec.actuation)
+    body = realism.body(actuators, character)
+    return Parts(characters.make(body), arena, tracked, spec.actuation)
 
 
 def _motion(spec: EnvSpec, kind: type) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from trl_suite.actuation import realism
+from trl_suite.actuation import realism, series
 from trl_suite.actuation.realism import Actuators
 from trl_suite.characters import Character
 from trl_suite.engine import World
@@ -39,6 +39,9 @@ class Actuated(Task):
           character: the character whose joints are driven; it has its actuators.
         """
         self.task, self.actuators, self._character = task, actuators, character
+        self._curves = realism.curves_of(actuators, character)
+        if actuators.backlash or actuators.flex:
+            series.finish(character, task.physics_timestep)
         self.set_timesteps(task.control_timestep, task.physics_timestep)
         self.fields, self.action_map, self.blocks = task.fields, task.action_map, task.blocks
         self.in_parts = task.in_parts
@@ -82,7 +85,7 @@ class Actuated(Task):
         longest = self._steps(realism.bounds(actuators.delay)[1])
         slots = longest // self.steps_per_call + 2 if longest else 0
         self.motors = world.set_motors(
-            realism.limits(actuators, units, model),
+            realism.limits(actuators, units, model, self._curves),
             realism.noise(actuators, units, self._timestep),
             len(units.names),
             slots,
@@ -184,20 +187,15 @@ class Actuated(Task):
         self._strength.apply(env_id, self.motors.strength[env_id])
 
 
-def actuate(task: Task, given: Any, actuation: str, character: Character) -> Task:
-    """Returns the task with the actuators that the user gives; the task itself if they are ideal.
+def actuate(task: Task, actuators: Actuators, character: Character) -> Task:
+    """Returns the task with other actuators; the task itself if they are ideal.
 
     Args:
       task: the task.
-      given: options by name, or `Actuators`.
-      actuation: actuation model of the task; 'gait' if a gait controls the torques.
-      character: the character whose joints are driven.
+      actuators: the options.
+      character: the character whose joints are driven, made from what `realism.body` returns.
 
     Raises:
-      ValueError: an unknown or invalid option, or one that does not suit the actuation model.
+      ValueError: an option that does not suit the character.
     """
-    actuators = Actuators.parse(given)
-    if not actuators.changed:
-        return task
-    realism.check(actuators, actuation, character)
-    return Actuated(task, actuators, character)
+    return Actuated(task, actuators, character) if actuators.changed else task
