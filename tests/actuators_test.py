@@ -96,7 +96,7 @@ class OptionsTest(parameterized.TestCase):
         ({'no_load_speed': 5.0}, 'no effect without torque_speed'),
         ({'backlash': 0.6}, 'at most 0.5, in rad'),
         ({'flex': -0.1}, 'flex is -0.1'),
-        ({'flex': 0.1, 'flex_damping': 0.001}, 'at least 0.005'),
+        ({'flex': 0.1, 'flex_damping': -0.001}, 'at least 0'),
         ({'flex_damping': 0.1}, 'no effect without flex'),
         ({'braking': 2.0}, 'no effect without torque_speed'),
         ({'torque_pose': 'no such file.json'}, 'cannot read the table'),
@@ -154,7 +154,8 @@ class OptionsTest(parameterized.TestCase):
         plain = suite.make(gaps, task_kwargs={'random': 4})
         given = suite.make(gaps, task_kwargs={'random': 4, 'actuators': ALL})
         for _ in range(3):
-            np.testing.assert_array_equal(flat(plain.reset()), flat(given.reset()))
+            # Springs and play add bodies, which round differently.
+            np.testing.assert_allclose(flat(plain.reset()), flat(given.reset()), atol=1e-9)
 
 
 class EngineTest(absltest.TestCase):
@@ -534,10 +535,11 @@ class SeriesTest(parameterized.TestCase):
 
     @parameterized.parameters('biped2d', 'dog', 'biped3d', 'hopper')
     def test_a_spring_deflects_by_torque_over_stiffness(self, character):
-        flex = 0.08
+        flex = 0.5
         figure, physics = fixed(character, flex=flex)
         model, data = physics.model.ptr, physics.data.ptr
-        for _ in range(3000):
+        data.ctrl[:] = 0.3  # rad, so that gravity loads the joints
+        for _ in range(8000):
             physics.step()
         self.assertLess(np.abs(data.qvel).max(), 1e-3)
         largest = 0.0
@@ -552,7 +554,7 @@ class SeriesTest(parameterized.TestCase):
                 deflection, size = data.qpos[spring.qposadr], 1
             dof = motor.dofadr[0] + np.arange(size)
             # Of a ball joint, torque and deflection are parallel, but refer to different links.
-            torque = data.qfrc_actuator[dof]
+            torque = data.qfrc_actuator[dof] + data.qfrc_constraint[dof]  # at joint limits
             self.assertAlmostEqual(
                 np.linalg.norm(deflection), np.linalg.norm(torque) / stiffness,
                 delta=1e-4 + 2e-3 * np.linalg.norm(deflection),

@@ -79,7 +79,7 @@ class Actuators(Config):
         unit='rad', at_least=0, at_most=1,
     )  # fmt: skip
     flex_damping: float = option(
-        0.005, 'damping of these springs relative to their stiffness', unit='s', at_least=0.005, at_most=1
+        0.005, 'damping of these springs relative to their stiffness', unit='s', at_least=0, at_most=1
     )
     noise: float = option(
         0.0,
@@ -206,6 +206,13 @@ def curves_of(actuators: Actuators, character: Character) -> dict[str, Curve]:
     return strength_curves.load(
         actuators.torque_pose, spec.torque_curves, spec.name, tuple(spec.joints)
     )
+
+
+def body(actuators: Actuators, spec: CharacterSpec) -> CharacterSpec:
+    """Returns the character with free play and springs in its joints, if there are any."""
+    if not (actuators.backlash or actuators.flex):
+        return spec
+    return series.divided(spec, actuators.backlash, actuators.flex, actuators.flex_damping)
 
 
 def limits(

@@ -18,6 +18,8 @@ import pathlib
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
+import numpy as np
+
 from trl_suite.characters.character import Character, CharacterSpec
 from trl_suite.util import resources
 
@@ -145,9 +147,20 @@ def _joint(
 
 
 def finish(character: Character, timestep: float) -> None:
-    """Sets what actuation models set in joints: the inertia of motors, and stiff ends of the play."""
+    """Sets what depends on the time step, or what actuation models set in joints.
+
+    Springs get the armature by which an implicit integration step would increase their inertia:
+    damping * timestep + stiffness * timestep^2. MuJoCo integrates damping implicitly, but its
+    constraint solver does not take that into account; without the armature, light links on the ground
+    would be unstable.
+    """
+    find = character.mjcf_model.find
     for joint in character.joints:
         joint.armature = max(joint.armature or 0.0, MOTOR_INERTIA)
-        play = character.mjcf_model.find('joint', f'{joint.name}{PLAY}')
+        play, spring = (find('joint', f'{joint.name}{suffix}') for suffix in (PLAY, FLEX))
         if play is not None:
             play.solreflimit = (2 * timestep, 1)
+        if spring is not None:
+            # These attributes are polynomials in MJCF.
+            stiffness, damping = np.ravel(spring.stiffness)[0], np.ravel(spring.damping)[0]
+            spring.armature = float(damping * timestep + stiffness * timestep**2)
