@@ -9,12 +9,14 @@ import tempfile
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
-from dm_control import mjcf
+from dm_control import composer, mjcf
 
-from trl_suite import actuation, characters, suite
+from trl_suite import actuation, characters, describe, suite
 from trl_suite.actuation import realism, series, strength_curves
+from trl_suite.describe import actuators as describe_actuators
 from trl_suite.engine import BatchWorld, motors
 from trl_suite.engine.world import STATE
+from trl_suite.util import tables
 from trl_suite.vector import VectorEnvironment
 
 PLANAR = 'PD_Biped2D_LLC_Imitate_Flat-v0'
@@ -257,7 +259,10 @@ class TorqueSpeedTest(parameterized.TestCase):
                         f'biped3d/{name}' + ('_x' if model_name == 'torque' else '')
                     ).id
                     out = slice(model.actuator_outadr[first], model.actuator_outadr[first] + 3)
-                    wanted, limit = scratch.actuator_force[out], environment.task.character.torque_limits[k]
+                    wanted, limit = (
+                        scratch.actuator_force[out],
+                        environment.task.character.torque_limits[k],
+                    )
                     norm = np.linalg.norm(wanted)
                     dof = model.joint(f'biped3d/{name}').dofadr[0]
                     v = wanted @ scratch.qvel[dof : dof + 3] / norm
@@ -410,16 +415,18 @@ class StrengthTest(parameterized.TestCase):
             PLANAR, 200, 1, seed=3, task_kwargs={'actuators': {'strength': (0.7, 1.3)}}
         )
         environments.reset()
-        info = environments.info['strength']
-        self.assertEqual(set(info), set(environments.task.character.spec.joints))
-        drawn = np.array(list(info.values()))
+        drawn = self.drawn(environments)
         self.assertBetween(drawn.min(), 0.7, 0.72)
         self.assertBetween(drawn.max(), 1.28, 1.3)
         self.assertAlmostEqual(drawn.mean(), 1.0, delta=0.02)
         self.assertLess(abs(np.corrcoef(drawn)[0, 1]), 0.25)  # joints are independent
         environments.reset()
-        self.assertGreater(np.abs(np.array(list(environments.info['strength'].values())) - drawn).min(), 0)
+        self.assertGreater(np.abs(self.drawn(environments) - drawn).min(), 0)
         environments.close()
+
+    def drawn(self, environments):
+        joints = environments.task.character.spec.joints
+        return np.array([environments.info[f'strength_{name}'] for name in joints])
 
 
 class NoiseTest(parameterized.TestCase):
@@ -568,11 +575,14 @@ class SeriesTest(parameterized.TestCase):
     def test_play_is_free_within_its_range(self, character, both):
         backlash = 0.1
         options = {'flex': 0.02} if both else {}
-        figure, physics = fixed(character, backlash=backlash, **options)
+        _, physics = fixed(character, backlash=backlash, **options)
         model, data = physics.model.ptr, physics.data.ptr
         model.opt.gravity[:] = 0
         name = 'right_hip'
-        play, ball = model.joint(name + series.PLAY), model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_BALL
+        play, ball = (
+            model.joint(name + series.PLAY),
+            model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_BALL,
+        )
         last = model.joint(name + (series.FLEX if both else series.PLAY))  # moves the link
         found = []
         for torque in (4.0, -4.0):
@@ -680,10 +690,37 @@ class CompositionTest(parameterized.TestCase):
         for batch in (*batches, restored, clone):
             batch.close()
 
+    def test_gymnasium_shows_what_was_drawn(self):
+        import gymnasium
+
+        import trl_suite.gym  # noqa: F401
+
+        options = {'strength': (0.7, 1.3), 'delay': (10, 20)}
+        one = gymnasium.make(f'trl_suite/{PLANAR}', task_kwargs={'actuators': options})
+        _, info = one.reset(seed=1)
+        self.assertBetween(info['strength_right_hip'], 0.7, 1.3)
+        many = gymnasium.make_vec(
+            f'trl_suite/{PLANAR}', num_envs=4, task_kwargs={'actuators': options}
+        )
+        _, info = many.reset(seed=1)
+        self.assertEqual(info['delay'].shape, (4,))
+
     def test_a_state_belongs_to_its_options(self):
         one, two = make(delay=20), make(delay=30)
         with self.assertRaisesRegex(ValueError, 'delay'):
             two.set_state(one.get_state())
+
+    def test_a_plain_composer_environment_is_refused(self):
+        task = suite.make(PLANAR, task_kwargs={'actuators': {'noise': 0.1}}).task
+        environment = composer.Environment(copy.copy(task), random_state=0)
+        environment.reset()
+        with self.assertRaisesRegex(RuntimeError, 'not a plain composer.Environment'):
+            environment.step(np.zeros(len(task.action_map)))
+
+    def test_hooks_compose(self):
+        environment = make(noise=0.1)
+        environment.add_extra_hook('after_step', lambda physics, random_state: None)
+        self.assertTrue(np.isfinite(environment.step(actions(environment, 1)[0]).reward))
 
     def test_custom_rewards_compose(self):
         environment = suite.make(
@@ -693,19 +730,41 @@ class CompositionTest(parameterized.TestCase):
         environment.reset()
         environment.step(np.zeros(len(environment.action_map)))
         self.assertEqual(environment.info['reward_terms']['one'], 1.0)
-        self.assertIn('strength', environment.info)
+        self.assertIn('strength_neck', environment.info)
 
     @parameterized.parameters('torque', 'velocity', 'position', 'muscle')
     def test_extreme_settings_stay_finite(self, model):
         options = {'delay': 500, 'noise': 1.0, 'strength': (0.01, 10)}
         if model != 'muscle':
             options |= {'backlash': 0.2, 'flex': 1.0}
-            options |= {'torque_speed': True, 'no_load_speed': 0.5, 'braking': 10.0, 'torque_pose': True}
+            options |= {
+                'torque_speed': True,
+                'no_load_speed': 0.5,
+                'braking': 10.0,
+                'torque_pose': True,
+            }
         environment = make('biped2d', model, **options)
         for action in actions(environment, 60):
             step = environment.step(action)
             self.assertTrue(np.isfinite(flat(step)).all())
             self.assertTrue(step.reward is None or np.isfinite(step.reward))
+
+
+class DescriptionTest(absltest.TestCase):
+    def test_info_has_every_option(self):
+        spec = suite.find(PLANAR)
+        text = dict(describe.sections(spec, suite.make(PLANAR)))['Options of actuators']
+        for option in actuation.Actuators.options():
+            self.assertIn(option.name, text)
+        spec = suite.find(MUSCLE)
+        text = dict(describe.sections(spec, suite.make(MUSCLE)))['Options of actuators']
+        self.assertNotIn('torque_speed', text)
+        self.assertIn('strength', text)
+
+    def test_the_page_has_the_table_of_the_dataclass(self):
+        page = pathlib.Path(__file__).parents[1] / 'docs' / 'realism.md'
+        (table,) = describe_actuators.actuators().parts
+        self.assertIn(tables.markdown_table(table), page.read_text('utf-8'))
 
 
 if __name__ == '__main__':

@@ -28,12 +28,16 @@ NOISE_TIME = 0.02  # s; correlation time of the torque noise
 LONGEST_DELAY = 1000.0  # ms
 _AXES = ('_x', '_y', '_z')
 _LATERAL = 1  # the y axis
-_NOT_FOR_MUSCLES = {
-    'torque_speed': 'the force of a muscle depends on its velocity already',
+_VELOCITY, _TENDONS = (
+    'the force of a muscle depends on its velocity already',
+    'muscles act on links by rigid tendons, which span several joints',
+)
+NOT_FOR_MUSCLES = {  # option -> the reason
+    'torque_speed': _VELOCITY, 'no_load_speed': _VELOCITY, 'braking': _VELOCITY,
     'torque_pose': 'the force of a muscle depends on its length already',
     'backlash': 'muscles pull on links without gears',
-    'flex': 'muscles act on links by rigid tendons, which span several joints',
-}
+    'flex': _TENDONS, 'flex_damping': _TENDONS,
+}  # fmt: skip
 _REQUIRED = {
     'no_load_speed': 'torque_speed', 'braking': 'torque_speed', 'flex_damping': 'flex',
 }  # fmt: skip  # option -> the one that it modifies
@@ -45,11 +49,14 @@ class Actuators(Config):
 
     torque_speed: bool = option(
         False,
-        "torque limits depend on joint speed as those of a DC motor: limit * (1 - v / no_load_speed), at "
+        'torque limits depend on joint speed as those of a DC motor: limit * (1 - v / no_load_speed), at '
         "least 0 and at most limit * braking, where v is the speed in the torque's direction",
     )
     no_load_speed: float = option(
-        20.0, 'joint speed at which a motor can only brake; with torque_speed', unit='rad/s', above=0
+        20.0,
+        'joint speed at which a motor can only brake; with torque_speed',
+        unit='rad/s',
+        above=0,
     )
     braking: float = option(
         1.5,
@@ -79,7 +86,11 @@ class Actuators(Config):
         unit='rad', at_least=0, at_most=1,
     )  # fmt: skip
     flex_damping: float = option(
-        0.005, 'damping of these springs relative to their stiffness', unit='s', at_least=0, at_most=1
+        0.005,
+        'damping of these springs relative to their stiffness',
+        unit='s',
+        at_least=0,
+        at_most=1,
     )
     noise: float = option(
         0.0,
@@ -251,9 +262,7 @@ def limits(
             balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, curve))
     speed = actuators.no_load_speed if actuators.torque_speed else np.inf
     braking = actuators.braking if actuators.torque_speed else 1.0
-    return motors.limits(
-        _columns(single, 3), _columns(balls, 4), _table(rows), speed, braking
-    )
+    return motors.limits(_columns(single, 3), _columns(balls, 4), _table(rows), speed, braking)
 
 
 def _table(curves: Sequence[Curve]) -> motors.Curves | None:
@@ -321,6 +330,6 @@ def check(actuators: Actuators, actuation: str) -> None:
     Raises:
       ValueError: they do not; the message has the name of the option.
     """
-    for name, reason in _NOT_FOR_MUSCLES.items():
+    for name, reason in NOT_FOR_MUSCLES.items():
         if actuation == 'muscle' and name in actuators.changed:
             raise ValueError(f'{name} is not an option of muscle control: {reason}')

@@ -55,7 +55,10 @@ class Exertion(NamedTuple):
 ANDERSON_2007 = {
     'hip': {'extension': Exertion(0.161, 0.958, 0.932), 'flexion': Exertion(0.113, 0.738, -0.214)},
     'knee': {'extension': Exertion(0.163, 1.258, 1.133), 'flexion': Exertion(0.087, 0.869, 0.522)},
-    'ankle': {'extension': Exertion(0.095, 1.391, 0.408), 'flexion': Exertion(0.033, 1.510, -0.187)},
+    'ankle': {
+        'extension': Exertion(0.095, 1.391, 0.408),
+        'flexion': Exertion(0.033, 1.510, -0.187),
+    },
 }
 # Whether flexion swings the limb forward.
 _FORWARD = {'hip': True, 'knee': False, 'ankle': True}
@@ -116,7 +119,9 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
     if given == HUMAN:
         curves = {joint: curve for joint in joints if (curve := human(joint)) is not None}
         if not curves:
-            raise ValueError(f'torque_pose: {character!r} has no joint that ends in hip, knee or ankle')
+            raise ValueError(
+                f'torque_pose: {character!r} has no joint that ends in hip, knee or ankle'
+            )
         return curves
     if isinstance(given, (str, pathlib.Path)):
         given = _read(pathlib.Path(given))
@@ -126,7 +131,9 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
         )
     for joint in given:
         if joint not in joints:
-            raise ValueError(errors.unknown(f'joint of {character!r} in torque_pose', joint, joints))
+            raise ValueError(
+                errors.unknown(f'joint of {character!r} in torque_pose', joint, joints)
+            )
     return {joint: _curve(joint, entry) for joint, entry in given.items()}
 
 

@@ -18,6 +18,12 @@ _EVERYWHERE = (
         '',
         'custom functions, see docs/make_your_own.md',
     ),
+    (
+        'actuators',
+        '-',
+        '',
+        'limits, delay, noise, strength, free play and elasticity of motors: a dict, see docs/realism.md',
+    ),
     ('random', '-', '', 'seed; by default drawn from the operating system'),
     ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
 )

@@ -147,7 +147,9 @@ def limits(
     return Limits(*single, *balls, curves or Curves(*np.zeros((3, 0, 1))), no_load, braking)
 
 
-def noise(dof: np.ndarray | None = None, deviation: np.ndarray | None = None, decay: float = 0.0) -> Noise:
+def noise(
+    dof: np.ndarray | None = None, deviation: np.ndarray | None = None, decay: float = 0.0
+) -> Noise:
     """Returns noise; by default none."""
     if dof is None or deviation is None:
         return Noise(np.zeros(0, int), np.zeros(0), decay)

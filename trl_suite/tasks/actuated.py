@@ -22,6 +22,8 @@ _STREAM = 29  # distinguishes the draws of actuators from other draws with the s
 class Actuated(Task):
     """Another task, whose joints are driven by the motors that `Actuators` describes.
 
+    `info` has 'delay' (ms) and 'strength_NAME' of each joint or muscle, if they are options.
+
     What changes between episodes is drawn from the episode's random state without advancing it, so
     that terrain and initial states are those of the task without this option.
 
@@ -96,9 +98,8 @@ class Actuated(Task):
         self._delay = np.zeros(world.n)
         self.info_arrays = {}
         if 'strength' in actuators.changed:
-            self.info_arrays['strength'] = dict(
-                zip(units.names, self.motors.strength.T, strict=True)
-            )
+            for name, strength in zip(units.names, self.motors.strength.T, strict=True):
+                self.info_arrays[f'strength_{name}'] = strength
         if longest:
             self.info_arrays['delay'] = self._delay
         self.task.bind(world)  # afterwards, since it keeps the engine
@@ -112,7 +113,9 @@ class Actuated(Task):
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
         seeds = [drawn_seed(copy.deepcopy(each)) for each in random_states]
         self.task.reset(env_ids, random_states)
-        for env_id, seed in zip(env_ids.tolist(), seeds, strict=True):
+        for env_id, seed, each in zip(env_ids.tolist(), seeds, random_states, strict=True):
+            if (drawn_seed(copy.deepcopy(each)).entropy == seed.entropy).all():  # type: ignore[union-attr]
+                each.random_sample()  # the task drew nothing: the next episode differs all the same
             self._draw(env_id, np.random.SeedSequence(seed.entropy, spawn_key=(_STREAM,)))
 
     def _draw(self, env_id: int, seed: np.random.SeedSequence) -> None:
@@ -134,6 +137,7 @@ class Actuated(Task):
         self.task.step(action, env_ids)
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
+        self._age = self.motors.age[0]
         self.task.apply_action(action, env_ids)
 
     def simulate(self, env_ids: np.ndarray) -> None:
@@ -145,12 +149,6 @@ class Actuated(Task):
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         self.task.observe(env_ids)
 
-    def before_step(
-        self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState
-    ) -> None:
-        self._age = self.motors.age[0]
-        self.task.before_step(physics, action, random_state)
-
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         if self.motors.age[0] == self._age:
             raise RuntimeError(
@@ -158,12 +156,6 @@ class Actuated(Task):
                 'trl_suite.environments.environment.Environment, not a plain composer.Environment'
             )
         self.task.after_step(physics, random_state)
-
-    def initialize_episode(
-        self, physics: mjcf.Physics, random_state: np.random.RandomState
-    ) -> None:
-        super().initialize_episode(physics, random_state)
-        self.task._begun = self._begun
 
     # Results and state.
 
