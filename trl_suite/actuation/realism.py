@@ -152,9 +152,10 @@ def _interval(name: str, value: float | Sequence[float]) -> float | tuple[float,
     return bounds[0] if bounds[0] == bounds[1] else (bounds[0], bounds[1])
 
 
-def bounds(value: float | tuple[float, float]) -> tuple[float, float]:
+def bounds(value: float | Sequence[float]) -> tuple[float, float]:
     """Returns lower and upper bound of a value of an option, which may be a number."""
-    return value if isinstance(value, tuple) else (value, value)
+    low, high = value if isinstance(value, Sequence) else (value, value)
+    return low, high
 
 
 class Units:

@@ -62,7 +62,8 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
                 f'{", ".join(str(joint.get("name")) for joint in joints)} on the same link'
             )
         if joints:
-            _divide(body, joints[0], limits[joints[0].get('name')], backlash, flex, damping)
+            limit = limits[joints[0].get('name', '')]
+            _divide(body, joints[0], limit, backlash, flex, damping)
     # A link does not collide with the link to which its motor is attached, as before.
     for above, below in _neighbours(spec, character):
         ElementTree.SubElement(contact, 'exclude', body1=above, body2=below)

@@ -17,7 +17,7 @@ torque, v the component of the angular velocity along it, and the pose factor th
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -144,7 +144,9 @@ def limits(
     none, reals = np.zeros(0, int), np.zeros(0)
     single = single or (none, none, none, reals, none, none, none)
     balls = balls or (np.zeros((0, 3), int), none, none, none, reals, none, none)
-    return Limits(*single, *balls, curves or Curves(*np.zeros((3, 0, 1))), no_load, braking)
+    curves = curves or Curves(*np.zeros((3, 0, 1)))
+    fields: tuple[Any, ...] = (*single, *balls, curves, no_load, braking)
+    return Limits(*fields)
 
 
 def noise(
@@ -173,7 +175,6 @@ def motors(
       units: number of motors that have a strength.
       slots: number of controls that are kept for delays; 0 for no delays.
     """
-    n = len(models)
     fields = [
         [
             memory.address(array)
@@ -184,21 +185,29 @@ def motors(
         ]
         for model, each in zip(models, data, strict=True)
     ]  # fmt: skip
-    state = MotorState(
-        np.ones((n, units)), *np.zeros((4, n), int), np.zeros((n, slots), int),
-        np.zeros((n, slots, models[0].nu)), np.zeros((n, len(noise.dof))),
-        random.Streams(n).state,
-    )  # fmt: skip
+    state = _state(len(models), units, slots, models[0].nu, len(noise.dof))
     return Motors(True, np.array(fields, np.int64), limits, noise, state)
 
 
 def none(n: int) -> Motors:
     """Returns no motors, for n simulations."""
-    state = MotorState(
-        np.ones((n, 0)), *np.zeros((4, n), int), np.zeros((n, 0), int), np.zeros((n, 0, 0)),
-        np.zeros((n, 0)), random.Streams(0).state,
-    )  # fmt: skip
+    state = _state(n, 0, 0, 0, 0)
     return Motors(False, np.zeros((n, 0), np.int64), limits(), noise(), state)
+
+
+def _state(n: int, units: int, slots: int, controls: int, dofs: int) -> MotorState:
+    """Allocates the state of n simulations."""
+    return MotorState(
+        strength=np.ones((n, units)),
+        lag=np.zeros(n, int),
+        age=np.zeros(n, int),
+        given=np.zeros(n, int),
+        used=np.zeros(n, int),
+        times=np.zeros((n, slots), int),
+        controls=np.zeros((n, slots, controls)),
+        noise=np.zeros((n, dofs)),
+        stream=random.Streams(n).state,
+    )
 
 
 # Functions of simulation i.

@@ -13,7 +13,7 @@ from trl_suite.actuation import realism, series
 from trl_suite.actuation.realism import Actuators
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.tasks.task import Outcome, Task, drawn_seed
+from trl_suite.tasks.task import Outcome, Task
 from trl_suite.util import random
 
 _STREAM = 29  # distinguishes the draws of actuators from other draws with the same seed
@@ -111,12 +111,12 @@ class Actuated(Task):
         return round(delay / 1000 / self._timestep)
 
     def reset(self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]) -> None:
-        seeds = [drawn_seed(copy.deepcopy(each)) for each in random_states]
+        entropies = [_entropy(each) for each in random_states]
         self.task.reset(env_ids, random_states)
-        for env_id, seed, each in zip(env_ids.tolist(), seeds, random_states, strict=True):
-            if (drawn_seed(copy.deepcopy(each)).entropy == seed.entropy).all():  # type: ignore[union-attr]
+        for env_id, entropy, each in zip(env_ids.tolist(), entropies, random_states, strict=True):
+            if _entropy(each) == entropy:
                 each.random_sample()  # the task drew nothing: the next episode differs all the same
-            self._draw(env_id, np.random.SeedSequence(seed.entropy, spawn_key=(_STREAM,)))
+            self._draw(env_id, np.random.SeedSequence(entropy, spawn_key=(_STREAM,)))
 
     def _draw(self, env_id: int, seed: np.random.SeedSequence) -> None:
         """Draws strengths, delay and noise at the start of an episode."""
@@ -177,6 +177,11 @@ class Actuated(Task):
             array[env_id] = value
         self._delay[env_id] = 1000 * self._timestep * self.motors.lag[env_id]
         self._strength.apply(env_id, self.motors.strength[env_id])
+
+
+def _entropy(random_state: np.random.RandomState) -> list[int]:
+    """Returns the next random numbers without drawing them."""
+    return copy.deepcopy(random_state).randint(0, 2**32, size=4, dtype=np.uint32).tolist()
 
 
 def actuate(task: Task, actuators: Actuators, character: Character) -> Task:
