@@ -12,7 +12,7 @@ from trl_suite.util.tables import Section, Table, section
 _SYMBOLS = {'at_least': '>=', 'at_most': '<=', 'above': '>', 'below': '<'}
 
 
-def actuators(actuation: str | None = None) -> Section:
+def actuator_options(actuation: str | None = None) -> Section:
     """Returns the table of options, of those that an actuation model has; None: of all."""
     cells = [
         (field.name, repr(field.default), field.metadata['unit'], _bounds(field), field.metadata['meaning'])
