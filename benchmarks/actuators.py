@@ -18,7 +18,7 @@ from dm_control import mjcf
 
 from trl_suite import actuation, characters, evaluation, policies, suite
 from trl_suite.actuation import realism, series, strength_curves
-from trl_suite.describe import actuators as describe_actuators
+from trl_suite.describe.actuators import actuator_options
 from trl_suite.engine import motors
 from trl_suite.util import files, tables
 from trl_suite.vector import VectorEnvironment
@@ -226,9 +226,9 @@ def series_panel(axes: object, name: str, **options: object) -> None:
     else:
         for side in (-0.5, 0.5):
             axes.axvline(side * options['backlash'])
-    value = options[name]
+    ((option, value),) = options.items()
     axes.set(
-        title=f'{name}: {value:g} rad', xlabel='thigh against motor, rad', ylabel='torque, N m'
+        title=f'{option}: {value:g} rad', xlabel='thigh against motor, rad', ylabel='torque, N m'
     )
 
 
@@ -302,7 +302,7 @@ def effect_table(found: dict[str, object]) -> str:
 def page() -> None:
     """Writes the tables between their markers."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
-    (options,) = describe_actuators.actuators().parts
+    (options,) = actuator_options().parts
     parts = {'options': tables.markdown_table(options)}
     if 'costs' in found:
         parts['costs'] = cost_table(found['costs'])
