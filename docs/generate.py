@@ -26,8 +26,8 @@ from trl_suite.environments import named_policies as acting
 from trl_suite.registry import catalogue
 from trl_suite.registry.build import task_type
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
-from trl_suite.terrain import checks
 from trl_suite.tasks.disturbances import sensors, worlds
+from trl_suite.terrain import checks
 from trl_suite.util import files, resources
 from trl_suite.viewing import gallery
 

@@ -7,5 +7,6 @@ from trl_suite.actuation.models import (
     character_muscles,
     original_ranges,
 )
+from trl_suite.actuation.realism import Actuators
 
-__all__ = ['ACTUATIONS', 'ROTATIONS', 'add', 'character_muscles', 'original_ranges']
+__all__ = ['ACTUATIONS', 'ROTATIONS', 'Actuators', 'add', 'character_muscles', 'original_ranges']

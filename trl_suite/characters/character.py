@@ -75,6 +75,7 @@ class CharacterSpec:
         with its name, unless its default class is group0.
       notes: assumptions that were made about the character, as sentences.
       clip: name of the clip in mocap/ that it tracks by default.
+      torque_curves: name of its torque limits by joint angle, see `actuation.strength_curves`.
       differences: sentences on differences from the original, by actuation model or 'gait'.
     """
 
@@ -93,6 +94,7 @@ class CharacterSpec:
     collision_geoms: tuple[str, ...] | None = None
     notes: tuple[str, ...] = ()
     clip: str | None = None
+    torque_curves: str | None = None
     differences: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict, repr=False)
 
     @property

@@ -198,6 +198,7 @@ BIPED2D = CharacterSpec(
     fall_links=('root',),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
+    torque_curves='human',
     description='Biped, 7 links: a trunk of 25 kg and two legs; the feet are the ankle links.',
     clip='biped2d_walk',
 )
@@ -208,6 +209,7 @@ BIPED2D_SIMBICON = CharacterSpec(
     fall_links=('root',),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    torque_curves='human',
     description='Biped of the gait state machines, 7 links: the biped with heavier legs.',
     differences={
         'gait': (
@@ -226,6 +228,7 @@ BIPED2D_FULL = CharacterSpec(
     ),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
+    torque_curves='human',
     description='Biped with arms and head, 12 links, with human torque limits.',
     clip='biped2d_full_walk',
     differences={'muscle': _BORROWED},
@@ -251,6 +254,7 @@ BIPED3D = CharacterSpec(
     fall_links=('root', 'torso'),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle'),
+    torque_curves='human',
     description='Biped in 3D, 8 links; waist, hips and ankles are ball joints.',
     spatial=True,
     clip='biped3d_walk',
@@ -289,6 +293,7 @@ BIPED3D_SIMBICON = CharacterSpec(
     fall_links=('root',),
     end_effectors=('right_ankle', 'left_ankle'),
     stumble_exempt=('right_ankle', 'left_ankle', 'right_knee', 'left_knee'),
+    torque_curves='human',
     description='Biped of the gait state machines in 3D, 7 links: no waist, hips close to the middle.',
     spatial=True,
 )

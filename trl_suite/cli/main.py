@@ -136,6 +136,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
     command.add_argument('--steps', type=_positive, default=256, help='number of control steps')
     add_policy(command, 'random')
+    add_options(command)
     command.add_argument(
         '--video', type=pathlib.Path, metavar='FILE', help='write a video, .mp4 or .gif'
     )
@@ -164,6 +165,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         help=f'{", ".join(acting.POLICIES)}, or an .npz file; best: the first of these that exists',
     )  # fmt: skip
     command.add_argument('--seed', type=int, default=0, help='seed of environment and policy')
+    add_options(command)
     command.add_argument(
         '--browser', action='store_true',
         help="show it in web browsers, with controls, instead of dm_control's viewer (F1: its keys)",
@@ -176,6 +178,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     command = add('evaluate', 'run a policy for whole episodes, and print a summary')
     command.add_argument('id', metavar='ID', help="id, or 'domain/task'")
     add_policy(command, 'reference')
+    add_options(command)
     command.add_argument('--episodes', type=_positive, default=50, help='number of episodes')
     command.add_argument(
         '--seed', type=int, default=0, help='seed of the environments and the policy'

@@ -24,12 +24,8 @@ INSTEAD = 'use --browser to show it in a web browser, on this or another machine
 
 
 def run(arguments: argparse.Namespace) -> None:
-<<<<<<< HEAD
     """Opens a window and returns when it is closed, or serves web browsers until interrupted."""
-=======
-    """Opens a window, and returns when it is closed; or serves web browsers until interrupted."""
     options = dict(arguments.options or ())
->>>>>>> worlds
     if arguments.browser:
         if options:
             raise ValueError('--option is for the window; the browser has no options of tasks')

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from trl_suite.describe import common, options
+from trl_suite.describe.actuators import actuator_options
 from trl_suite.describe.differences import differences_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
@@ -37,6 +38,8 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     for title, parts_ in parts(spec, environment):
         yield title, tables.text(parts_)
+    title, parts_ = actuator_options(spec.actuation)
+    yield title, tables.text(parts_)
     for title, parts_ in options.disturbances():
         yield title, tables.text(parts_)
     yield (

@@ -34,6 +34,12 @@ _EVERYWHERE = (
         "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
         'docs/realism.md',
     ),
+    (
+        'actuators',
+        '-',
+        '',
+        'limits, delay, noise, strength, free play and elasticity of motors: a dict, see docs/realism.md',
+    ),
     ('random', '-', '', 'seed; by default drawn from the operating system'),
     ('time_limit', '-', 's', 'simulated time after which an episode is truncated'),
 )

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from trl_suite.engine import pushes
+from trl_suite.engine import memory, motors, pushes
 from trl_suite.util.compiled import Compiled, compiled, compiled_loop
 
 # Functions of type void f(const mjModel*, mjData*), in the order of `Engine.functions`.
-NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData')
-STEP, STEP1, STEP2, FORWARD, RESET = range(len(NAMES))
+NAMES = ('mj_step', 'mj_step1', 'mj_step2', 'mj_forward', 'mj_resetData', 'mj_fwdActuation')
+STEP, STEP1, STEP2, FORWARD, RESET, ACTUATION = range(len(NAMES))
 _PATTERNS = ('libmujoco.so*', 'libmujoco*.dylib', 'mujoco.dll')
 _TYPE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 # The warnings of bad position, velocity and acceleration have consecutive numbers.
@@ -41,6 +41,7 @@ class Engine(NamedTuple):
       steps: physics steps since the world was made, (n,).
       timestep: duration of a physics step, s.
       pushes: forces that act while the simulations are advanced.
+      motors: imperfections of the motors; by default there are none.
     """
 
     functions: np.ndarray
@@ -55,6 +56,7 @@ class Engine(NamedTuple):
     steps: np.ndarray
     timestep: float
     pushes: pushes.Pushes
+    motors: motors.Motors
 
 
 @functools.cache
@@ -89,7 +91,7 @@ def check_version(found: str, expected: str, path: str) -> None:
         )
 
 
-# Calls and copies by address, which need Numba intrinsics; the Python functions do the same.
+# Calls by address, which need a Numba intrinsic; the Python function does the same.
 
 
 def _call_native() -> Callable[..., Any]:
@@ -118,59 +120,7 @@ def _call(function: int, model: int, data: int) -> None:
     _TYPE(int(function))(int(model), int(data))
 
 
-def _pointer(kind: str) -> Any:
-    """Returns an intrinsic that converts an address to a pointer to numbers of type `kind`."""
-    from numba import types
-    from numba.extending import intrinsic
-
-    @intrinsic
-    def pointer(typing: Any, address: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
-
-        return types.CPointer(getattr(types, kind))(types.int64), generate
-
-    return pointer
-
-
-def _copy_native() -> Callable[..., Any]:
-    import numba
-
-    pointer = _pointer('float64')
-
-    def copy(target: int, source: int, count: int) -> None:
-        to = numba.carray(pointer(target), (count,))
-        of = numba.carray(pointer(source), (count,))
-        for k in range(count):
-            to[k] = of[k]
-
-    return copy
-
-
-def _copy(target: int, source: int, count: int) -> None:
-    """Copies numbers from one address to another."""
-    ctypes.memmove(int(target), int(source), 8 * int(count))
-
-
-def _count_native() -> Callable[..., Any]:
-    import numba
-
-    pointer = _pointer('int32')
-
-    def count_at(address: int) -> int:
-        return numba.carray(pointer(address), (1,))[0]
-
-    return count_at
-
-
-def _count(address: int) -> int:
-    """Returns the int at an address."""
-    return ctypes.c_int32.from_address(int(address)).value
-
-
 call = Compiled(_call, _call_native)
-_copy_numbers = Compiled(_copy, _copy_native)
-_count_at = Compiled(_count, _count_native)
 
 
 # Functions of simulation i.
@@ -181,7 +131,7 @@ def write(i: int, engine: Engine) -> None:
     """Copies the fields that tasks may write from the arrays to the physics."""
     for k in range(min(engine.written, len(engine.sizes))):
         size = engine.sizes[k]
-        _copy_numbers(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
+        memory.copy(engine.fields[i, k], engine.arrays[k] + 8 * size * i, size)
 
 
 @compiled
@@ -189,7 +139,7 @@ def read(i: int, engine: Engine) -> None:
     """Copies all fields from the physics to the arrays."""
     for k in range(len(engine.sizes)):
         size = engine.sizes[k]
-        _copy_numbers(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
+        memory.copy(engine.arrays[k] + 8 * size * i, engine.fields[i, k], size)
 
 
 @compiled
@@ -204,10 +154,13 @@ def step(i: int, nstep: int, engine: Engine) -> None:
     pushed = pushes.advance(i, engine.time[i], nstep * engine.timestep, engine.pushes)
     if pushed:
         begin_push(i, engine.pushes)
-    call(engine.functions[STEP2], model, data)
-    for _ in range(nstep - 1):
-        call(engine.functions[STEP], model, data)
-    call(engine.functions[STEP1], model, data)
+    if engine.motors.active:
+        step_motors(i, nstep, engine)
+    else:
+        call(engine.functions[STEP2], model, data)
+        for _ in range(nstep - 1):
+            call(engine.functions[STEP], model, data)
+        call(engine.functions[STEP1], model, data)
     for _ in range(nstep):  # one addition per step, for the same rounding as in MuJoCo
         engine.time[i] += engine.timestep
     engine.steps[i] += nstep
@@ -220,17 +173,34 @@ def step(i: int, nstep: int, engine: Engine) -> None:
 def begin_push(i: int, given: pushes.Pushes) -> None:
     """Adds the force in `scratch[i, 3:]` to the forces on the body."""
     force, place = given.forces[i] + _FORCE_STRIDE * given.body[0], given.places[i]
-    _copy_numbers(place, force, 3)
+    memory.copy(place, force, 3)
     for k in range(3):
         given.scratch[i, 3 + k] += given.scratch[i, k]
-    _copy_numbers(force, place + 3 * _NUMBER, 3)
+    memory.copy(force, place + 3 * _NUMBER, 3)
 
 
 @compiled
 def end_push(i: int, given: pushes.Pushes) -> None:
     """Restores the forces on the body, bit for bit."""
     force = given.forces[i] + _FORCE_STRIDE * given.body[0]
-    _copy_numbers(force, given.places[i], 3)
+    memory.copy(force, given.places[i], 3)
+
+
+@compiled
+def step_motors(i: int, nstep: int, engine: Engine) -> None:
+    """Advances a simulation by physics steps, before each of which its motors are updated."""
+    model, data, own = engine.models[i], engine.data[i], engine.motors
+    motors.give(i, own)
+    for _ in range(nstep):
+        motors.prepare(i, own)
+        if len(own.limits.ball_limit) > 0:
+            # The limit of a ball joint depends on the direction of the torque that it intends.
+            motors.free_balls(i, own)
+            call(engine.functions[ACTUATION], model, data)
+            motors.limit_balls(i, own)
+        call(engine.functions[STEP2], model, data)
+        call(engine.functions[STEP1], model, data)
+    motors.restore(i, own)
 
 
 @compiled
@@ -253,7 +223,7 @@ def reset(i: int, engine: Engine) -> None:
 def diverged(i: int, engine: Engine) -> bool:
     """Returns whether a simulation has had a non-finite or huge state since its reset."""
     for k in range(_BAD[0], _BAD[1]):
-        if _count_at(engine.warnings[i] + _WARNING_STRIDE * k) > 0:
+        if memory.count(engine.warnings[i] + _WARNING_STRIDE * k) > 0:
             return True
     return False
 

@@ -17,7 +17,8 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from trl_suite.engine import native, pushes
+from trl_suite.engine import motors, native, pushes
+from trl_suite.engine.memory import address
 from trl_suite.util.compiled import packed
 
 # State arrays that tasks may write. After writing any but ctrl, call `World.forward`.
@@ -106,19 +107,35 @@ class World:
             functions=np.array(native.addresses()),
             models=np.array([model._address for model in models]),
             data=np.array([each._address for each in data]),
-            warnings=np.array([_address(each.warning.number) for each in data]),
+            warnings=np.array([address(each.warning.number) for each in data]),
             fields=np.array(
-                [[_address(getattr(each, name)) for name in mirrored] for each in data], np.int64
+                [[address(getattr(each, name)) for name in mirrored] for each in data], np.int64
             ).reshape(self.n, len(mirrored)),
-            arrays=np.array([_address(array) for array in arrays[: len(mirrored)]], np.int64),
+            arrays=np.array([address(array) for array in arrays[: len(mirrored)]], np.int64),
             sizes=np.array([array[0].size for array in arrays[: len(mirrored)]], np.int64),
             written=len(WRITABLE),
             time=np.zeros(self.n),
             steps=np.zeros(self.n, int),
             timestep=models[0].opt.timestep,
-            pushes=pushes.no_pushes(np.array([_address(each.xfrc_applied) for each in data])),
+            motors=motors.none(self.n),
+            pushes=pushes.no_pushes(np.array([address(each.xfrc_applied) for each in data])),
         )
         self.pack = packed(self.engine)
+
+    def set_motors(
+        self, limits: motors.Limits, noise: motors.Noise, units: int, slots: int
+    ) -> motors.MotorState:
+        """Makes motors imperfect; for the arguments see `trl_suite.engine.motors.motors`.
+
+        It must be called before a task keeps `engine`.
+
+        Returns:
+          The state of the motors, to be drawn at the start of episodes, saved and restored.
+        """
+        made = motors.motors(self.models, self._data, limits, noise, units, slots)
+        self.engine = self.engine._replace(motors=made)
+        self.pack = packed(self.engine)
+        return made.state
 
     # Methods for tasks; env_ids are sorted numbers of simulations, without repeats.
 
@@ -288,10 +305,6 @@ class BatchWorld(World):
         threads = num_threads or os.cpu_count() or 1
         super().__init__(models, [mujoco.MjData(each) for each in models], fields, False, threads)
         self.reset(self.all_ids)
-
-
-def _address(array: np.ndarray) -> int:
-    return array.__array_interface__['data'][0]
 
 
 def light_model(root: mjcf.RootElement) -> mujoco.MjModel:

@@ -8,11 +8,12 @@ from typing import Any
 
 from trl_suite import characters, motion, policies
 from trl_suite import terrain as terrains
+from trl_suite.actuation import Actuators, realism
 from trl_suite.arenas import PlanarArena, SpatialArena, scene
 from trl_suite.registry.catalogue import ALIASES, BY_ID, find
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.registry.task_types import TASK_TYPES
-from trl_suite.tasks import composed, disturbances
+from trl_suite.tasks import actuated, composed, disturbances
 from trl_suite.tasks.task import Task
 from trl_suite.tasks.task_type import Parts, TaskType
 from trl_suite.util import errors
@@ -67,7 +68,8 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
       spec: spec of the environment.
       options: options of the task, which override those of the spec; in addition, every task has
         the options `rewards`, `observations` and `failures`, see `trl_suite.tasks.composed`, and
-        `randomize` and `sensors`, see `trl_suite.tasks.disturbances`.
+        `actuators`, `randomize` and `sensors`, see `trl_suite.actuation.Actuators` and
+        `trl_suite.tasks.disturbances`.
 
     Raises:
       ValueError: an unknown option (the message has the closest matches), a value out of range, or
@@ -76,7 +78,12 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
     merged = {**spec.options, **(options or {})}
     extras = {name: merged.pop(name) for name in composed.OPTIONS if name in merged}
     disturbing = {name: merged.pop(name) for name in disturbances.OPTIONS if name in merged}
-    type_, others = task_type(spec), (*composed.OPTIONS, *disturbances.OPTIONS, 'random')
+    actuators = Actuators.parse(merged.pop('actuators', {}))
+    realism.check(actuators, spec.actuation)
+    type_, others = (
+        task_type(spec),
+        (*composed.OPTIONS, 'actuators', *disturbances.OPTIONS, 'random'),
+    )
     config_type, config = config_of(spec), None
     if config_type is None:
         known = {option.name for option in task_options(spec)}
@@ -96,16 +103,18 @@ def build_task(spec: EnvSpec, options: Mapping[str, Any] | None = None) -> Task:
             f'{spec.task}: expected the actuation model {" or ".join(type_.actuations or ())}, not '
             f'{spec.actuation}'
         )
-    parts = _parts(spec, type_)
+    parts = _parts(spec, type_, actuators)
     if type_ is not None:
-        task = composed.compose(type_.make(parts, config), extras)
-        return disturbances.disturb(task, disturbing)
+        task = type_.make(parts, config)
+        task = actuated.actuate(task, actuators, parts.character)
+        return disturbances.disturb(composed.compose(task, extras), disturbing)
     given: dict[str, Any] = merged if config is None else {'config': config}
     if spec.clip is not None:
         given['clip'] = parts.motion
     task = spec.own['task_type'](
         parts.character, parts.arena, actuation_model=parts.actuation, **given
     )
+    task = actuated.actuate(task, actuators, parts.character)
     return disturbances.disturb(composed.compose(task, extras), disturbing)
 
 
@@ -123,7 +132,7 @@ def _policy(name: str, source: Any) -> Any:
     return policies.reference(find(source).id)
 
 
-def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
+def _parts(spec: EnvSpec, type_: TaskType | None, actuators: Actuators) -> Parts:
     """Makes the parts of the task."""
     character, ground = character_of(spec), terrains.load(spec.part('terrain'))
     if ground.spatial != character.spatial:
@@ -137,7 +146,8 @@ def _parts(spec: EnvSpec, type_: TaskType | None) -> Parts:
     tracked = None if kind is None or spec.clip is None else _motion(spec, kind)
     make_arena = SpatialArena if character.spatial else PlanarArena
     arena = make_arena(ground, look=scene.LOOKS.get(spec.domain, scene.OLIVE))
-    return Parts(characters.make(character), arena, tracked, spec.actuation)
+    body = realism.body(actuators, character)
+    return Parts(characters.make(body), arena, tracked, spec.actuation)
 
 
 def _motion(spec: EnvSpec, kind: type) -> Any:

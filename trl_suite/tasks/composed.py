@@ -133,6 +133,9 @@ class Composed(Task):
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
         self.task.apply_action(action, env_ids)
 
+    def simulate(self, env_ids: np.ndarray) -> None:
+        self.task.simulate(env_ids)
+
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.task.finish_step(env_ids)
         self._finish(env_ids)

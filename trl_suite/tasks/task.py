@@ -197,6 +197,11 @@ class Task(composer.Task):
         """Advances the physics of some simulations by one control step."""
         self.world.step(self._substeps, env_ids)
 
+    @property
+    def steps_per_call(self) -> int:
+        """The least number of physics steps between two controls; see `simulate`."""
+        return self._substeps
+
     def info(self) -> dict[str, Any]:
         """Returns further results by name: arrays of n simulations, or dicts of such arrays."""
         return _each(self.info_arrays, np.copy)

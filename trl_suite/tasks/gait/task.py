@@ -170,6 +170,10 @@ class GaitTask(Task):
         parts = self.character.spec.name, self.arena.terrain.name, self.interface
         return f'{super().signature} of {" / ".join(parts)}'
 
+    @property
+    def steps_per_call(self) -> int:
+        return self._control_substeps
+
     def bind(self, world: World) -> None:
         self.world, n = world, world.n
         figure, gait = self.figure, self.gait

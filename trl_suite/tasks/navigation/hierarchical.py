@@ -379,6 +379,10 @@ class HierarchicalNavigation(SpatialTask):
             goal = np.array([x, y, height[0, 0]])
         set_goal(i, goal, self.clock.steps[i], random, self.goals)
 
+    @property
+    def steps_per_call(self) -> int:
+        return self._frame
+
     # A step.
 
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:

@@ -1,0 +1,328 @@
+"""Costs and effects of the options of actuators, as tables and plots of docs/realism.md.
+
+    python benchmarks/actuators.py costs      # benchmarks/actuators.json: CPU time of each option
+    python benchmarks/actuators.py effects    # benchmarks/actuators.json: returns of shipped policies
+    python benchmarks/actuators.py plots      # docs/pictures/realism/actuators.png, by simulation
+    python benchmarks/actuators.py page       # the tables of docs/realism.md
+
+Costs are CPU times of one thread, by `time.thread_time`, so that other programs on the machine disturb
+them little; environments with and without an option take turns.
+"""
+
+import argparse
+import pathlib
+import time
+
+import numpy as np
+from dm_control import mjcf
+
+from trl_suite import actuation, characters, evaluation, policies, suite
+from trl_suite.actuation import realism, series, strength_curves
+from trl_suite.describe.actuators import actuator_options
+from trl_suite.engine import motors
+from trl_suite.util import files, tables
+from trl_suite.vector import VectorEnvironment
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+RESULTS, PAGE = ROOT / 'benchmarks' / 'actuators.json', ROOT / 'docs' / 'realism.md'
+PICTURE = ROOT / 'docs' / 'pictures' / 'realism' / 'actuators.png'
+OPTIONS = {
+    'torque_speed': {'torque_speed': True},
+    'torque_pose': {'torque_pose': True},
+    'delay': {'delay': 20},
+    'flex': {'flex': 0.05},
+    'backlash': {'backlash': 0.02},
+    'noise': {'noise': 0.05},
+    'strength': {'strength': (0.8, 1.2)},
+}
+OPTIONS['all'] = {name: value for each in OPTIONS.values() for name, value in each.items()}
+COST_IDS = {
+    'biped, planar': 'PD_Biped2D_LLC_Imitate_Flat-v0',
+    'biped, 3D': 'PD_Biped3D_Imitate-v0',
+    'dog, gait': 'FSM_Dog2D_Terrain_Gaps-v0',
+}
+EFFECT_IDS = {
+    'biped, position': 'PD_Biped2D_LLC_Imitate_Flat-v0',
+    'biped, velocity': 'Vel_Biped2D_LLC_Imitate_Flat-v0',
+    'biped, torque': 'Torque_Biped2D_LLC_Imitate_Flat-v0',
+    'biped, muscle': 'MTU_Biped2D_LLC_Imitate_Flat-v0',
+    'dog, position': 'PD_Dog2D_LLC_Imitate_Flat-v0',
+    'biped 3D, position': 'PD_Biped3D_Imitate-v0',
+}
+STRENGTHS = {  # three strengths of each option
+    'torque_speed': [{'torque_speed': True, 'no_load_speed': v} for v in (20.0, 10.0, 5.0)],
+    'torque_pose': [{'torque_pose': True}],
+    'delay': [{'delay': d} for d in (10, 20, 40)],
+    'flex': [{'flex': f} for f in (0.02, 0.1, 0.3)],
+    'backlash': [{'backlash': b} for b in (0.01, 0.05, 0.2)],
+    'noise': [{'noise': s} for s in (0.02, 0.1, 0.3)],
+    'strength': [{'strength': s} for s in ((0.9, 1.1), (0.7, 1.3), (0.5, 1.5))],
+}
+ENVS, ROUNDS, STEPS = 8, 5, 10
+
+
+def fits(spec: object, options: dict[str, object]) -> bool:
+    """Returns whether an environment can have these options."""
+    try:
+        suite.make(spec.id, task_kwargs={'actuators': options})  # type: ignore[attr-defined]
+    except ValueError:
+        return False
+    return True
+
+
+def store(name: str, result: object) -> None:
+    """Stores results under a name, beside the others."""
+    found = files.read_json(RESULTS) if RESULTS.exists() else {}
+    found[name] = result
+    files.write_json(found, RESULTS)
+
+
+# Costs.
+
+
+def cpu(environments: VectorEnvironment, actions: np.ndarray) -> float:
+    """Steps an environment; returns the CPU time per physics step and simulation, us."""
+    before, begin = environments.task.world.engine.steps.sum(), time.thread_time()
+    for action in actions:
+        environments.step(action)
+    spent = time.thread_time() - begin
+    return 1e6 * spent / float(environments.task.world.engine.steps.sum() - before)
+
+
+def costs() -> None:
+    """Measures the time of each option relative to ideal actuators."""
+    result = {}
+    for title, id_ in COST_IDS.items():
+        made = {}
+        for name, options in {'ideal': {}, **OPTIONS}.items():
+            own = {
+                key: value for key, value in options.items() if fits(suite.find(id_), {key: value})
+            }
+            if own or not options:
+                made[name] = VectorEnvironment(id_, ENVS, 1, seed=0, task_kwargs={'actuators': own})
+                made[name].reset()
+        size = len(made['ideal'].action_map)
+        steps = 2 if 'gait' in title else STEPS
+        rng, times = np.random.default_rng(0), {name: [] for name in made}
+        for _ in range(ROUNDS + 1):  # the first one compiles, and is dropped
+            actions = rng.uniform(-0.3, 0.3, (steps, ENVS, size))
+            for name, environments in made.items():
+                times[name].append(cpu(environments, actions))
+        median = {name: float(np.median(each[1:])) for name, each in times.items()}
+        result[title] = {name: value / median['ideal'] for name, value in median.items()}
+        result[title]['ideal'] = median['ideal']
+        print(title, result[title], flush=True)
+        store('costs', result)
+
+
+# Effects on shipped policies.
+
+
+def effects(episodes: int) -> None:
+    """Evaluates shipped policies with each option at three strengths."""
+    result: dict[str, object] = {'episodes': episodes}
+    for title, id_ in EFFECT_IDS.items():
+        policy, spec = policies.reference(id_), suite.find(id_)
+        ideal = evaluation.evaluate(id_, policy, episodes)['return']
+        row = {'ideal': ideal}
+        for name, strengths in STRENGTHS.items():
+            row[name] = [
+                evaluation.evaluate(id_, policy, episodes, task_kwargs={'actuators': each})[
+                    'return'
+                ]
+                / ideal
+                for each in strengths
+                if fits(spec, each)
+            ]
+        result[title] = row
+        print(title, row, flush=True)
+        store('effects', result)
+
+
+# Plots: each panel shows a formula as a line, and what a simulation did as dots.
+
+
+def fixed(**options: object) -> tuple[characters.Character, mjcf.Physics]:
+    """Returns the planar biped with a fixed root, servos and no gravity."""
+    given = actuation.Actuators(**options)
+    figure = characters.make(realism.body(given, characters.CHARACTERS['biped2d']))
+    actuation.add(figure, 'position', 1 / 600)
+    series.finish(figure, 1 / 600)
+    root = figure.mjcf_model
+    root.option.timestep, root.option.integrator = 1 / 600, 'implicitfast'
+    root.option.gravity = (0, 0, 0)
+    return figure, mjcf.Physics.from_mjcf_model(root)
+
+
+def speed_panel(axes: object) -> None:
+    options = {'torque_speed': True, 'no_load_speed': 10.0}
+    environment = suite.build('biped2d', task_kwargs={'actuators': options, 'random': 0})
+    environment.reset()
+    data, limit = environment.physics.data.ptr, environment.task.character.torque_limits[1]
+    dof = environment.physics.model.ptr.joint('biped2d/right_knee').dofadr[0]
+    rng, found = np.random.default_rng(0), []
+    for _ in range(30):
+        action = rng.choice([-1.0, 1.0], len(environment.action_map))
+        environment.task.apply_action(action[None], np.array([0]))
+        for _ in range(10):
+            v = data.qvel[dof]
+            environment.task.world.step(1)
+            found.append((v, data.actuator('biped2d/right_knee').force[0] / limit))
+    v = np.linspace(-15, 15, 301)
+    line = [motors.speed_factor(each, 10.0, 1.5) for each in v]
+    axes.plot(*np.array(found).T, '.', ms=2, color='0.5', label='knee of a walker')
+    axes.plot(v, line, 'C0', v, -np.array(line)[::-1], 'C0', label='limits')
+    axes.set(title='torque_speed', xlabel='speed, rad/s', ylabel='torque / limit', xlim=(-15, 15))
+
+
+def pose_panel(axes: object) -> None:
+    for k, joint in enumerate(strength_curves.ANDERSON_2007):
+        curve = strength_curves.human(joint)
+        sign = -1 if joint == 'knee' else 1
+        axes.plot(sign * curve.angle, curve.positive, f'C{k}', label=joint)
+        axes.plot(sign * curve.angle, -curve.negative, f'C{k}')
+    axes.set(
+        title='torque_pose: human', xlabel='flexion, rad', ylabel='limit / peak', xlim=(-1.2, 2.2)
+    )
+    axes.legend(fontsize=7)
+
+
+def delay_panel(axes: object) -> None:
+    environment = suite.build('biped2d', task_kwargs={'actuators': {'delay': 40}, 'random': 0})
+    environment.reset()
+    task, data = environment.task, environment.physics.data.ptr
+    size, given, used, times = len(environment.action_map), [], [], []
+    limit, kp = task.character.torque_limits[0], task.character.spec.joints['right_hip'].kp
+    address = environment.physics.model.ptr.joint('biped2d/right_hip').qposadr[0]
+    for k in range(8):
+        task.apply_action(np.full((1, size), 0.08 * (-1) ** k), np.array([0]))
+        for _ in range(10):
+            given.append(task.world.ctrl[0, 0])
+            angle = data.qpos[address]
+            task.world.step(1)
+            force = data.actuator_force[0]
+            used.append(angle + force / kp if abs(force) < limit else np.nan)
+            times.append(1000 * data.time)
+    axes.step(times, given, label='given')
+    axes.plot(times, used, '.', ms=2, label='acts (torque / kp + angle)')
+    axes.set(title='delay: 40 ms', xlabel='time, ms', ylabel='hip target, rad')
+    axes.legend(fontsize=7)
+
+
+def series_panel(axes: object, name: str, **options: object) -> None:
+    figure, physics = fixed(**options)
+    model, data = physics.model.ptr, physics.data.ptr
+    joint, motor = model.joint(f'right_hip_{name}'), model.joint('right_hip')
+    limit, found = figure.torque_limits[0], []
+    for torque in limit * 0.1 * np.concatenate([np.sin(np.linspace(0, 2.5 * np.pi, 2500))]):
+        data.qfrc_applied[:] = 0
+        data.qfrc_applied[[joint.dofadr[0], motor.dofadr[0]]] = torque  # on the thigh
+        physics.step()
+        found.append((data.qpos[joint.qposadr[0]], torque))
+    axes.plot(*np.array(found).T, '.', ms=2, color='0.5')
+    if name == 'flex':
+        deflection = np.array([-0.012, 0.012])
+        axes.plot(deflection, deflection * limit / options['flex'])
+    else:
+        for side in (-0.5, 0.5):
+            axes.axvline(side * options['backlash'])
+    ((option, value),) = options.items()
+    axes.set(
+        title=f'{option}: {value:g} rad', xlabel='thigh against motor, rad', ylabel='torque, N m'
+    )
+
+
+def noise_panel(axes: object) -> None:
+    environment = suite.build('biped2d', task_kwargs={'actuators': {'noise': 0.1}, 'random': 0})
+    environment.reset()
+    task, data, found = environment.task, environment.physics.data.ptr, []
+    dof = environment.physics.model.ptr.joint('biped2d/right_hip').dofadr[0]
+    for _ in range(150):
+        task.world.step(1)
+        found.append((1000 * data.time, data.qfrc_applied[dof] / task.character.torque_limits[0]))
+    axes.plot(*np.array(found).T)
+    axes.axhspan(-0.1, 0.1, alpha=0.2)
+    axes.set(title='noise: 0.1', xlabel='time, ms', ylabel='torque / limit')
+
+
+def strength_panel(axes: object) -> None:
+    environments = VectorEnvironment(
+        EFFECT_IDS['biped, position'],
+        500,
+        1,
+        0,
+        task_kwargs={'actuators': {'strength': (0.7, 1.3)}},
+    )
+    environments.reset()
+    drawn = [environments.info[f'strength_{side}_knee'] for side in ('right', 'left')]
+    axes.plot(*drawn, '.', ms=2)
+    axes.set(title='strength: (0.7, 1.3)', xlabel='right knee', ylabel='left knee')
+
+
+def plots() -> None:
+    """Draws a panel for each option."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((10, 4.6), layout='constrained')
+    axes = figure.subplots(2, 4).ravel()
+    speed_panel(axes[0])
+    pose_panel(axes[1])
+    delay_panel(axes[2])
+    series_panel(axes[3], 'flex', flex=0.1)
+    series_panel(axes[4], 'play', backlash=0.05)
+    noise_panel(axes[5])
+    strength_panel(axes[6])
+    axes[7].set_axis_off()
+    PICTURE.parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(PICTURE) as path:
+        figure.savefig(path, dpi=110, format='png')
+
+
+# The page.
+
+
+def cost_table(found: dict[str, dict[str, float]]) -> str:
+    rows = [
+        [name, *(f'{found[title].get(name, np.nan):.2f}'.replace('nan', '-') for title in found)]
+        for name in OPTIONS
+    ]
+    return tables.markdown_table(tables.Table(('option', *found), rows))
+
+
+def effect_table(found: dict[str, object]) -> str:
+    rows = []
+    for title, row in found.items():
+        if title == 'episodes':
+            continue
+        cells = [', '.join(f'{share:.2f}' for share in row[name]) or '-' for name in STRENGTHS]
+        rows.append([title, f'{row["ideal"]:.0f}', *cells])
+    return tables.markdown_table(tables.Table(('policy', 'return, ideal', *STRENGTHS), rows))
+
+
+def page() -> None:
+    """Writes the tables between their markers."""
+    found = files.read_json(RESULTS) if RESULTS.exists() else {}
+    (options,) = actuator_options().parts
+    parts = {'options': tables.markdown_table(options)}
+    if 'costs' in found:
+        parts['costs'] = cost_table(found['costs'])
+    if 'effects' in found:
+        parts['effects'] = effect_table(found['effects'])
+    text = PAGE.read_text(encoding='utf-8')
+    for name, part in parts.items():
+        begin, end = f'<!-- actuators: {name} -->\n', '<!-- end -->'
+        before, rest = text.split(begin)
+        text = before + begin + '\n' + part.strip() + '\n\n' + end + rest.split(end, 1)[1]
+    with files.replacing(PAGE) as path:
+        path.write_text(text, encoding='utf-8')
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser.add_argument('what', choices=('costs', 'effects', 'plots', 'page'))
+    parser.add_argument('--episodes', type=int, default=32)
+    args = parser.parse_args()
+    if args.what == 'effects':
+        effects(args.episodes)
+    else:
+        {'costs': costs, 'plots': plots, 'page': page}[args.what]()

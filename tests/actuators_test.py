@@ -1,0 +1,772 @@
+"""Imperfect motors: torques against formulas, and composition with everything else."""
+
+import copy
+import json
+import pathlib
+import pickle
+import tempfile
+
+import mujoco
+import numpy as np
+from absl.testing import absltest, parameterized
+from dm_control import composer, mjcf
+
+from trl_suite import actuation, characters, describe, suite
+from trl_suite.actuation import realism, series, strength_curves
+from trl_suite.describe.actuators import actuator_options
+from trl_suite.engine import BatchWorld, motors
+from trl_suite.engine.world import STATE
+from trl_suite.util import tables
+from trl_suite.vector import VectorEnvironment
+
+PLANAR = 'PD_Biped2D_LLC_Imitate_Flat-v0'
+SPATIAL = 'PD_Biped3D_Imitate-v0'
+MUSCLE = 'MTU_Biped2D_LLC_Imitate_Flat-v0'
+GAIT = 'FSM_Dog2D_Terrain_Gaps-v0'
+CHARACTERS = ('biped2d', 'biped3d')
+MODELS = ('torque', 'velocity', 'position')
+EACH = {
+    'torque_speed': {'torque_speed': True, 'no_load_speed': 8.0},
+    'strength': {'strength': (0.7, 1.3)},
+    'noise': {'noise': 0.1},
+    'delay': {'delay': (0, 60)},
+    'torque_pose': {'torque_pose': True},
+    'flex': {'flex': 0.05},
+    'backlash': {'backlash': 0.02},
+}
+NOT_FOR_MUSCLES = ('torque_speed', 'no_load_speed', 'torque_pose', 'flex', 'backlash')
+ALL = {name: value for options in EACH.values() for name, value in options.items()}
+
+
+def make(character='biped2d', model='position', task='imitation', **options):
+    """An environment after its reset."""
+    environment = suite.build(
+        character, model, task=task, task_kwargs={'actuators': options, 'random': 1}
+    )
+    environment.reset()
+    return environment
+
+
+def actions(environment, steps, seed=0, scale=1.0):
+    size = len(environment.action_map)
+    return scale * np.random.default_rng(seed).uniform(-1, 1, (steps, size))
+
+
+def flat(step):
+    return np.concatenate([np.ravel(block) for block in step.observation.values()])
+
+
+def joint_of(environment, name):
+    task = environment.task
+    return environment.physics.model.ptr.joint(f'{task.character.spec.name}/{name}')
+
+
+def each_step(environment, action, steps):
+    """Yields MjData before and after each physics step under one action."""
+    data = environment.physics.data.ptr
+    environment.task.apply_action(action[None], np.array([0]))
+    for _ in range(steps):
+        before = data.qpos.copy(), data.qvel.copy()
+        environment.task.world.step(1)
+        yield before, data
+
+
+def limit_of(v, limit, no_load, braking):
+    """Largest torque in the direction in which v is measured."""
+    return limit * min(max(1 - v / no_load, 0), braking)
+
+
+def lateral(quaternion):
+    """Rotation of a ball joint about -y, rad."""
+    vector = np.zeros(3)
+    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return -vector[1]
+
+
+class OptionsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ({'torque_sped': True}, "did you mean 'torque_speed'"),
+        ({'delay': -1}, 'delay is -1'),
+        ({'delay': 5000}, 'at most 1000, in ms'),
+        ({'delay': (30, 10)}, 'ascending order'),
+        ({'delay': (1, 2, 3)}, 'two bounds'),
+        ({'noise': 2}, 'at most 1'),
+        ({'noise': float('nan')}, 'noise is nan'),
+        ({'strength': 0}, 'strength is 0'),
+        ({'strength': 'weak'}, 'strength'),
+        ({'torque_speed': 1}, 'True or False'),
+        ({'no_load_speed': 5.0}, 'no effect without torque_speed'),
+        ({'backlash': 0.6}, 'at most 0.5, in rad'),
+        ({'flex': -0.1}, 'flex is -0.1'),
+        ({'flex': 0.1, 'flex_damping': -0.001}, 'at least 0'),
+        ({'flex_damping': 0.1}, 'no effect without flex'),
+        ({'braking': 2.0}, 'no effect without torque_speed'),
+        ({'torque_pose': 'no such file.json'}, 'cannot read the table'),
+        ({'torque_pose': 3}, 'expected True'),
+        ({'torque_pose': {'right_nee': {}}}, "did you mean 'right_knee'"),
+        ({'torque_pose': {'right_knee': {'angle': [0, 1]}}}, 'angle, positive, negative'),
+        (
+            {'torque_pose': {'right_knee': {'angle': [0, 0], 'positive': [1, 1], 'negative': [1, 1]}}},
+            'ascending order',
+        ),
+        (
+            {'torque_pose': {'right_knee': {'angle': [0, 1], 'positive': [1, 1], 'negative': [1, -1]}}},
+            'from 0 to 10',
+        ),
+        ([1], 'expected a dict of options'),
+    )  # fmt: skip
+    def test_bad_options_are_refused_by_name(self, options, message):
+        with self.assertRaisesRegex(ValueError, message):
+            suite.make(PLANAR, task_kwargs={'actuators': options})
+
+    @parameterized.parameters('torque_speed', 'torque_pose')
+    def test_options_that_muscles_include_are_refused(self, name):
+        with self.assertRaisesRegex(ValueError, f'{name} is not an option of muscle control'):
+            suite.make(MUSCLE, task_kwargs={'actuators': {name: True}})
+
+    @parameterized.parameters('flex', 'backlash')
+    def test_muscles_have_no_gears(self, name):
+        with self.assertRaisesRegex(ValueError, f'{name} is not an option of muscle control'):
+            suite.make(MUSCLE, task_kwargs={'actuators': {name: 0.1}})
+
+    def test_a_character_without_curves_has_none(self):
+        with self.assertRaisesRegex(ValueError, "'dog' has no curves of its own"):
+            suite.build('dog', task_kwargs={'actuators': {'torque_pose': True}})
+
+    def test_ideal_actuators_change_nothing(self):
+        ideal = {'delay': 0, 'noise': 0, 'strength': 1, 'torque_pose': False}
+        plain = suite.make(PLANAR, task_kwargs={'random': 4})
+        given = suite.make(PLANAR, task_kwargs={'random': 4, 'actuators': ideal})
+        self.assertIs(type(given.task), type(plain.task))
+        self.assertEqual(
+            given.task.root_entity.mjcf_model.to_xml_string(),
+            plain.task.root_entity.mjcf_model.to_xml_string(),
+        )
+
+    def test_a_dataclass_is_taken_as_a_dict_is(self):
+        options = actuation.Actuators(delay=20, strength=(0.8, 1.2))
+        one = suite.make(PLANAR, task_kwargs={'random': 4, 'actuators': options})
+        two = suite.make(PLANAR, task_kwargs={'random': 4, 'actuators': options.changed})
+        one.reset(), two.reset()
+        action = np.ones(len(one.action_map))
+        np.testing.assert_array_equal(flat(one.step(action)), flat(two.step(action)))
+
+    def test_terrain_and_start_do_not_depend_on_the_option(self):
+        gaps = 'PD_Biped2D_Gaps_Terrain-v0'
+        plain = suite.make(gaps, task_kwargs={'random': 4})
+        given = suite.make(gaps, task_kwargs={'random': 4, 'actuators': ALL})
+        for _ in range(3):
+            # Springs and play add bodies, which round differently.
+            np.testing.assert_allclose(flat(plain.reset()), flat(given.reset()), atol=1e-9)
+
+
+class EngineTest(absltest.TestCase):
+    def test_motors_without_effect_leave_every_bit(self):
+        xml = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
+        <geom type="plane" size="9 9 1"/><body pos="0 0 1"><freejoint/><geom size=".1 .2" type="capsule"/>
+        <body><joint name="j" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body>
+        </body></worldbody><actuator><position joint="j" kp="30" kv="2" forcerange="-9 9"/></actuator>
+        </mujoco>"""
+        model = mujoco.MjModel.from_xml_string(xml)
+        plain, other = BatchWorld(model, 3, 1), BatchWorld(model, 3, 1)
+        other.set_motors(motors.limits(), motors.noise(), 0, 0)
+        rng = np.random.default_rng(0)
+        for world in (plain, other):
+            world.forward(world.all_ids)
+        for _ in range(60):
+            control = rng.uniform(-1, 1, (3, 1))
+            for world in (plain, other):
+                world.ctrl[:] = control
+                world.step(7)
+            np.testing.assert_array_equal(plain.qpos, other.qpos)
+            np.testing.assert_array_equal(plain.qvel, other.qvel)
+
+
+class TorqueSpeedTest(parameterized.TestCase):
+    NO_LOAD, BRAKING = 6.0, 1.25
+
+    def make(self, character, model):
+        return make(
+            character, model, torque_speed=True, no_load_speed=self.NO_LOAD, braking=self.BRAKING
+        )
+
+    def test_servos_of_hinges_follow_the_formula(self):
+        environment = self.make('biped2d', 'position')
+        spec, saturated = environment.task.character.spec, 0
+        rng = np.random.default_rng(0)
+        for _ in range(8):
+            action = rng.choice([-1.0, 1.0], len(environment.action_map))
+            target = environment.action_map.control(action)
+            for (qpos, qvel), data in each_step(environment, action, 10):
+                for k, (name, joint) in enumerate(spec.joints.items()):
+                    own = joint_of(environment, name)
+                    limit = environment.task.character.torque_limits[k]
+                    v = qvel[own.dofadr[0]]
+                    kv = joint.kd - min(limit / 50, joint.kd)
+                    torque = joint.kp * (target[k] - qpos[own.qposadr[0]]) - kv * v
+                    high = limit_of(v, limit, self.NO_LOAD, self.BRAKING)
+                    low = -limit_of(-v, limit, self.NO_LOAD, self.BRAKING)
+                    saturated += not low <= torque <= high
+                    self.assertAlmostEqual(
+                        data.actuator_force[k], min(max(torque, low), high), delta=1e-9 * limit
+                    )
+        self.assertGreater(saturated, 50)
+
+    def test_torque_equals_that_of_mujocos_dc_motor(self):
+        # A DC motor at full voltage V: torque K / R (V - K v) = limit (1 - v / no_load).
+        limit, no_load = 12.0, 8.0
+        xml = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/>
+        </body></worldbody><actuator><dcmotor name="m" joint="j" motorconst="{k}" resistance="{r}"/>
+        </actuator></mujoco>"""
+        constant = 1.5
+        voltage = constant * no_load
+        resistance = constant * voltage / limit
+        model = mujoco.MjModel.from_xml_string(xml.format(k=constant, r=resistance))
+        data = mujoco.MjData(model)
+        data.ctrl[0] = voltage
+        for v in np.linspace(0, no_load, 9):
+            data.qvel[0] = v
+            mujoco.mj_forward(model, data)
+            expected = limit * motors.speed_factor(v, no_load, 1.5)
+            self.assertAlmostEqual(data.actuator_force[0], expected, places=9)
+
+    def test_norm_of_ball_joints_follows_the_formula(self):
+        # The intended torque is that of the same state without limits.
+        for model in ('position', 'torque'):
+            with self.subTest(model):
+                self.balls(model)
+
+    def balls(self, model_name):
+        environment = self.make('biped3d', model_name)
+        model, data = environment.physics.model.ptr, environment.physics.data.ptr
+        free, scratch = copy.copy(model), mujoco.MjData(model)
+        free.actuator_forcelimited[:] = False
+        spec, saturated = environment.task.character.spec, 0
+        rng = np.random.default_rng(1)
+        for _ in range(6):
+            action = rng.choice([-1.0, 1.0], len(environment.action_map))
+            environment.task.apply_action(action[None], np.array([0]))
+            for _ in range(8):
+                state = np.empty(mujoco.mj_stateSize(model, STATE))
+                mujoco.mj_getState(model, data, state, STATE)
+                mujoco.mj_setState(free, scratch, state, STATE)
+                mujoco.mj_forward(free, scratch)
+                environment.task.world.step(1)
+                for k, name in enumerate(spec.joints):
+                    if not environment.task.character.spherical[k]:
+                        continue
+                    first = model.actuator(
+                        f'biped3d/{name}' + ('_x' if model_name == 'torque' else '')
+                    ).id
+                    out = slice(model.actuator_outadr[first], model.actuator_outadr[first] + 3)
+                    wanted, limit = (
+                        scratch.actuator_force[out],
+                        environment.task.character.torque_limits[k],
+                    )
+                    norm = np.linalg.norm(wanted)
+                    dof = model.joint(f'biped3d/{name}').dofadr[0]
+                    v = wanted @ scratch.qvel[dof : dof + 3] / norm
+                    most = limit_of(v, limit, self.NO_LOAD, self.BRAKING)
+                    saturated += norm > most
+                    np.testing.assert_allclose(
+                        data.actuator_force[out], wanted * min(1, most / norm), atol=1e-7 * limit
+                    )
+        self.assertGreater(saturated, 10)
+
+    def test_velocity_servos_of_ball_joints_have_a_limit_about_each_axis(self):
+        environment = self.make('biped3d', 'velocity')
+        model = environment.physics.model.ptr
+        joint = model.joint('biped3d/right_hip')
+        each = environment.task.character.torque_limits[1] / np.sqrt(3)
+        action, saturated = np.ones(len(environment.action_map)), 0
+        for (_, qvel), data in each_step(environment, action, 30):
+            for k, axis in enumerate('xyz'):
+                v = qvel[joint.dofadr[0] + k]
+                high = limit_of(v, each, self.NO_LOAD, self.BRAKING)
+                low = -limit_of(-v, each, self.NO_LOAD, self.BRAKING)
+                force = data.actuator(f'biped3d/right_hip_{axis}').force[0]
+                self.assertBetween(force, low - 1e-9, high + 1e-9)
+                saturated += force > high - 1e-9
+        self.assertGreater(saturated, 10)
+
+    def test_gaits_have_the_limits_at_every_physics_step(self):
+        environment = make('dog', None, 'gait', torque_speed=True, no_load_speed=5.0)
+        model, seen = environment.physics.model.ptr, []
+        environment.step(np.zeros(len(environment.action_map)))
+        data = environment.physics.data.ptr
+        # The ranges were written for the velocities before the last physics step.
+        for k, name in enumerate(environment.task.character.spec.joints):
+            low, high = model.actuator(f'dog/{name}').forcerange
+            limit = environment.task.character.torque_limits[k]
+            self.assertBetween(-low / limit, 0, 1.5)
+            self.assertBetween(high / limit, 0, 1.5)
+            self.assertBetween(data.actuator_force[k], low, high)
+            seen += [high / limit, -low / limit]
+        self.assertGreater(np.ptp(seen), 0.1)
+
+
+class TorquePoseTest(parameterized.TestCase):
+    def test_human_curves_are_those_of_the_publication(self):
+        # Table 3, men of 18 to 25 years; ratios at the angle of the largest torque.
+        knee = strength_curves.human('right_knee')
+        at = lambda curve, angle: np.interp(angle, knee.angle, curve)  # noqa: E731
+        self.assertAlmostEqual(at(knee.positive, -1.133), 1.0, delta=0.01)  # extension
+        self.assertAlmostEqual(at(knee.negative, -0.522), 0.087 / 0.163, delta=0.01)
+        straight = np.cos(1.258 * 1.133)
+        self.assertAlmostEqual(at(knee.positive, 0.0), straight, delta=0.02)
+        ankle = strength_curves.human('left_ankle')
+        weak = np.interp(-0.187, ankle.angle, ankle.positive)  # dorsiflexion
+        self.assertAlmostEqual(weak, 0.033 / 0.095, delta=0.01)
+        self.assertAlmostEqual(ankle.negative.max(), 1.0, delta=0.01)
+        self.assertIsNone(strength_curves.human('neck'))
+
+    def test_servos_follow_the_table(self):
+        table = {
+            'right_knee': {'angle': [-1.5, -0.5, 0.0], 'positive': [0.2, 0.8, 0.1], 'negative': [0.5, 0.3, 0.4]}
+        }  # fmt: skip
+        environment = make(torque_pose=table)
+        own, found = joint_of(environment, 'right_knee'), []
+        limit = environment.task.character.torque_limits[1]
+        rng = np.random.default_rng(2)
+        for _ in range(8):
+            action = rng.choice([-1.0, 1.0], len(environment.action_map))
+            for (qpos, _), data in each_step(environment, action, 10):
+                factors = {
+                    name: np.interp(qpos[own.qposadr[0]], table['right_knee']['angle'], table['right_knee'][name])
+                    for name in ('positive', 'negative')
+                }  # fmt: skip
+                low, high = -limit * factors['negative'], limit * factors['positive']
+                force = data.actuator('biped2d/right_knee').force[0]
+                self.assertBetween(force, low - 1e-9, high + 1e-9)
+                found.append(min(abs(force - low), abs(force - high)) < 1e-9)
+        self.assertGreater(np.mean(found), 0.3)
+
+    @parameterized.parameters('position', 'torque', 'velocity')
+    def test_ball_joints_have_the_limit_about_the_lateral_axis(self, model):
+        # Torques that swing the right hip forward are limited to a tenth, others are not.
+        entry = {'angle': [-3.0, 3.0], 'positive': [0.1, 0.1], 'negative': [1.0, 1.0]}
+        environment = make('biped3d', model, torque_pose={'right_hip': entry})
+        own, other, forward = {}, [], []
+        limit = environment.task.character.torque_limits[1]
+        joint = joint_of(environment, 'right_hip')
+        rng = np.random.default_rng(3)
+        for _ in range(10):
+            action = rng.choice([-1.0, 1.0], len(environment.action_map))
+            for _, data in each_step(environment, action, 5):
+                own = data.qfrc_actuator[joint.dofadr[0] + np.arange(3)]
+                forward.append(-own[1] / limit)
+                other.append(np.linalg.norm(own) / limit)
+        self.assertLessEqual(max(forward), 0.1 + 1e-9)
+        self.assertGreater(max(forward), 0.05)
+        self.assertLess(min(forward), -0.2)
+        self.assertLessEqual(max(other), 1 + 1e-9)
+
+    def test_the_angle_of_a_ball_joint_is_its_rotation_about_the_lateral_axis(self):
+        for vector in ([0, -0.7, 0], [0.3, 0.5, -0.2], [0, 3.0, 0]):
+            angle = np.linalg.norm(vector)
+            quaternion = np.zeros(4)
+            mujoco.mju_axisAngle2Quat(quaternion, np.array(vector) / angle, angle)
+            for sign in (1, -1):
+                address = (sign * quaternion).copy()
+                found = motors.lateral_angle(address.__array_interface__['data'][0], 0)
+                self.assertAlmostEqual(found, vector[1], places=12)
+                self.assertAlmostEqual(-found, lateral(quaternion), places=12)
+
+    def test_a_file_is_read_as_a_table_is(self):
+        table = {'right_knee': {'angle': [-1, 0], 'positive': [1, 0.5], 'negative': [0.5, 0.5]}}
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / 'table.json'
+            path.write_text(json.dumps(table))
+            one, two = make(torque_pose=str(path)), make(torque_pose=table)
+        for action in actions(one, 5):
+            np.testing.assert_array_equal(flat(one.step(action)), flat(two.step(action)))
+
+
+class StrengthTest(parameterized.TestCase):
+    @parameterized.product(character=CHARACTERS, model=MODELS)
+    def test_torques_and_limits_scale(self, character, model):
+        # One physics step from the same state: the torque is the factor times that of the ideal motor.
+        plain = suite.build(character, model, task_kwargs={'random': 1})
+        weak = make(character, model, strength=0.5)
+        plain.reset()
+        action = np.ones(len(plain.action_map))
+        for environment in (plain, weak):
+            environment.task.apply_action(action[None], np.array([0]))
+            environment.task.world.step(1)
+        np.testing.assert_allclose(
+            weak.physics.data.ptr.actuator_force, 0.5 * plain.physics.data.ptr.actuator_force,
+            rtol=1e-9, atol=1e-12,
+        )  # fmt: skip
+
+    def test_muscle_forces_scale(self):
+        plain = suite.make(MUSCLE, task_kwargs={'random': 1})
+        weak = suite.make(MUSCLE, task_kwargs={'random': 1, 'actuators': {'strength': 0.5}})
+        action = np.ones(len(plain.action_map))
+        for environment in (plain, weak):
+            environment.reset()
+            environment.task.apply_action(action[None], np.array([0]))
+            environment.task.world.step(1)
+        force = plain.physics.data.ptr.actuator_force
+        self.assertLess(force.min(), -100)
+        np.testing.assert_allclose(weak.physics.data.ptr.actuator_force, 0.5 * force, rtol=1e-9)
+
+    def test_factors_are_drawn_uniformly_and_shown(self):
+        environments = VectorEnvironment(
+            PLANAR, 200, 1, seed=3, task_kwargs={'actuators': {'strength': (0.7, 1.3)}}
+        )
+        environments.reset()
+        drawn = self.drawn(environments)
+        self.assertBetween(drawn.min(), 0.7, 0.72)
+        self.assertBetween(drawn.max(), 1.28, 1.3)
+        self.assertAlmostEqual(drawn.mean(), 1.0, delta=0.02)
+        self.assertLess(abs(np.corrcoef(drawn)[0, 1]), 0.25)  # joints are independent
+        environments.reset()
+        self.assertGreater(np.abs(self.drawn(environments) - drawn).min(), 0)
+        environments.close()
+
+    def drawn(self, environments):
+        joints = environments.task.character.spec.joints
+        return np.array([environments.info[f'strength_{name}'] for name in joints])
+
+
+class NoiseTest(parameterized.TestCase):
+    def test_deviation_and_correlation_time(self):
+        environment = make(noise=0.1)
+        task, data = environment.task, environment.physics.data.ptr
+        limits = task.character.torque_limits
+        dofs = [joint_of(environment, name).dofadr[0] for name in task.character.spec.joints]
+        found = []
+        for _ in range(6000):
+            task.world.step(1)
+            found.append(data.qfrc_applied[dofs] / limits)
+        found = np.array(found)
+        self.assertAlmostEqual(found.std(), 0.1, delta=0.01)
+        self.assertAlmostEqual(found.mean(), 0.0, delta=0.01)
+        lag = round(realism.NOISE_TIME / task.physics_timestep)
+        correlation = (found[lag:] * found[:-lag]).mean() / found.var()
+        self.assertAlmostEqual(correlation, np.exp(-1), delta=0.05)
+        self.assertLess(abs((found[:, 0] * found[:, 1]).mean() / found.var()), 0.1)
+
+    def test_muscle_driven_joints_have_it_too(self):
+        environment = suite.make(MUSCLE, task_kwargs={'random': 1, 'actuators': {'noise': 0.1}})
+        environment.reset()
+        environment.step(np.zeros(len(environment.action_map)))
+        self.assertGreater(np.count_nonzero(environment.physics.data.ptr.qfrc_applied), 5)
+
+
+class DelayTest(parameterized.TestCase):
+    @parameterized.parameters(0.5, 1.0, 37.0, 100.0, 500.0)
+    def test_a_control_takes_effect_after_the_delay(self, delay):
+        environment = make(delay=delay)
+        task, data = environment.task, environment.physics.data.ptr
+        lag = round(delay / 1000 / task.physics_timestep)
+        self.assertAlmostEqual(
+            environment.info.get('delay', 0), 1000 * lag * task.physics_timestep, places=9
+        )
+        given, applied, per = [], [], 20
+        target = np.zeros(len(environment.action_map))
+        for action in actions(environment, 25):
+            task.apply_action(action[None], np.array([0]))
+            given.append(environment.action_map.control(action))
+            task.world.step(per)
+            np.testing.assert_array_equal(task.world.ctrl[0], given[-1])  # as the task wrote it
+        # Replayed step by step: what acts at step s is the control given at step s - lag, at first the first.
+        other = make(delay=delay)
+        own = other.physics.data.ptr
+        for k, action in enumerate(actions(other, 25)):
+            other.task.apply_action(action[None], np.array([0]))
+            for s in range(per):
+                qpos, qvel = own.qpos.copy(), own.qvel.copy()
+                other.task.world.step(1)
+                target = given[max(0, (k * per + s - lag) // per)]
+                applied = self.servo(other, 3, target, qpos, qvel)
+                self.assertAlmostEqual(own.actuator_force[3], applied, places=9)
+        del data
+
+    def servo(self, environment, k, target, qpos, qvel):
+        character = environment.task.character
+        joint, limit = list(character.spec.joints.values())[k], character.torque_limits[k]
+        own = joint_of(environment, list(character.spec.joints)[k])
+        kv = joint.kd - min(limit / 50, joint.kd)
+        torque = joint.kp * (target[k] - qpos[own.qposadr[0]]) - kv * qvel[own.dofadr[0]]
+        return min(max(torque, -limit), limit)
+
+    def test_delay_equals_mujocos_own(self):
+        # A motor whose first control is 0 from the start, as MuJoCo's history begins with 0.
+        lag, timestep = 23, 0.002
+        xml = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody><body>
+        <joint name="j" axis="0 1 0" damping=".1"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/>
+        </body></worldbody><actuator><motor joint="j" {delay}/></actuator></mujoco>"""
+        own = mujoco.MjModel.from_xml_string(
+            xml.format(delay=f'delay="{lag * timestep}" nsample="40" interp="zoh"')
+        )
+        data = mujoco.MjData(own)
+        world = BatchWorld(mujoco.MjModel.from_xml_string(xml.format(delay='')), 1, 1)
+        state = world.set_motors(motors.limits(), motors.noise(), 0, lag // 5 + 2)
+        state.lag[:] = lag
+        world.forward(world.all_ids)
+        rng, control = np.random.default_rng(0), 0.0
+        for _ in range(40):
+            world.ctrl[:] = data.ctrl[:] = control
+            mujoco.mj_step(own, data, 5)
+            world.step(5)
+            np.testing.assert_allclose(world.qpos[0], data.qpos, atol=1e-12)
+            control = rng.uniform(-1, 1)
+        self.assertGreater(abs(data.qvel[0]), 0.01)
+
+    def test_drawn_delays_are_uniform_and_shown(self):
+        environments = VectorEnvironment(
+            PLANAR, 200, 1, seed=3, task_kwargs={'actuators': {'delay': (10, 50)}}
+        )
+        environments.reset()
+        delay = environments.info['delay']
+        self.assertBetween(delay.min(), 9, 13)
+        self.assertBetween(delay.max(), 47, 51)
+        self.assertAlmostEqual(delay.mean(), 30, delta=3)
+        environments.close()
+
+
+def fixed(character, **options):
+    """A character whose root is fixed, with servos, and its physics; gravity acts."""
+    spec = characters.CHARACTERS[character]
+    figure = characters.make(realism.body(actuation.Actuators(**options), spec))
+    actuation.add(figure, 'position', 1 / 600)
+    series.finish(figure, 1 / 600)
+    figure.mjcf_model.option.timestep = 1 / 600
+    figure.mjcf_model.option.integrator = 'implicitfast'
+    return figure, mjcf.Physics.from_mjcf_model(figure.mjcf_model)
+
+
+class SeriesTest(parameterized.TestCase):
+    """Free play and springs between motors and links."""
+
+    @parameterized.parameters('biped2d', 'dog', 'biped3d', 'hopper')
+    def test_a_spring_deflects_by_torque_over_stiffness(self, character):
+        flex = 0.5
+        figure, physics = fixed(character, flex=flex)
+        model, data = physics.model.ptr, physics.data.ptr
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        data.ctrl[:] = 0.3  # rad, so that gravity loads the joints
+        for _ in range(8000):
+            physics.step()
+        self.assertLess(np.abs(data.qvel).max(), 1e-3)
+        largest = 0.0
+        for k, name in enumerate(figure.spec.joints):
+            motor, spring = model.joint(name), model.joint(name + series.FLEX)
+            stiffness = figure.torque_limits[k] / flex
+            if figure.spherical[k]:
+                deflection, size = np.zeros(3), 3
+                address = spring.qposadr[0]
+                mujoco.mju_quat2Vel(deflection, data.qpos[address : address + 4], 1.0)
+            else:
+                deflection, size = data.qpos[spring.qposadr], 1
+            dof = motor.dofadr[0] + np.arange(size)
+            # Of a ball joint, torque and deflection are parallel, but refer to different links.
+            torque = data.qfrc_actuator[dof] + data.qfrc_constraint[dof]  # at joint limits
+            self.assertAlmostEqual(
+                np.linalg.norm(deflection), np.linalg.norm(torque) / stiffness,
+                delta=1e-4 + 2e-3 * np.linalg.norm(deflection),
+            )  # fmt: skip
+            if size == 1:
+                self.assertAlmostEqual(deflection[0], -torque[0] / stiffness, delta=1e-4)
+            largest = max(largest, np.linalg.norm(deflection))
+        self.assertGreater(largest, 2e-3)
+
+    @parameterized.product(character=('biped2d', 'biped3d'), both=(False, True))
+    def test_play_is_free_within_its_range(self, character, both):
+        backlash = 0.1
+        options = {'flex': 0.02} if both else {}
+        _, physics = fixed(character, backlash=backlash, **options)
+        model, data = physics.model.ptr, physics.data.ptr
+        model.opt.gravity[:] = 0
+        name = 'right_hip'
+        play, ball = (
+            model.joint(name + series.PLAY),
+            model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_BALL,
+        )
+        last = model.joint(name + (series.FLEX if both else series.PLAY))  # moves the link
+        found = []
+        for torque in (4.0, -4.0):
+            for _ in range(1500):
+                data.qfrc_applied[:] = 0
+                for joint in {play.id, last.id, model.joint(name).id}:  # on the link about y
+                    data.qfrc_applied[model.jnt_dofadr[joint] + ball] = torque
+                data.qvel *= 0.99
+                physics.step()
+            address = play.qposadr[0]
+            if ball:
+                vector = np.zeros(3)
+                mujoco.mju_quat2Vel(vector, data.qpos[address : address + 4], 1.0)
+                found.append(vector[1])
+            else:
+                found.append(data.qpos[address])
+        self.assertAlmostEqual(found[0] - found[1], backlash, delta=0.03 * backlash)
+
+    @parameterized.parameters({'flex': 0.05}, {'backlash': 0.02}, {'flex': 0.05, 'backlash': 0.02})
+    def test_mass_poses_and_observations_are_those_of_the_character(self, **options):
+        for character in CHARACTERS:
+            plain = suite.build(character, task_kwargs={'random': 5})
+            given = suite.build(character, task_kwargs={'random': 5, 'actuators': options})
+            np.testing.assert_allclose(flat(plain.reset()), flat(given.reset()), atol=1e-9)
+            self.assertEqual(plain.task.figure.__class__, given.task.figure.__class__)
+            mass = [e.physics.model.ptr.body_mass.sum() for e in (plain, given)]
+            self.assertAlmostEqual(mass[1] / mass[0], 1, delta=1e-4)
+            pairs = [e.physics.model.ptr.nexclude for e in (plain, given)]
+            self.assertGreater(pairs[1], pairs[0])
+            given.step(np.zeros(len(given.action_map)))
+
+    def test_links_on_one_body_are_refused(self):
+        xml = """<mujoco><worldbody><body name="root"><geom name="root" size=".1"/>
+        <body name="a"><joint name="a" axis="0 1 0" actuatorfrcrange="-1 1"/>
+        <joint name="b" axis="0 1 0" actuatorfrcrange="-1 1"/><geom name="a" size=".1"/></body>
+        </body></worldbody></mujoco>"""
+        spec = characters.CharacterSpec(
+            name='two', joints={'a': characters.Joint(1, 1, 1), 'b': characters.Joint(1, 1, 1)},
+            fall_links=('root',), end_effectors=('a',), stumble_exempt=(), description='', xml=xml,
+            bodies=('root', 'a'),
+        )  # fmt: skip
+        with self.assertRaisesRegex(ValueError, 'flex needs one joint for each link'):
+            realism.body(actuation.Actuators(flex=0.1), spec)
+
+
+class CompositionTest(parameterized.TestCase):
+    """Each option, and all of them: single, batch, threads, save, restore, copy and pickle."""
+
+    def options(self, spec, name):
+        options = dict(ALL if name == 'all' else EACH[name])
+        if suite.find(spec).actuation == 'muscle':
+            options = {key: options[key] for key in options if key not in NOT_FOR_MUSCLES}
+        return options
+
+    @parameterized.product(spec=(PLANAR, SPATIAL), name=(*EACH, 'all'))
+    def test_bit_identity(self, spec, name):
+        self.compare(spec, self.options(spec, name), 10)
+
+    @parameterized.parameters('strength', 'noise', 'delay', 'all')
+    def test_bit_identity_with_muscles(self, name):
+        self.compare(MUSCLE, self.options(MUSCLE, name), 10)
+
+    def test_bit_identity_of_gaits(self):
+        self.compare(GAIT, {name: ALL[name] for name in ALL if name != 'torque_pose'}, 3)
+
+    def test_bit_identity_of_hierarchies(self):
+        self.compare('PD_Biped3D_HLC_Soccer-v0', ALL, 2)
+
+    def compare(self, spec, options, steps):
+        kwargs = {'actuators': options}
+        seeds = [11, 12, 13, 14, 15, 16, 17, 18]
+        batches = [
+            VectorEnvironment(spec, 8, threads, seeds, task_kwargs=kwargs) for threads in (1, 3)
+        ]
+        single = suite.make(spec, task_kwargs={**kwargs, 'random': 15})
+        np.testing.assert_array_equal(batches[0].reset(), batches[1].reset())
+        single.reset()
+        size, saved = len(single.action_map), None
+        rng = np.random.default_rng(0)
+        for k in range(steps):
+            if k == steps // 2:
+                saved = pickle.loads(pickle.dumps(batches[0].get_state()))
+                restored = VectorEnvironment(spec, 8, 2, 99, task_kwargs=kwargs)
+                restored.reset()
+                restored.set_state(saved)
+                copied = pickle.loads(pickle.dumps(single))
+                clone = VectorEnvironment(spec, 1, 1, 5, task_kwargs=kwargs)
+                clone.reset()
+                clone.copy_from(batches[0], [4], [0])
+            action = rng.uniform(-1, 1, (8, size))
+            one, two = (batch.step(action) for batch in batches)
+            np.testing.assert_array_equal(one.observation, two.observation)
+            np.testing.assert_array_equal(one.reward, two.reward)
+            self.assertTrue(np.isfinite(one.observation).all())
+            if k == 0 or not one.terminated[4]:
+                np.testing.assert_array_equal(flat(single.step(action[4])), one.observation[4])
+            if saved is not None:
+                np.testing.assert_array_equal(restored.step(action).observation, one.observation)
+                if not one.terminated[4]:
+                    np.testing.assert_array_equal(flat(copied.step(action[4])), one.observation[4])
+                    found = clone.step(action[4:5]).observation[0]
+                    np.testing.assert_array_equal(found, one.observation[4])
+            if one.terminated[4]:
+                break
+        for batch in (*batches, restored, clone):
+            batch.close()
+
+    def test_gymnasium_shows_what_was_drawn(self):
+        import gymnasium
+
+        import trl_suite.gym  # noqa: F401
+
+        options = {'strength': (0.7, 1.3), 'delay': (10, 20)}
+        one = gymnasium.make(f'trl_suite/{PLANAR}', task_kwargs={'actuators': options})
+        _, info = one.reset(seed=1)
+        self.assertBetween(info['strength_right_hip'], 0.7, 1.3)
+        many = gymnasium.make_vec(
+            f'trl_suite/{PLANAR}', num_envs=4, task_kwargs={'actuators': options}
+        )
+        _, info = many.reset(seed=1)
+        self.assertEqual(info['delay'].shape, (4,))
+
+    def test_a_state_belongs_to_its_options(self):
+        one, two = make(delay=20), make(delay=30)
+        with self.assertRaisesRegex(ValueError, 'delay'):
+            two.set_state(one.get_state())
+
+    def test_a_plain_composer_environment_is_refused(self):
+        task = suite.make(PLANAR, task_kwargs={'actuators': {'noise': 0.1}}).task
+        environment = composer.Environment(copy.copy(task), random_state=0)
+        environment.reset()
+        with self.assertRaisesRegex(RuntimeError, 'not a plain composer.Environment'):
+            environment.step(np.zeros(len(task.action_map)))
+
+    def test_hooks_compose(self):
+        environment = make(noise=0.1)
+        environment.add_extra_hook('after_step', lambda physics, random_state: None)
+        self.assertTrue(np.isfinite(environment.step(actions(environment, 1)[0]).reward))
+
+    def test_custom_rewards_compose(self):
+        environment = suite.make(
+            PLANAR,
+            task_kwargs={'actuators': ALL, 'rewards': {'one': (1.0, lambda task: np.ones(1))}},
+        )
+        environment.reset()
+        environment.step(np.zeros(len(environment.action_map)))
+        self.assertEqual(environment.info['reward_terms']['one'], 1.0)
+        self.assertIn('strength_right_hip', environment.info)
+
+    @parameterized.parameters('torque', 'velocity', 'position', 'muscle')
+    def test_extreme_settings_stay_finite(self, model):
+        options = {'delay': 500, 'noise': 1.0, 'strength': (0.01, 10)}
+        if model != 'muscle':
+            options |= {'backlash': 0.2, 'flex': 1.0}
+            options |= {
+                'torque_speed': True,
+                'no_load_speed': 0.5,
+                'braking': 10.0,
+                'torque_pose': True,
+            }
+        environment = make('biped2d', model, **options)
+        for action in actions(environment, 60):
+            step = environment.step(action)
+            self.assertTrue(np.isfinite(flat(step)).all())
+            self.assertTrue(step.reward is None or np.isfinite(step.reward))
+
+
+class DescriptionTest(absltest.TestCase):
+    def test_info_has_every_option(self):
+        spec = suite.find(PLANAR)
+        text = dict(describe.sections(spec, suite.make(PLANAR)))['Options of actuators']
+        for option in actuation.Actuators.options():
+            self.assertIn(option.name, text)
+        spec = suite.find(MUSCLE)
+        text = dict(describe.sections(spec, suite.make(MUSCLE)))['Options of actuators']
+        self.assertNotIn('torque_speed', text)
+        self.assertIn('strength', text)
+
+    def test_the_page_has_the_table_of_the_dataclass(self):
+        page = pathlib.Path(__file__).parents[1] / 'docs' / 'realism.md'
+        (table,) = actuator_options().parts
+        self.assertIn(tables.markdown_table(table), page.read_text('utf-8'))
+
+
+if __name__ == '__main__':
+    absltest.main()

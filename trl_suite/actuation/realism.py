@@ -1,0 +1,336 @@
+"""Actuators closer to reality: the options, and what the engine needs for them.
+
+    suite.make(ID, task_kwargs={'actuators': {'torque_speed': True, 'delay': 20, 'strength': (0.8, 1.2)}})
+
+Every task whose joints are driven takes the option. `trl_suite.engine.motors` has the formulas, and
+`trl_suite.tasks.actuated` draws what changes between episodes.
+
+Torques, gains and limits are those of the actuation model (see `trl_suite.actuation.models`). For a
+prismatic joint read m for rad and N for N m.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from trl_suite.actuation import series, strength_curves
+from trl_suite.actuation.strength_curves import Curve
+from trl_suite.characters.character import Character, CharacterSpec
+from trl_suite.engine import World, motors
+from trl_suite.util.options import Config, option
+
+NOISE_TIME = 0.02  # s; correlation time of the torque noise
+LONGEST_DELAY = 1000.0  # ms
+_AXES = ('_x', '_y', '_z')
+_LATERAL = 1  # the y axis
+_VELOCITY, _TENDONS = (
+    'the force of a muscle depends on its velocity already',
+    'muscles act on links by rigid tendons, which span several joints',
+)
+NOT_FOR_MUSCLES = {  # option -> the reason
+    'torque_speed': _VELOCITY, 'no_load_speed': _VELOCITY, 'braking': _VELOCITY,
+    'torque_pose': 'the force of a muscle depends on its length already',
+    'backlash': 'muscles pull on links without gears',
+    'flex': _TENDONS, 'flex_damping': _TENDONS,
+}  # fmt: skip
+_REQUIRED = {
+    'no_load_speed': 'torque_speed', 'braking': 'torque_speed', 'flex_damping': 'flex',
+}  # fmt: skip  # option -> the one that it modifies
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Actuators(Config):
+    """Options of actuators; with the defaults they are ideal."""
+
+    torque_speed: bool = option(
+        False,
+        'torque limits depend on joint speed as those of a DC motor: limit * (1 - v / no_load_speed), at '
+        "least 0 and at most limit * braking, where v is the speed in the torque's direction",
+    )
+    no_load_speed: float = option(
+        20.0,
+        'joint speed at which a motor can only brake; with torque_speed',
+        unit='rad/s',
+        above=0,
+    )
+    braking: float = option(
+        1.5,
+        'largest torque against the motion, in torque limits; with torque_speed',
+        at_least=1, at_most=10,
+    )  # fmt: skip
+    torque_pose: Any = option(
+        None,
+        "factors of the torque limits by joint angle and direction: True for the character's own (bipeds: "
+        "human legs), 'human', a JSON file, or a table of joint -> angle (rad), positive, negative",
+    )
+    delay: float | Sequence[float] = option(
+        0.0,
+        'time until a control takes effect, rounded to physics steps; of two bounds, between which it is '
+        'drawn for each episode',
+        unit='ms', at_least=0, at_most=LONGEST_DELAY,
+    )  # fmt: skip
+    backlash: float = option(
+        0.0,
+        'free play between motor and link of every joint; of a ball joint the opening angle of a cone',
+        unit='rad', at_least=0, at_most=0.5,
+    )  # fmt: skip
+    flex: float = option(
+        0.0,
+        'deflection of a spring between motor and link of every joint at the torque limit; its stiffness '
+        'is torque limit / flex',
+        unit='rad', at_least=0, at_most=1,
+    )  # fmt: skip
+    flex_damping: float = option(
+        0.005,
+        'damping of these springs relative to their stiffness',
+        unit='s',
+        at_least=0,
+        at_most=1,
+    )
+    noise: float = option(
+        0.0,
+        'standard deviation of torque noise, in torque limits; an Ornstein-Uhlenbeck process for each '
+        f'degree of freedom, with a correlation time of {NOISE_TIME:g} s',
+        at_least=0, at_most=1,
+    )  # fmt: skip
+    strength: float | Sequence[float] = option(
+        1.0,
+        'factor of all torques of a motor or muscle, gains and limits included; of two bounds, between '
+        'which it is drawn for each motor and episode',
+        above=0, at_most=10,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.torque_pose is False:
+            self._set('torque_pose', None)
+        for name in ('delay', 'strength'):
+            self._set(name, _interval(name, getattr(self, name)))
+        for name, needed in _REQUIRED.items():
+            if not getattr(self, needed) and name in self.changed:
+                raise ValueError(f'{name} has no effect without {needed}; give both or none')
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """The options that differ from the defaults, by name."""
+        return {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if getattr(self, field.name) != field.default
+        }
+
+    @classmethod
+    def parse(cls, value: Any) -> Actuators:
+        """Returns the actuators that a user gives: options by name, or `Actuators`.
+
+        Raises:
+          ValueError: another type, an unknown name, or an invalid value.
+        """
+        if isinstance(value, Actuators):
+            return value
+        if not isinstance(value, Mapping):
+            raise ValueError(f'actuators is {value!r}; expected a dict of options, or Actuators')
+        return cls.of('actuators', value)
+
+
+def _interval(name: str, value: float | Sequence[float]) -> float | tuple[float, float]:
+    """Returns a number, or two bounds in ascending order; equal ones become a number.
+
+    Raises:
+      ValueError: another number of values, or another order.
+    """
+    if np.ndim(value) == 0:
+        return float(value)  # type: ignore[arg-type]
+    bounds = tuple(float(each) for each in value)  # type: ignore[union-attr]
+    if len(bounds) != 2 or bounds[0] > bounds[1]:
+        raise ValueError(f'{name} is {value}; expected a number, or two bounds in ascending order')
+    return bounds[0] if bounds[0] == bounds[1] else (bounds[0], bounds[1])
+
+
+def bounds(value: float | Sequence[float]) -> tuple[float, float]:
+    """Returns lower and upper bound of a value of an option, which may be a number."""
+    low, high = value if isinstance(value, Sequence) else (value, value)
+    return low, high
+
+
+class Units:
+    """The motors of a character's joints, or its muscles, in a compiled model.
+
+    Attributes:
+      names: joint or muscle of each, U of them.
+      actuators: ids of the actuators of each.
+      joints: id of the joint on which the actuators of a motor act.
+      limits: torque limit of each joint, N m, for all J joints of the character.
+      muscles: whether they are muscles.
+      dofs: addresses in qvel of the joints that are driven, (D,), and the limit of each, (D,) N m.
+    """
+
+    def __init__(self, character: Character, model: mujoco.MjModel) -> None:
+        """Finds the actuators.
+
+        Raises:
+          ValueError: the character has actuators of another kind than those of the suite.
+        """
+        scope, name = f'{character.mjcf_model.model}/', character.spec.name
+        found = {model.actuator(i).name: i for i in range(model.nactuator)}
+        tendons = int(mujoco.mjtTrn.mjTRN_TENDON)
+        self.muscles = model.nactuator > 0 and bool((model.actuator_trntype == tendons).all())
+        self.limits = character.torque_limits
+        joints = [
+            mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_JOINT), scope + joint)
+            for joint in character.spec.joints
+        ]
+        if self.muscles:
+            self.names = tuple(actuator.removeprefix(scope) for actuator in found)
+            self.actuators = [np.array([i]) for i in found.values()]
+        else:
+            self.names, self.actuators = tuple(character.spec.joints), []
+            for joint in self.names:
+                names = [scope + joint]
+                if names[0] not in found:
+                    names = [scope + joint + axis for axis in _AXES]
+                if any(each not in found for each in names):
+                    raise ValueError(
+                        f'actuators: joint {joint!r} of {name!r} has no actuator of the actuation '
+                        'models of the suite'
+                    )
+                self.actuators.append(np.array([found[each] for each in names]))
+            joints = [int(model.actuator_trnid[each[0], 0]) for each in self.actuators]
+        self.joints = np.array(joints)
+        sizes = np.where(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_BALL, 3, 1)
+        self.dofs = np.concatenate([
+            model.jnt_dofadr[joint] + np.arange(size)
+            for joint, size in zip(self.joints, sizes, strict=True)
+        ]).astype(int)  # fmt: skip
+        self.dof_limits = np.repeat(self.limits, sizes)
+
+
+def curves_of(actuators: Actuators, character: Character) -> dict[str, Curve]:
+    """Returns the factors of torque limits by joint angle, by joint."""
+    if actuators.torque_pose is None:
+        return {}
+    spec = character.spec
+    return strength_curves.load(
+        actuators.torque_pose, spec.torque_curves, spec.name, tuple(spec.joints)
+    )
+
+
+def body(actuators: Actuators, spec: CharacterSpec) -> CharacterSpec:
+    """Returns the character with free play and springs in its joints, if there are any."""
+    if not (actuators.backlash or actuators.flex):
+        return spec
+    return series.divided(spec, actuators.backlash, actuators.flex, actuators.flex_damping)
+
+
+def limits(
+    actuators: Actuators, units: Units, model: mujoco.MjModel, curves: Mapping[str, Curve]
+) -> motors.Limits:
+    """Returns the limits of motors that depend on speed and pose."""
+    if not (actuators.torque_speed or curves):
+        return motors.limits()
+    ball = model.jnt_type[units.joints] == mujoco.mjtJoint.mjJNT_BALL
+    place = {name: k for k, name in enumerate(curves)}
+    turns = dict(zip(units.names, ball, strict=True))
+    # The engine takes rotations of ball joints about y, and the tables have those about -y.
+    rows = [
+        Curve(-curve.angle[::-1], curve.negative[::-1], curve.positive[::-1])
+        if turns[name] else curve
+        for name, curve in curves.items()
+    ]  # fmt: skip
+    single: list[tuple[Any, ...]] = []
+    balls: list[tuple[Any, ...]] = []
+    for unit, (ids, joint, limit) in enumerate(
+        zip(units.actuators, units.joints, units.limits, strict=True)
+    ):
+        qpos, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        curve = place.get(units.names[unit], -1)
+        if not ball[unit]:
+            single.append((ids[0], qpos, dof, limit, unit, curve, 1))
+        elif len(ids) == 3 and model.actuator_biastype[ids[0]] != mujoco.mjtBias.mjBIAS_NONE:
+            # Velocity servos, each with a limit of its own.
+            each = model.actuator_forcerange[ids[0], 1]
+            single += [
+                (ids[k], qpos, dof + k, each, unit, curve if k == _LATERAL else -1, -1)
+                for k in range(3)
+            ]
+        else:
+            group = [*ids, -1, -1][:3]
+            balls.append((group, model.actuator_outadr[ids[0]], qpos, dof, limit, unit, curve))
+    speed = actuators.no_load_speed if actuators.torque_speed else np.inf
+    braking = actuators.braking if actuators.torque_speed else 1.0
+    return motors.limits(_columns(single, 3), _columns(balls, 4), _table(rows), speed, braking)
+
+
+def _table(curves: Sequence[Curve]) -> motors.Curves | None:
+    """Returns curves as a table, whose rows repeat their last knots; None if there are no curves."""
+    if not curves:
+        return None
+    most = max(len(curve.angle) for curve in curves)
+    columns = [
+        [np.pad(values, (0, most - len(values)), 'edge') for values in field]
+        for field in zip(*curves, strict=True)
+    ]
+    return motors.Curves(*map(np.array, columns))
+
+
+def _columns(rows: list[tuple[Any, ...]], reals: int) -> tuple[np.ndarray, ...] | None:
+    """Returns the columns of a table as arrays of integers; column `reals` as floats."""
+    if not rows:
+        return None
+    return tuple(
+        np.array(column, float if k == reals else int)
+        for k, column in enumerate(zip(*rows, strict=True))
+    )
+
+
+def noise(actuators: Actuators, units: Units, timestep: float) -> motors.Noise:
+    """Returns the torque noise."""
+    if not actuators.noise:
+        return motors.noise()
+    deviation = actuators.noise * units.dof_limits
+    return motors.noise(units.dofs, deviation, float(np.exp(-timestep / NOISE_TIME)))
+
+
+class Strength:
+    """Scales the torques of motors and muscles in the models of simulations."""
+
+    def __init__(self, actuators: Actuators, units: Units, world: World) -> None:
+        """Keeps the nominal values; limits that the engine writes replace those of the models."""
+        self._units, self._models, model = units, world.models, world.models[0]
+        self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+        self._force, self._joint = model.actuator_forcerange.copy(), model.jnt_actfrcrange.copy()
+        if actuators.torque_speed or actuators.torque_pose is not None:
+            for each in world.models:  # only the motors' limits count
+                each.jnt_actfrclimited[units.joints] = False
+                for ids in units.actuators:
+                    each.actuator_forcelimited[ids] = True
+
+    def apply(self, env_id: int, strength: np.ndarray) -> None:
+        """Sets the strength of each unit of a simulation, (U,)."""
+        model, units = self._models[env_id], self._units
+        # Numbers of the parameters that are proportional to torque: a muscle's peak force; gains.
+        scaled = slice(2, 3) if units.muscles else slice(0, 3)
+        for unit, ids in enumerate(units.actuators):
+            factor = strength[unit]
+            model.actuator_gainprm[ids, scaled] = self._gain[ids, scaled] * factor
+            model.actuator_biasprm[ids, scaled] = self._bias[ids, scaled] * factor
+            if not units.muscles:
+                model.actuator_forcerange[ids] = self._force[ids] * factor
+                joint = units.joints[unit]
+                model.jnt_actfrcrange[joint] = self._joint[joint] * factor
+
+
+def check(actuators: Actuators, actuation: str) -> None:
+    """Checks that the options suit an actuation model.
+
+    Raises:
+      ValueError: they do not; the message has the name of the option.
+    """
+    for name, reason in NOT_FOR_MUSCLES.items():
+        if actuation == 'muscle' and name in actuators.changed:
+            raise ValueError(f'{name} is not an option of muscle control: {reason}')

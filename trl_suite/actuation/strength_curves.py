@@ -1,0 +1,163 @@
+"""Torque limits by joint angle: tables, and those of human legs.
+
+A table maps joints to the knots of two curves; joints that it lacks keep their limits:
+
+    {"right_knee": {"angle": [-2.0, -1.0, 0.0],      # of the joint, rad, ascending
+                    "positive": [0.6, 1.0, 0.4],     # factor of the limit of positive torques
+                    "negative": [0.3, 0.4, 0.5]}}    # factor of the limit of negative torques
+
+Between the knots the factors are interpolated, beyond the ends they are constant. The angle of a ball
+joint is that about the lateral axis: minus the y component of its rotation vector, so that a positive
+angle, as a positive torque, swings a limb forward; torques about other axes keep their limits.
+
+The human curves are those of D. E. Anderson, M. L. Madigan, M. A. Nussbaum, 'Maximum voluntary joint
+torque as a function of joint angle and angular velocity: model development and application to the lower
+limb', Journal of Biomechanics 40 (2007), 3105-3113: table 3, men of 18 to 25 years, isometric torque
+C1 cos(C2 (angle - C3)) relative to body weight times height. The coefficients were compared with those
+in the library RBDL (`Millard2016TorqueMuscle`), which cites the same table. Ours are the choices of
+normalisation (the largest torque of a joint, in its stronger direction, is the character's torque limit)
+and of `LEAST`, the factor where the cosine is smaller, which is outside the measured range.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trl_suite.util import errors
+
+HUMAN = 'human'
+LEAST = 0.1
+KNOTS = 41
+_FIELDS = ('angle', 'positive', 'negative')
+MOST = 10.0  # largest factor
+
+
+class Exertion(NamedTuple):
+    """Coefficients of one direction of a joint.
+
+    Attributes:
+      c1: largest isometric torque / (weight * height).
+      c2: width: the torque is proportional to cos(c2 (angle - c3)).
+      c3: angle of the largest torque, rad.
+    """
+
+    c1: float
+    c2: float
+    c3: float
+
+
+# Flexion is positive at hip and knee, dorsiflexion at the ankle; 0 is upright standing.
+ANDERSON_2007 = {
+    'hip': {'extension': Exertion(0.161, 0.958, 0.932), 'flexion': Exertion(0.113, 0.738, -0.214)},
+    'knee': {'extension': Exertion(0.163, 1.258, 1.133), 'flexion': Exertion(0.087, 0.869, 0.522)},
+    'ankle': {
+        'extension': Exertion(0.095, 1.391, 0.408),
+        'flexion': Exertion(0.033, 1.510, -0.187),
+    },
+}
+# Whether flexion swings the limb forward.
+_FORWARD = {'hip': True, 'knee': False, 'ankle': True}
+
+
+class Curve(NamedTuple):
+    """Factors of the limits of a joint by its angle, (knots,)."""
+
+    angle: np.ndarray
+    positive: np.ndarray
+    negative: np.ndarray
+
+
+def human(joint: str) -> Curve | None:
+    """Returns the curve of a joint whose name ends in hip, knee or ankle; None for other joints.
+
+    Positive angles and torques of the joint must swing the limb forward.
+    """
+    kind = joint.split('_')[-1]
+    if kind not in ANDERSON_2007:
+        return None
+    exertions, forward = ANDERSON_2007[kind], _FORWARD[kind]
+    angle = np.linspace(-np.pi, np.pi, KNOTS)
+    flexion = angle if forward else -angle
+    largest = max(each.c1 for each in exertions.values())
+    factors = {
+        name: np.maximum(each.c1 / largest * _cosine(each.c2 * (flexion - each.c3)), LEAST)
+        for name, each in exertions.items()
+    }
+    positive, negative = ('flexion', 'extension') if forward else ('extension', 'flexion')
+    return Curve(angle, factors[positive], factors[negative])
+
+
+def _cosine(angle: np.ndarray) -> np.ndarray:
+    """Cosine, but 0 beyond a quarter turn."""
+    return np.where(np.abs(angle) < np.pi / 2, np.cos(angle), 0.0)
+
+
+def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -> dict[str, Curve]:
+    """Returns the curves by joint of a character.
+
+    Args:
+      given: True for the character's own, 'human', a JSON file, or a table.
+      own: name of the character's own curves; None if it has none.
+      character: name of the character, for messages.
+      joints: its joints.
+
+    Raises:
+      ValueError: the character has no curves, or the table is invalid.
+    """
+    if given is True:
+        if own is None:
+            raise ValueError(
+                f'torque_pose: character {character!r} has no curves of its own; give a table of '
+                'joint -> angle, positive, negative'
+            )
+        given = own
+    if given == HUMAN:
+        curves = {joint: curve for joint in joints if (curve := human(joint)) is not None}
+        if not curves:
+            raise ValueError(
+                f'torque_pose: {character!r} has no joint that ends in hip, knee or ankle'
+            )
+        return curves
+    if isinstance(given, (str, pathlib.Path)):
+        given = _read(pathlib.Path(given))
+    if not isinstance(given, Mapping):
+        raise ValueError(
+            f"torque_pose is {given!r}; expected True, 'human', a JSON file, or a table by joint"
+        )
+    for joint in given:
+        if joint not in joints:
+            raise ValueError(
+                errors.unknown(f'joint of {character!r} in torque_pose', joint, joints)
+            )
+    return {joint: _curve(joint, entry) for joint, entry in given.items()}
+
+
+def _read(path: pathlib.Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise ValueError(f'torque_pose: cannot read the table {str(path)!r}: {error}') from None
+
+
+def _curve(joint: str, entry: Any) -> Curve:
+    """Returns a checked curve of a table."""
+    owner = f'torque_pose[{joint!r}]'
+    if not isinstance(entry, Mapping) or set(entry) != set(_FIELDS):
+        raise ValueError(f'{owner} is {entry!r}; expected a dict with {", ".join(_FIELDS)}')
+    try:
+        angle, positive, negative = (np.array(entry[name], float) for name in _FIELDS)
+    except (TypeError, ValueError):
+        raise ValueError(f'{owner} is {entry!r}; expected lists of numbers') from None
+    if angle.ndim != 1 or len(angle) < 2 or not angle.shape == positive.shape == negative.shape:
+        raise ValueError(f'{owner}: expected lists of equal length, at least 2')
+    if not (np.isfinite(angle).all() and (np.diff(angle) > 0).all()):
+        raise ValueError(f'{owner}: angle is {angle}; expected finite numbers in ascending order')
+    for name, factors in (('positive', positive), ('negative', negative)):
+        if not ((factors >= 0) & (factors <= MOST)).all():
+            raise ValueError(f'{owner}: {name} is {factors}; expected numbers from 0 to {MOST:g}')
+    return Curve(angle, positive, negative)
