@@ -488,7 +488,7 @@ class Learner:
         self.seconds['simulation'] += middle - begin
         self.seconds['learning'] += time.process_time() - middle
         every = s.renew_every
-        if every and self.samples // every > before // every and self.samples < s.samples:
+        if every and self.samples // every > before // every:
             self.finish()
 
     def finish(self) -> None:
