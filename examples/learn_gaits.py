@@ -106,10 +106,31 @@ GENERALIST: dict[str, Any] = {
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
-    'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
     'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
     # One policy for all terrains of a character.
+    # A hopper must choose its hops four cycles, or 9 m, ahead.
+    'FSM_Hopper2D_Terrain_Mixed_Easy-v0': {
+        **GENERALIST,
+        'also': ('FSM_Hopper2D_*',),
+        'num_envs': 70,
+        'expert_cycles': 32768,
+        'learning_rate': 3e-4,
+        'samples': 229376,
+        'view': 10.0,
+        'back': (1, 5),
+        'retry_cycles': 3,
+    },
+    'FSM_Biped2D_Terrain_Mixed-v0': {
+        **GENERALIST,
+        'also': ('FSM_Biped2D_*',),
+        'num_envs': 64,
+        'expert_cycles': 32768,
+        'learning_rate': 3e-4,
+        'samples': 229376,
+        'back': (1, 5),
+        'retry_cycles': 3,
+    },
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST,
         'start': 'FSM_Dog2D_Terrain_Mixed-v0',
