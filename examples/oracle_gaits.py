@@ -12,7 +12,7 @@ the gait itself is the limit, or the view, or the fall was decided more than `BA
 
 Writes `trained/oracles.json`: ID -> settings and, for 1 to `BACK` cycles before the end, the share of
 falls that some action prevents, and the mean share of actions that do. The policy's own action is
-tried as well; as simulations are deterministic, it falls again.
+tried as well: it falls again, unless two actions are so close in value that rounding decides.
 """
 
 from __future__ import annotations
