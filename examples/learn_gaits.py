@@ -103,33 +103,28 @@ GENERALIST: dict[str, Any] = {
     'learning_rate': 2e-4, 'epsilon': 0.06, 'greedy': 0.2, 'retries': 6, 'back': (1, 4),
     'evaluate_every': 8192, 'evaluation_episodes': 0,
 }  # fmt: skip
+FROM_SCRATCH: dict[str, Any] = {
+    'samples': 196608, 'expert_cycles': 98304, 'begin': 2e3, 'renew_every': 98304,
+    'learning_rate': 3e-4, 'back': (1, 5), 'retry_cycles': 3,
+}  # fmt: skip
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
     'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
     # One policy for all terrains of a character.
-    # A hopper must choose its hops four cycles, or 9 m, ahead.
     'FSM_Hopper2D_Terrain_Mixed_Easy-v0': {
         **GENERALIST,
+        **FROM_SCRATCH,
         'also': ('FSM_Hopper2D_*',),
         'num_envs': 70,
-        'expert_cycles': 32768,
-        'learning_rate': 3e-4,
-        'samples': 229376,
-        'view': 10.0,
-        'back': (1, 5),
-        'retry_cycles': 3,
+        'view': 10.0,  # a hopper must choose its hops four cycles, or 9 m, ahead
     },
     'FSM_Biped2D_Terrain_Mixed-v0': {
         **GENERALIST,
+        **FROM_SCRATCH,
         'also': ('FSM_Biped2D_*',),
         'num_envs': 64,
-        'expert_cycles': 32768,
-        'learning_rate': 3e-4,
-        'samples': 229376,
-        'back': (1, 5),
-        'retry_cycles': 3,
     },
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST,
@@ -148,7 +143,7 @@ CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hol
 CLIP = 5.0  # bound of the networks' inputs, in standard deviations
 _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
-    'past', 'chains', 'travelled', 'tally',
+    'past', 'chains', 'travelled', 'tally', 'renewed',
 )  # fmt: skip
 # Settings that may change when a run is continued.
 _CHANGEABLE = (
@@ -333,6 +328,7 @@ class Learner:
             self.expert = (policies.reference if shipped else policies.load)(s.start)
             self.begin_with(self.expert)
         self.samples = self.updates = 0
+        self.renewed = 0  # number of samples when the policy last learnt with a falling rate
         self.loss = 0.0
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.curve: list[dict[str, Any]] = []
@@ -530,6 +526,7 @@ class Learner:
         for _ in tqdm.trange(s.final_updates, unit='update', desc='last updates'):
             self.learn()
             schedule.step()
+        self.renewed = self.samples
         if s.renew_every:
             self.network.load_state_dict(self.target.state_dict())
         self.seconds['learning'] += time.process_time() - begin
@@ -673,7 +670,8 @@ def _train(
             if learner.samples // s.write_every > before // s.write_every:
                 learner.save(folder)
     learner.save(folder)
-    learner.finish()
+    if learner.renewed < learner.samples:
+        learner.finish()
     learner.evaluate()
     learner.write_curve(folder)
     policies.save(learner.exported(), folder / 'policy.npz')
