@@ -14,7 +14,9 @@ Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command cont
 identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
 curve), `last.npz` (the current averaged network), and at the end `policy.npz`: the result of a final
 phase without new samples, in which a new network learns from the replay with a falling learning rate
-(with `--start` the same network continues). Needs `pip install 'trl_suite[train]'`.
+(with an initial policy the same network continues). A run may learn over several environments of one
+character at a time, and may learn in rounds: the network collects, then learns anew from the replay.
+Needs `pip install 'trl_suite[train]'`.
 """
 
 from __future__ import annotations
@@ -22,9 +24,11 @@ from __future__ import annotations
 import collections
 import copy
 import dataclasses
+import fnmatch
 import json
 import pathlib
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import checkpoints
@@ -36,8 +40,9 @@ import tqdm
 from torch import nn
 
 from trl_suite import characters, evaluation, policies
+from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import files
+from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -46,6 +51,9 @@ from trl_suite.vector import VectorEnvironment
 class Settings:
     """Settings of a run, besides environment and seed."""
 
+    # Ids, or patterns of ids, of further environments of the character, in which the policy is
+    # trained, too; all have as many simulations. One that is given twice has twice as many.
+    also: tuple[str, ...] = ()
     samples: float = 2e5  # cycles
     num_envs: int = 64
     start: str = ''  # environment, or file, of the initial policy; '': none
@@ -69,6 +77,8 @@ class Settings:
     capacity: float = 5e5  # transitions in the replay buffer
     minibatch: int = 256
     updates: int = 16  # per cycle of all simulations
+    # Cycles between learning from the replay with a falling learning rate, as at the end; 0: never.
+    renew_every: float = 0
     learning_rate: float = 3e-4
     weight_decay: float = 1e-2
     polyak: float = 0.005  # weight of the new weights in the target network
@@ -86,18 +96,54 @@ class Settings:
     evaluation_episodes: int = 32
 
 
+# A policy collects and learns in rounds, because one that has learnt with a falling learning rate
+# runs several times as far as one that learns with a constant rate all the time.
+GENERALIST: dict[str, Any] = {
+    'samples': 3e5, 'expert_cycles': 0, 'begin': 0, 'updates': 0, 'renew_every': 32768,
+    'learning_rate': 2e-4, 'epsilon': 0.06, 'greedy': 0.2, 'retries': 6, 'back': (1, 4),
+    'evaluate_every': 8192, 'evaluation_episodes': 0,
+}  # fmt: skip
+FROM_SCRATCH: dict[str, Any] = {
+    'samples': 196608, 'expert_cycles': 98304, 'begin': 2e3, 'renew_every': 98304,
+    'learning_rate': 3e-4, 'back': (1, 5), 'retry_cycles': 3,
+}  # fmt: skip
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
-    'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
     'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
+    # One policy for all terrains of a character.
+    'FSM_Hopper2D_Terrain_Mixed_Easy-v0': {
+        **GENERALIST,
+        **FROM_SCRATCH,
+        'also': ('FSM_Hopper2D_*',),
+        'num_envs': 70,
+        'view': 10.0,  # a hopper must choose its hops four cycles, or 9 m, ahead
+    },
+    'FSM_Biped2D_Terrain_Mixed-v0': {
+        **GENERALIST,
+        **FROM_SCRATCH,
+        'also': ('FSM_Biped2D_*',),
+        'num_envs': 64,
+    },
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
+        **GENERALIST,
+        'start': 'FSM_Dog2D_Terrain_Mixed-v0',
+        'also': ('FSM_Dog2D_*',),
+        'num_envs': 78,
+    },
+    'FSM_Raptor2D_Terrain_Slopes_Mixed-v0': {
+        **GENERALIST,
+        'start': 'FSM_Raptor2D_Terrain_Mixed-v0',
+        'also': ('FSM_Raptor2D_*',),
+        'num_envs': 70,
+    },
 }
 CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hold as float32
 CLIP = 5.0  # bound of the networks' inputs, in standard deviations
 _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
-    'past', 'chains',
+    'past', 'chains', 'travelled', 'tally', 'renewed',
 )  # fmt: skip
 # Settings that may change when a run is continued.
 _CHANGEABLE = (
@@ -174,6 +220,77 @@ class Replay:
                 value[: len(self)] = state[name]
 
 
+class Simulations:
+    """Simulations of several environments of one character, with one numbering.
+
+    Attributes:
+      groups: the simulations of each environment.
+      group: number of the environment of each simulation, (n,) int.
+    """
+
+    def __init__(self, ids: Sequence[str], seeds: Sequence[int], threads: int) -> None:
+        if len(seeds) < len(ids):
+            raise ValueError(f'{len(seeds)} simulations for {len(ids)} environments')
+        parts = [part.tolist() for part in np.array_split(seeds, len(ids))]
+        self.groups = [
+            VectorEnvironment(id_, len(part), threads, part, autoreset='disabled', step_limit=None)
+            for id_, part in zip(ids, parts, strict=True)
+        ]
+        self.group = np.repeat(np.arange(len(ids)), list(map(len, parts)))
+        self.place = np.concatenate([np.arange(len(part)) for part in parts])
+        characters = [environments.spec.character for environments in self.groups]
+        if len(set(characters)) > 1:
+            raise ValueError(f'environments of different characters: {sorted(set(characters))}')
+
+    @property
+    def observation(self) -> np.ndarray:
+        """Observations of all simulations, (n, size)."""
+        return np.concatenate([environments.task.observation for environments in self.groups])
+
+    def reset(self, env_ids: Sequence[int] | None = None) -> None:
+        """Begins an episode in some simulations, or in all."""
+        for number, environments in enumerate(self.groups):
+            if env_ids is None:
+                environments.reset()
+            elif places := [self.place[i] for i in env_ids if self.group[i] == number]:
+                environments.reset(places)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Runs a cycle; returns rewards, whether there was a fall, and distances (m), (n,) each."""
+        steps = [
+            environments.step(action[self.group == number])
+            for number, environments in enumerate(self.groups)
+        ]
+        values = ((step.reward, step.terminated, step.info['distance']) for step in steps)
+        reward, terminated, distance = map(np.concatenate, zip(*values, strict=True))
+        return reward, terminated, distance
+
+    def get_state(self, env_id: int | None = None) -> Any:
+        """Returns the state of a simulation, or of all."""
+        if env_id is None:
+            return [environments.get_state() for environments in self.groups]
+        return self.groups[self.group[env_id]].get_state([self.place[env_id]])
+
+    def set_state(self, state: Any, env_id: int | None = None) -> None:
+        """Restores the state of a simulation, or of all."""
+        if env_id is not None:
+            self.groups[self.group[env_id]].set_state(state, [self.place[env_id]])
+            return
+        for environments, each in zip(self.groups, state, strict=True):
+            environments.set_state(each)
+
+
+def environments_of(id_: str, settings: Settings) -> list[str]:
+    """Returns the ids of all environments of a run; its own comes first."""
+    ids = [id_]
+    for pattern in settings.also:
+        found = fnmatch.filter(catalogue.BY_ID, pattern)
+        if not found:
+            raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
+        ids += [other for other in found if other != id_ or pattern == id_]
+    return ids
+
+
 class Learner:
     """One run: the simulations, the networks and the progress."""
 
@@ -183,10 +300,16 @@ class Learner:
         s, n = settings, settings.num_envs
         self.random = np.random.default_rng(seed)
         seeds = self.random.integers(2**32, size=n).tolist()  # different from those of evaluations
-        self.environments = VectorEnvironment(
-            id_, n, threads, seeds, autoreset='disabled', step_limit=None
+        self.ids = environments_of(id_, s)
+        self.simulations = Simulations(self.ids, seeds, threads)
+        environments = self.environments = self.simulations.groups[0]
+        # Simulations without random actions and without retries.
+        self.greedy = np.concatenate(
+            [
+                np.arange(each.num_envs) < s.greedy * each.num_envs
+                for each in self.simulations.groups
+            ]
         )
-        environments = self.environments
         parameters = environments.task.gait.parameters
         self.choices = parameters.action(parameters.base_actions)
         ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
@@ -205,10 +328,12 @@ class Learner:
             self.expert = (policies.reference if shipped else policies.load)(s.start)
             self.begin_with(self.expert)
         self.samples = self.updates = 0
+        self.renewed = 0  # number of samples when the policy last learnt with a falling rate
         self.loss = 0.0
         self.seconds = {'simulation': 0.0, 'learning': 0.0, 'evaluation': 0.0}
         self.curve: list[dict[str, Any]] = []
-        self.observation = environments.reset()
+        self.simulations.reset()
+        self.observation = self.simulations.observation
         # Of each simulation: states before the last cycles, and transitions not yet in the replay.
         self.past: list[collections.deque] = [
             collections.deque(maxlen=s.back[1] + 1) for _ in range(n)
@@ -216,12 +341,21 @@ class Learner:
         self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
         # Of each simulation: retries in a row, and cycles since the last one.
         self.tried = np.zeros((2, n), int)
+        # Distance in the current episode, m; and of each environment since the last point of the
+        # curve: distance and number of falls of its simulations without random actions.
+        self.travelled = np.zeros(n)
+        self.tally = np.zeros((len(self.ids), 2))
 
     def begin_network(self) -> None:
         """Makes a new network, its target network and its optimizer."""
         s, others = self.settings, len(self.columns) - self.line
         self.network = Network(self.line, others, len(self.choices), s)
         self.target = copy.deepcopy(self.network).requires_grad_(False)
+        self.begin_optimizer()
+
+    def begin_optimizer(self) -> None:
+        """Makes a new optimizer of the network."""
+        s = self.settings
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), s.learning_rate, weight_decay=s.weight_decay, fused=True
         )
@@ -289,40 +423,37 @@ class Learner:
         drawn = self.random.integers(len(self.choices), size=n)
         return np.where(self.random.random(n) < epsilon, drawn, chosen)
 
-    @property
-    def greedy(self) -> np.ndarray:
-        """Mask of the simulations without random actions, (n,) bool."""
-        n = self.settings.num_envs
-        return np.arange(n) < self.settings.greedy * n
-
     def collect(self) -> None:
         """Runs one cycle in every simulation, and adds the transitions to the replay."""
-        s, environments = self.settings, self.environments
+        s, simulations = self.settings, self.simulations
         action, before = self.act(), self.observation[:, self.columns].astype(np.float16)
         for i, past in enumerate(self.past):
-            past.append(environments.get_state([i]))
-        step = environments.step(self.choices[action])
+            past.append(simulations.get_state(i))
+        reward, fell, distance = simulations.step(self.choices[action])
         self.samples += s.num_envs
-        reward = step.reward + s.alive * ~step.terminated
-        after, fresh = step.observation[:, self.columns].astype(np.float16), []
+        reward = reward + s.alive * ~fell
+        after, fresh = simulations.observation[:, self.columns].astype(np.float16), []
+        counted = np.stack([distance - self.travelled, fell], 1)[self.greedy]
+        np.add.at(self.tally, simulations.group[self.greedy], counted)
+        self.travelled = np.where(fell, 0.0, distance)
         self.tried[1] += 1
         self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
         for i, chain in enumerate(self.chains):
             chain.append((before[i], int(action[i]), float(reward[i])))
-            while chain and (step.terminated[i] or len(chain) == s.steps):
+            while chain and (fell[i] or len(chain) == s.steps):
                 value = sum(s.gamma**k * each[2] for k, each in enumerate(chain))
-                discount = 0.0 if step.terminated[i] else s.gamma ** len(chain)
+                discount = 0.0 if fell[i] else s.gamma ** len(chain)
                 self.replay.add(chain[0][0], chain[0][1], value, discount, after[i])
                 del chain[0]
-        for i in np.flatnonzero(step.terminated).tolist():
+        for i in np.flatnonzero(fell).tolist():
             if self.go_back(i):
                 continue
             fresh.append(i)
             self.past[i].clear()
             self.tried[:, i] = 0
         if fresh:
-            environments.reset(fresh)
-        self.observation = environments.task.observation.copy()
+            simulations.reset(fresh)
+        self.observation = simulations.observation
 
     def go_back(self, env_id: int) -> bool:
         """Restores the state some cycles before a fall; returns whether it did."""
@@ -334,7 +465,7 @@ class Learner:
             return False
         for _ in range(back + 1):
             state = past.pop()
-        self.environments.set_state(state, [env_id])
+        self.simulations.set_state(state, env_id)
         self.tried[:, env_id] = self.tried[0, env_id] + 1, 0
         return True
 
@@ -373,6 +504,9 @@ class Learner:
                 self.learn()
         self.seconds['simulation'] += middle - begin
         self.seconds['learning'] += time.process_time() - middle
+        every = s.renew_every
+        if every and self.samples // every > before // every:
+            self.finish()
 
     def finish(self) -> None:
         """Learns with a falling learning rate, without new samples.
@@ -380,8 +514,11 @@ class Learner:
         A new network learns from the replay, unless the run began with a policy.
         """
         s = self.settings
+        if s.renew_every:  # so that a continued run is identical
+            torch.manual_seed(int(self.random.integers(2**32)))
         if not s.start:
             self.begin_network()
+        self.begin_optimizer()
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
             self.optimizer, s.final_updates, s.final_rate
         )
@@ -389,6 +526,9 @@ class Learner:
         for _ in tqdm.trange(s.final_updates, unit='update', desc='last updates'):
             self.learn()
             schedule.step()
+        self.renewed = self.samples
+        if s.renew_every:
+            self.network.load_state_dict(self.target.state_dict())
         self.seconds['learning'] += time.process_time() - begin
 
     def exported(self) -> policies.Policy:
@@ -428,26 +568,39 @@ class Learner:
         )  # fmt: skip
 
     def evaluate(self) -> dict[str, Any]:
-        """Evaluates the policy, and returns the new point of the curve."""
+        """Evaluates the policy, and returns the new point of the curve.
+
+        `metres` and `falls` are those of simulations without random actions and without retries
+        since the last point, by environment. Without episodes of evaluation `distance` is their
+        ratio in the environment of the run; it is their mean distance to a fall.
+        """
         s, begin = self.settings, time.process_time()
-        result = evaluation.evaluate(
-            self.environments.spec, self.exported(), s.evaluation_episodes, ppo.EVALUATION_SEED,
-            self.threads,
-        )  # fmt: skip
+        point: dict[str, Any] = {}
+        if s.evaluation_episodes:
+            results = evaluation.evaluate_all(
+                [(each.spec, self.exported()) for each in self.simulations.groups],
+                s.evaluation_episodes, ppo.EVALUATION_SEED, self.threads,
+            )  # fmt: skip
+            result = results[0]
+            for name in ('normalized_return', 'completion_rate', 'distance', 'median_distance'):
+                point[name] = result[name]
+            if s.also:
+                point['distances'] = [result['distance'] for result in results]
+        else:
+            point['distance'] = float(self.tally[0, 0] / max(self.tally[0, 1], 1))
         self.seconds['evaluation'] += time.process_time() - begin
-        point = {
-            name: result[name] for name in ('normalized_return', 'completion_rate', 'distance')
-        }
-        point['median_distance'] = float(np.median(result['distances']))
+        metres, falls = self.tally.T.round(1).tolist()
         point |= {'samples': self.samples, 'updates': self.updates, 'loss': self.loss}
-        self.curve.append({**point, 'seconds': dict(self.seconds)})
+        point |= {'metres': metres, 'falls': falls, 'seconds': dict(self.seconds)}
+        self.tally[:] = 0
+        self.curve.append(point)
         return point
 
     def save(self, folder: pathlib.Path) -> None:
         """Writes checkpoint, curve and policy."""
         state = {name: getattr(self, name) for name in _STATE}
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
-        state |= {name: getattr(self, name).get_state() for name in ('replay', 'environments')}
+        state |= {name: getattr(self, name).get_state() for name in ('replay', 'simulations')}
         state['past'] = list(map(list, self.past))
         state['settings'] = dataclasses.asdict(self.settings)
         state['random'] = self.random.bit_generator.state
@@ -458,7 +611,7 @@ class Learner:
     def write_curve(self, folder: pathlib.Path) -> None:
         """Writes the settings and the curve."""
         record = {
-            'id': self.environments.spec.id, 'seed': self.seed,
+            'id': self.environments.spec.id, 'seed': self.seed, 'environments': self.ids,
             'settings': dataclasses.asdict(self.settings), 'threads': self.threads,
             'curve': self.curve,
         }  # fmt: skip
@@ -479,7 +632,7 @@ class Learner:
         ]
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
-        for name in ('replay', 'environments'):
+        for name in ('replay', 'simulations'):
             getattr(self, name).set_state(state[name])
         self.random.bit_generator.state = state['random']
 
@@ -517,7 +670,8 @@ def _train(
             if learner.samples // s.write_every > before // s.write_every:
                 learner.save(folder)
     learner.save(folder)
-    learner.finish()
+    if learner.renewed < learner.samples:
+        learner.finish()
     learner.evaluate()
     learner.write_curve(folder)
     policies.save(learner.exported(), folder / 'policy.npz')
@@ -527,9 +681,7 @@ def _train(
 def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'cycles')
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        print(
-            f'{point["samples"]:9} {point["distance"]:.1f} m, {point["completion_rate"]:.0%} complete'
-        )
+        print(f'{point["samples"]:9} {point["distance"]:.1f} m')
     print(folder / 'policy.npz')
 
 

@@ -154,6 +154,19 @@ def shared_rows() -> list[list[str]]:
     return rows
 
 
+def oracle_rows() -> list[list[str]]:
+    """Returns the shares of falls that other actions prevent, one to five cycles earlier."""
+    path = resources.directory('trained') / 'oracles.json'
+    rows = []
+    for id_, found in (json.loads(path.read_text()) if path.exists() else {}).items():
+        shares = [
+            ' '.join(f'{share:.0%}' for share in found[kind]['prevented'])
+            for kind in ('base', 'random')
+        ]
+        rows.append([f'`{id_}`', str(found['falls']), *shares, f'{found["ever_prevented"]:.0%}'])
+    return rows
+
+
 def footstep_rows() -> list[list[str]]:
     path = resources.directory('trained') / 'footsteps.json'
     if not path.exists():
@@ -290,6 +303,17 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                 ),
                 rows,
             ),
+        ]
+    rows = oracle_rows()
+    if rows:
+        parts += [
+            '## Falls of gaits that other actions prevent',
+            'Measured by `examples/oracle_gaits.py`: the share of the falls of a policy that some action '
+            'prevents if it is taken one, two, ... five cycles before the end and the policy goes on from '
+            'there. *Base*: every base action; *random*: eight base actions with noise in all parameters; '
+            '*any*: the share of falls that some action prevents, at any time. Where it is high, the '
+            'policy is the limit; where it is low, the gait is.',
+            table(('environment', 'falls', 'base', 'random', 'any'), rows),
         ]
     rows = footstep_rows()
     if rows:

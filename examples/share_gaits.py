@@ -13,12 +13,29 @@ from __future__ import annotations
 
 import argparse
 import json
+from typing import Any
 
 import train_all
 
 from trl_suite import evaluation, policies
 from trl_suite.util import files, resources
 from trl_suite.util.program import begin_script
+
+
+def stored(id_: str, episodes: int) -> dict[str, Any] | None:
+    """Returns the results of the shipped policy, if it was evaluated in as many episodes."""
+    trained = resources.directory('trained')
+    shared = trained / policies.SHARED
+    entries = json.loads(shared.read_text()) if shared.exists() else {}
+    own = trained / f'{id_}.json'
+    if id_ in entries:
+        found = entries[id_]['evaluation']
+    elif own.exists():
+        found = train_all.shipped(json.loads(own.read_text()))['evaluation']
+    else:
+        return None
+    asked = {'episodes': episodes, 'seed': train_all.SEED}
+    return found if {name: found[name] for name in asked} == asked else None
 
 
 def main() -> None:
@@ -33,9 +50,10 @@ def main() -> None:
     path = resources.directory('trained') / policies.SHARED
     for id_ in arguments.ids:
         options = arguments.episodes, train_all.SEED, arguments.threads
-        if id_ in policies.available():
+        before = stored(id_, arguments.episodes)
+        if before is None and id_ in policies.available():
             before = evaluation.evaluate(id_, policies.reference(id_), *options)
-        else:
+        elif before is None:
             before = evaluation.evaluate(id_, evaluation.zero, *options, factory=True)
         found = evaluation.evaluate(id_, policies.reference(arguments.policy), *options)
         print(

@@ -7,7 +7,7 @@ import tempfile
 
 import numpy as np
 import torch
-from absl.testing import absltest
+from absl.testing import absltest, parameterized
 
 from trl_suite import policies
 from trl_suite.vector import VectorEnvironment
@@ -16,6 +16,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples')
 import learn_gaits
 
 HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
+WALLS = 'FSM_Hopper2D_Terrain_Walls-v0'
 TINY = learn_gaits.Settings(
     samples=48, num_envs=4, expert_cycles=24, begin=16, greedy=0.25, capacity=100, minibatch=8, updates=1,
     final_updates=2, convolutions=((4, 8, 2),), ground_units=8, hidden=(8, 6), write_every=16,
@@ -23,7 +24,7 @@ TINY = learn_gaits.Settings(
 )  # fmt: skip
 
 
-class LearnTest(absltest.TestCase):
+class LearnTest(parameterized.TestCase):
     def test_transitions_and_retries(self):
         settings = dataclasses.replace(
             TINY, expert_cycles=1e9, expert_epsilon=1.0, retry=1.0, retries=2
@@ -113,13 +114,68 @@ class LearnTest(absltest.TestCase):
         with self.assertRaisesRegex(ValueError, 'other inputs'):
             learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, start=HOPPER), 1)
 
-    def test_a_run_writes_its_policy_and_resumes_exactly(self):
+    def test_several_environments_share_the_simulations(self):
+        settings = dataclasses.replace(TINY, num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        self.assertEqual(learner.ids, [HOPPER, WALLS, HOPPER])
+        self.assertEqual([group.num_envs for group in learner.simulations.groups], [2, 2, 1])
+        np.testing.assert_array_equal(learner.simulations.group, [0, 0, 1, 1, 2])
+        np.testing.assert_array_equal(learner.greedy, [True, False, True, False, True])
+        seeds = [seed for group in learner.simulations.groups for seed in group.seeds.tolist()]
+        self.assertLen(set(seeds), 5)
+        # Simulation 3 is the second of the walls.
+        lone = VectorEnvironment(WALLS, 1, 1, seeds[3:4], autoreset='disabled')
+        np.testing.assert_array_equal(learner.observation[3], lone.reset()[0])
+        for _ in range(20):
+            before = learner.observation.copy()
+            learner.collect()
+            self.assertFalse((learner.observation == before).all(1).any())
+        self.assertEqual(len(learner.replay) + sum(map(len, learner.chains)), 20 * 5)
+        state = learner.simulations.get_state(3)
+        other = learner.observation.copy()
+        learner.collect()
+        learner.simulations.set_state(state, 3)
+        np.testing.assert_array_equal(learner.simulations.observation[3], other[3])
+        self.assertFalse((learner.simulations.observation[:3] == other[:3]).all())
+
+    def test_metres_and_falls_are_counted_without_random_actions(self):
+        settings = dataclasses.replace(TINY, also=(WALLS,), evaluation_episodes=0)
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        steps, step = [], learner.simulations.step
+        learner.simulations.step = lambda action: steps.append(step(action)) or steps[-1]
+        for _ in range(30):
+            learner.collect()
+        _, fell, distance = map(np.array, zip(*steps, strict=True))
+        for number, env_id in enumerate((0, 2)):  # these are greedy; the others are set back
+            ends = distance[:, env_id][fell[:, env_id]]
+            rest = 0.0 if fell[-1, env_id] else distance[-1, env_id]
+            self.assertNotEmpty(ends)
+            expected = ends.sum() + rest, len(ends)
+            np.testing.assert_allclose(learner.tally[number], expected)
+        falls = learner.tally[:, 1].tolist()
+        point = learner.evaluate()
+        self.assertEqual(point['falls'], falls)
+        self.assertAlmostEqual(point['distance'], point['metres'][0] / falls[0], delta=0.1)
+        np.testing.assert_array_equal(learner.tally, 0)
+
+    def test_unknown_and_foreign_environments_are_refused(self):
+        with self.assertRaisesRegex(ValueError, 'FSM_Hoper'):
+            learn_gaits.environments_of(HOPPER, dataclasses.replace(TINY, also=('FSM_Hoper_*',)))
+        with self.assertRaisesRegex(ValueError, 'different characters'):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, also=('FSM_Goat2D_*',)), 1)
+        with self.assertRaisesRegex(ValueError, '4 simulations for 10 environments'):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, also=('FSM_Hopper2D_*',)), 1)
+
+    @parameterized.parameters(
+        {}, {'also': (WALLS,), 'renew_every': 16, 'updates': 0, 'evaluation_episodes': 0}
+    )
+    def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
         curves = []
         with tempfile.TemporaryDirectory() as name:
             folders = [pathlib.Path(name) / each for each in 'ab']
-            for folder, samples in zip(folders, ((48,), (32, 48)), strict=True):
+            for folder, samples in zip(folders, ((48,), (24, 48)), strict=True):
                 for each in samples:
-                    settings = dataclasses.replace(TINY, samples=each)
+                    settings = dataclasses.replace(TINY, samples=each, **changes)
                     curve = learn_gaits.train(HOPPER, 1, settings, folder, 1)
                 curves.append([{**point, 'seconds': None} for point in curve])
             self.assertEqual([point['samples'] for point in curves[0]], [32, 48])
@@ -130,7 +186,7 @@ class LearnTest(absltest.TestCase):
             policy.check(VectorEnvironment(HOPPER, 1, 1))
             self.assertEqual(policy.info['samples'], 48)
             with self.assertRaisesRegex(ValueError, 'other settings'):
-                other = dataclasses.replace(TINY, alive=1.0)
+                other = dataclasses.replace(TINY, alive=1.0, **changes)
                 learn_gaits.train(HOPPER, 1, other, folders[0], 1)
 
 

@@ -1,0 +1,159 @@
+"""Measures whether the actions of a gait could have prevented the falls of a policy.
+
+    python examples/oracle_gaits.py FSM_Dog2D_Terrain_Mixed-v0 --falls 24
+    python examples/oracle_gaits.py FSM_Hopper2D_Terrain_Mixed_Easy-v0 --policy policy.npz
+
+The policy runs until it falls. From the states before its last cycles other actions are tried, each
+for one cycle, after which the policy continues: every base action, and random parameters (a base
+action plus normal noise in all parameters). An action prevents the fall if the character gets
+`PASSED` metres beyond the place of the fall. If base actions prevent most falls, the policy can be
+improved by learning; if random parameters prevent more, other gaits are needed; if nothing helps,
+the gait itself is the limit, or the view, or the fall was decided more than `BACK` cycles earlier.
+
+Writes `trained/oracles.json`: ID -> settings and, for 1 to `BACK` cycles before the end, the share of
+falls that some action prevents, and the mean share of actions that do. The policy's own action is
+tried as well: it falls again, unless two actions are so close in value that rounding decides.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import ppo
+import tqdm
+
+from trl_suite import policies, suite
+from trl_suite.util import files, resources
+from trl_suite.util.program import begin_script
+from trl_suite.vector import VectorEnvironment
+
+BACK = 5  # largest number of cycles from a state to the fall
+PASSED = 2.0  # m beyond the place of the fall
+MOST_CYCLES = 12  # after the action that is tried
+NOISE = 0.3  # standard deviation of random parameters, in units of the action
+KINDS = 'base', 'random'
+Act = Callable[[np.ndarray], np.ndarray]
+
+
+def position(environments: VectorEnvironment) -> np.ndarray:
+    """Returns the positions of the roots along the ground, (n,) m."""
+    task = environments.task
+    return task.world.qpos[:, int(task.figure.pose_qpos[0])].copy()
+
+
+def falls(
+    environments: VectorEnvironment, act: Act
+) -> tuple[list[list[dict[str, Any]]], np.ndarray]:
+    """Runs each simulation until a fall that is preceded by `BACK` cycles.
+
+    Returns:
+      For each simulation the states before its last `BACK` cycles, the last one first; and the
+      position in which it fell, (n,) m.
+    """
+    count = environments.num_envs
+    past: list[collections.deque] = [collections.deque(maxlen=BACK) for _ in range(count)]
+    going, observation = np.ones(count, bool), environments.reset()
+    with tqdm.tqdm(total=count, unit='fall') as bar:
+        while going.any():
+            for i in np.flatnonzero(going).tolist():
+                past[i].appendleft(environments.get_state([i]))
+            step = environments.step(act(observation), going)
+            for i in np.flatnonzero(step.terminated & going).tolist():
+                if len(past[i]) == BACK:
+                    going[i] = False
+                    bar.update()
+                else:
+                    past[i].clear()
+                    environments.reset([i])
+            observation = environments.task.observation.copy()
+    return [list(each) for each in past], position(environments)
+
+
+def prevented(
+    copies: VectorEnvironment, state: dict[str, Any], place: float, actions: np.ndarray, act: Act
+) -> np.ndarray:
+    """Returns which of some actions (m, k), each for one cycle, prevent a fall at a place, (m,)."""
+    going = np.arange(len(actions))
+    for i in going.tolist():
+        copies.set_state(state, [i])
+    action = np.zeros((copies.num_envs, actions.shape[1]))
+    action[going] = actions
+    passed = np.zeros(copies.num_envs, bool)
+    for _ in range(MOST_CYCLES):
+        step = copies.step(action, going)
+        passed[going] = ~step.terminated[going] & (position(copies)[going] > place + PASSED)
+        going = going[~(step.terminated | passed)[going]]
+        if not len(going):
+            break
+        action[going] = act(step.observation[going])
+    return passed[: len(actions)]
+
+
+def measure(
+    id_: str, policy: policies.Policy, number: int, randoms: int, seed: int
+) -> dict[str, Any]:
+    """Returns the results for a number of falls, as they are stored."""
+    rng = np.random.default_rng(seed)
+    options: dict[str, Any] = {'autoreset': 'disabled', 'step_limit': None}
+    environments = VectorEnvironment(id_, number, 1, seed, **options)
+    parameters = environments.task.gait.parameters
+    base = parameters.action(parameters.base_actions)
+    states, places = falls(environments, policy)
+    copies = VectorEnvironment(id_, 1 + len(base) + randoms, 1, seed, **options)
+    copies.reset()
+    found = np.zeros((number, BACK, copies.num_envs), bool)
+    for i, place in enumerate(tqdm.tqdm(places, unit='fall')):
+        for back, state in enumerate(states[i]):
+            copies.set_state(state, [0])
+            own = policy(copies.task.observation[:1])
+            around = base[rng.integers(len(base), size=randoms)]
+            noisy = np.clip(around + rng.normal(0, NOISE, around.shape), -1, 1)
+            tried = np.concatenate([own, base, noisy])
+            found[i, back] = prevented(copies, state, float(place), tried, policy)
+    parts = found[..., 1 : 1 + len(base)], found[..., 1 + len(base) :]
+    result: dict[str, Any] = {
+        'falls': number, 'seed': seed, 'samples': policy.info.get('samples'),
+        'policy': policy.id, 'own': float(found[..., 0].mean()),
+    }  # fmt: skip
+    for kind, part in zip(KINDS, parts, strict=True):
+        some = part.any(2)
+        result[kind] = {
+            'actions': part.shape[2],
+            'prevented': some.mean(0).round(3).tolist(),
+            'actions_that_prevent': part.mean((0, 2)).round(3).tolist(),
+            'ever_prevented': float(some.any(1).mean()),
+        }
+    result['ever_prevented'] = float((parts[0].any(2) | parts[1].any(2)).any(1).mean())
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('ids', nargs='+', metavar='ID', help='ids of environments with a gait')
+    parser.add_argument('--policy', help='file; default: the shipped policy')
+    parser.add_argument('--falls', type=int, default=24, help='number of falls')
+    parser.add_argument('--randoms', type=int, default=8, help='number of random actions')
+    parser.add_argument('--seed', type=int, default=ppo.EVALUATION_SEED + 1)
+    arguments = parser.parse_args()
+    path = resources.directory('trained') / 'oracles.json'
+    for name in arguments.ids:
+        id_, begin = suite.find(name).id, time.process_time()
+        policy = policies.load(arguments.policy) if arguments.policy else policies.reference(id_)
+        found = measure(id_, policy, arguments.falls, arguments.randoms, arguments.seed)
+        found['cpu_seconds'] = round(time.process_time() - begin)
+        print(id_, json.dumps(found), flush=True)
+        stored = json.loads(path.read_text()) if path.exists() else {}
+        stored[id_] = found
+        with files.replacing(path) as part:
+            part.write_text(json.dumps(dict(sorted(stored.items())), indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()

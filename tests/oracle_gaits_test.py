@@ -1,0 +1,46 @@
+"""Actions that could prevent falls: states before falls, and what is counted as prevented."""
+
+import pathlib
+import sys
+
+import numpy as np
+from absl.testing import absltest
+
+from trl_suite.vector import VectorEnvironment
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import oracle_gaits
+
+HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
+
+
+class OracleTest(absltest.TestCase):
+    def test_states_precede_the_fall(self):
+        environments = VectorEnvironment(HOPPER, 2, 1, 0, autoreset='disabled', step_limit=None)
+        size = len(environments.action_map)
+
+        def default(observation):
+            return np.zeros((len(observation), size))
+
+        states, places = oracle_gaits.falls(environments, default)
+        copies = VectorEnvironment(HOPPER, 2, 1, 1, autoreset='disabled', step_limit=None)
+        copies.reset()
+        for each, place in zip(states, places, strict=True):
+            self.assertLen(each, oracle_gaits.BACK)
+            for back, state in enumerate(each, 1):
+                copies.set_state(state, [0])
+                for cycle in range(back):
+                    self.assertFalse(copies.task.failed[0] and cycle)
+                    step = copies.step(default(copies.task.observation), [0])
+                self.assertTrue(step.terminated[0], back)
+                self.assertEqual(oracle_gaits.position(copies)[0], place)
+                # The same action falls again; at a place far behind nothing is prevented by it.
+                for nearer, expected in ((0.0, False), (1e3, True)):
+                    found = oracle_gaits.prevented(
+                        copies, state, place - nearer, np.zeros((2, size)), default
+                    )
+                    self.assertEqual(found.tolist(), [expected] * 2 if back > 1 else [False] * 2)
+
+
+if __name__ == '__main__':
+    absltest.main()
