@@ -31,7 +31,7 @@ IDS = (
     'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Dog2D_Slopes_Terrain-v0',
     'PD_Biped3D_Imitate-v0', 'PD_Biped3D_Imitate-Hills_Terrain-v0',
 )  # fmt: skip
-ROWS = (1, 16, 64, 256, 1024)
+SIZES = (1, 16, 64, 256, 1024)
 THREADS = (1, 2)
 SUBSTEPS = 10
 MEMORY_ROWS = (16, 1024)
@@ -41,6 +41,11 @@ def resident():
     """Resident memory of this process, bytes."""
     with open('/proc/self/statm') as file:
         return int(file.read().split()[1]) * resource.getpagesize()
+
+
+def measurement(num_envs, threads):
+    """Returns the name of a measurement in the JSON file."""
+    return f'{num_envs} simulations, {threads} threads'
 
 
 def ours(id_, num_envs, threads, seconds):
@@ -118,8 +123,8 @@ def peers(seconds):
                 num_envs = 16
                 vector = gymnasium.make_vec(id_, num_envs=num_envs, vectorization_mode=mode)
                 vector.reset(seed=0)
-                drawn_rows = actions(space.low, space.high, (num_envs, *space.shape))
-                speed = rate(lambda v=vector, d=drawn_rows: v.step(next(d)), seconds, num_envs)
+                drawn = actions(space.low, space.high, (num_envs, *space.shape))
+                speed = rate(lambda v=vector, d=drawn: v.step(next(d)), seconds, num_envs)
                 found[f'Gymnasium {id_} {mode}, {num_envs} simulations'] = speed / reference
                 vector.close()
             if id_ == 'Humanoid-v5':
@@ -156,13 +161,13 @@ def plot(figures, path):
     for k, (id_, found) in enumerate(figures['ours'].items()):
         reference = figures['single'][id_]['raw mj_step']
         for threads in THREADS:
-            specs = [n for n in ROWS if f'{n} num_envs, {threads} threads' in found]
+            sizes = [n for n in SIZES if measurement(n, threads) in found]
             rates = [
-                found[f'{n} num_envs, {threads} threads']['control steps per second'] / reference
-                for n in specs
+                found[measurement(n, threads)]['control steps per second'] / reference
+                for n in sizes
             ]
             axes.plot(
-                specs,
+                sizes,
                 rates,
                 'o-' if threads == 1 else 's--',
                 color=f'C{k}',
@@ -180,7 +185,7 @@ def main():
     parser.add_argument('--seconds', type=float, default=3.0, help='per measurement')
     parser.add_argument('--json', help='also write the figures to this file')
     parser.add_argument('--plot', help='also plot rate against number of simulations')
-    parser.add_argument('--num-envs', type=int, nargs='*', default=ROWS)
+    parser.add_argument('--num-envs', type=int, nargs='*', default=SIZES)
     parser.add_argument('--no-peers', action='store_true')
     arguments = parser.parse_args()
     figures = {'cores': os.cpu_count(), 'single': {}, 'ours': {}, 'engine alone': {}}
@@ -193,7 +198,7 @@ def main():
         figures['ours'][id_], figures['engine alone'][id_] = {}, {}
         for threads in THREADS:
             for num_envs in arguments.num_envs:
-                name = f'{num_envs} simulations, {threads} threads'
+                name = measurement(num_envs, threads)
                 found, speed = ours(id_, num_envs, threads, arguments.seconds)
                 figures['ours'][id_][name] = found
                 figures['engine alone'][id_][name] = round(speed)
