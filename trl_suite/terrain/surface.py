@@ -38,6 +38,7 @@ from trl_suite.util.files import check_size, existing
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 MESHES = ('.obj', '.glb', '.gltf', '.stl', '.ply')
 Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
+FARTHEST = 1e6  # m; of a vertex of a mesh
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
 MOST_BYTES = 10**9  # of a mesh file
 
@@ -328,6 +329,11 @@ def from_mesh(
     if up == 'y':
         triangles = triangles[..., [0, 2, 1]] * (1, -1, 1)
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    if max(-low.min(), high.max()) > FARTHEST:
+        raise ValueError(
+            f'{file}: the mesh reaches {max(-low.min(), high.max()):g} m; expected no more than '
+            f'{FARTHEST:g} m from its origin'
+        )
     if centre:
         middle = np.append(0.5 * (low + high)[:2], 0.0)
         triangles, low, high = triangles - middle, low - middle, high - middle
@@ -401,6 +407,8 @@ def _triangles(file: os.PathLike[str]) -> np.ndarray:
         raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
     if not len(triangles) or not np.isfinite(triangles).all():
         raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')
+    if triangles.shape[1:] != (3, 3):  # of files whose vertices have one or two coordinates
+        raise ValueError(f'{file}: not a mesh: vertices without three coordinates')
     return triangles
 
 
