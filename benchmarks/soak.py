@@ -57,6 +57,12 @@ def actions(random, shape):
                     yield held
 
 
+def order(random):
+    """Yields numbers of environments without end, all in each round."""
+    while True:
+        yield from random.permutation(len(SPECS))
+
+
 def resident_mb():
     """Returns the memory of this process in MB, after returning what is free."""
     gc.collect()
@@ -115,7 +121,7 @@ def show(figures):
         )
     print(f'all: {sum(figures["task_types"][name]["steps"] for name in names):,} steps')
     for run in figures['runs']:
-        memory = [mb for _, _, mb in run['memory']]
+        memory = [mb for _, _, mb in run['memory']] or [0.0]
         print(
             f'seed {run["seed"]}: {run["environments"]} environments in {run["seconds"] / 3600:.2f} h, '
             f'memory {memory[0]} MB after the first, {memory[-1]} after the last, at most {max(memory)}'
@@ -149,30 +155,29 @@ def main():
     }  # fmt: skip
     figures['runs'].append(run)
     steps, bar = 0, tqdm(total=round(arguments.seconds), unit='s', mininterval=10)
-    while time.time() < begin + arguments.seconds:
-        for i in random.permutation(len(SPECS)):
-            spec, own = SPECS[i], int(random.integers(2**32))
-            found = soak(spec, arguments.each, arguments.num_envs, arguments.threads, own)
-            if found['not_finite']:
-                figures['not_finite'].append({'id': spec.id, 'seed': own, 'run': seed, **found})
-            types = figures['task_types']
-            types[spec.task_type] = merged(types.get(spec.task_type), found)
-            steps += found['steps']
-            run['seconds'], run['environments'] = (
-                round(time.time() - begin, 1),
-                run['environments'] + 1,
-            )
-            run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
-            files.write_json(figures, arguments.file)
-            bar.set_postfix_str(f'{steps / 1e6:.2f} M steps, {run["memory"][-1][2]} MB')
-            bar.update(min(round(run['seconds']), bar.total) - bar.n)
-            if time.time() >= begin + arguments.seconds:
-                break
+    for i in order(random):
+        spec, own = SPECS[i], int(random.integers(2**32))
+        found = soak(spec, arguments.each, arguments.num_envs, arguments.threads, own)
+        if found['not_finite']:
+            figures['not_finite'].append({'id': spec.id, 'seed': own, 'run': seed, **found})
+        types = figures['task_types']
+        types[spec.task_type] = merged(types.get(spec.task_type), found)
+        steps += found['steps']
+        run['seconds'], run['environments'] = (
+            round(time.time() - begin, 1),
+            run['environments'] + 1,
+        )
+        run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
+        files.write_json(figures, arguments.file)
+        bar.set_postfix_str(f'{steps / 1e6:.2f} M steps, {run["memory"][-1][2]} MB')
+        bar.update(min(round(run['seconds']), bar.total) - bar.n)
+        if time.time() >= begin + arguments.seconds:
+            break
     bar.close()
     show(figures)
 
 
 if __name__ == '__main__':
     os.environ.setdefault('MUJOCO_GL', 'disable')
-    with program.terminable():
-        main()
+    program.begin_script()
+    main()

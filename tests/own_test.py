@@ -566,6 +566,8 @@ class TerrainTest(Folder):
         ('coarse', lambda f: terrain.from_mesh(f / 'away.stl', 50, centre=True), '1 x 1 points'),
         ('up', lambda f: terrain.from_mesh(f / 'away.stl', up='x'), "expected 'y' or 'z'"),
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
+        ('plane_mesh', lambda f: terrain.from_mesh(f / 'plane.obj'), 'not a mesh: .*without three coordinates'),
+        ('far', lambda f: terrain.from_mesh(f / 'away.stl', scale=1e7), r'reaches 9.5e\+07 m; expected no more than 1e\+06'),
         ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture that can be read'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
@@ -576,6 +578,7 @@ class TerrainTest(Folder):
         box.export(self.folder / 'away.stl')
         self.write('nothing', 'broken.obj')
         self.write('nothing', 'broken.png')
+        self.write('v -1 -1\nv 1 -1\nv 0 1\nf 1 2 3\n', 'plane.obj')
         with self.assertRaisesRegex(ValueError, message):
             make(self.folder)
 

@@ -350,7 +350,9 @@ class PartialBatchTest(parameterized.TestCase):
             environments.set_state(state, [1])
         environments.reset()
         for numbers in ([0, 1], None, []):
-            with self.assertRaisesRegex(ValueError, 'the state has 1 simulations; expected'):
+            with self.assertRaisesRegex(
+                ValueError, "the state has 1 simulations in 'world'; expected"
+            ):
                 environments.set_state(state, numbers)
         with self.assertRaisesRegex(ValueError, 'each of 2 simulations once'):
             environments.set_state(environments.get_state([1, 2]), [1, 1])

@@ -35,6 +35,7 @@ from trl_suite.terrain.spatial.layout import GRID, Layout
 from trl_suite.util.files import existing
 from trl_suite.util.libraries import library
 
+FARTHEST = 1e6  # m; of a vertex of a mesh
 IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
 
@@ -327,6 +328,11 @@ def from_mesh(
     if up == 'y':
         triangles = triangles[..., [0, 2, 1]] * (1, -1, 1)
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    if max(-low.min(), high.max()) > FARTHEST:
+        raise ValueError(
+            f'{file}: the mesh reaches {max(-low.min(), high.max()):g} m; expected no more than '
+            f'{FARTHEST:g} m from its origin'
+        )
     if centre:
         middle = np.append(0.5 * (low + high)[:2], 0.0)
         triangles, low, high = triangles - middle, low - middle, high - middle

@@ -166,6 +166,8 @@ def read_triangles(file: os.PathLike[str]) -> np.ndarray:
         raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
     if not len(triangles) or not np.isfinite(triangles).all():
         raise ValueError(f'{file}: not a mesh: no triangles, or vertices that are not finite')
+    if triangles.shape[1:] != (3, 3):  # of files whose vertices have one or two coordinates
+        raise ValueError(f'{file}: not a mesh: vertices without three coordinates')
     return triangles
 
 
