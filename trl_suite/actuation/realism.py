@@ -70,7 +70,7 @@ class Actuators(Config):
     )
     delay: float | Sequence[float] = option(
         0.0,
-        'time until a control takes effect, rounded to physics steps; of two bounds, between which it is '
+        'time until a control takes effect, rounded to physics steps; or two bounds, between which it is '
         'drawn for each episode',
         unit='ms', at_least=0, at_most=LONGEST_DELAY,
     )  # fmt: skip
@@ -100,7 +100,7 @@ class Actuators(Config):
     )  # fmt: skip
     strength: float | Sequence[float] = option(
         1.0,
-        'factor of all torques of a motor or muscle, gains and limits included; of two bounds, between '
+        'factor of all torques of a motor or muscle, gains and limits included; or two bounds, between '
         'which it is drawn for each motor and episode',
         above=0, at_most=10,
     )  # fmt: skip
