@@ -90,7 +90,9 @@ class OptionsTest(parameterized.TestCase):
         ({'delay': 5000}, 'at most 1000, in ms'),
         ({'delay': (30, 10)}, 'ascending order'),
         ({'delay': (1, 2, 3)}, 'two bounds'),
-        ({'noise': 2}, 'at most 1'),
+        ({'noise': 2}, 'at most 0.5'),
+        ({'strength': (1, 10)}, 'at most 2'),
+        ({'torque_speed': True, 'no_load_speed': 0.5}, 'at least 1, in rad/s'),
         ({'noise': float('nan')}, 'noise is nan'),
         ({'strength': 0}, 'strength is 0'),
         ({'strength': 'weak'}, 'strength'),
@@ -735,13 +737,13 @@ class CompositionTest(parameterized.TestCase):
 
     @parameterized.parameters('torque', 'velocity', 'position', 'muscle')
     def test_extreme_settings_stay_finite(self, model):
-        options = {'delay': 500, 'noise': 1.0, 'strength': (0.01, 10)}
+        options = {'delay': 500, 'noise': 0.5, 'strength': (0.01, 2)}
         if model != 'muscle':
             options |= {'backlash': 0.2, 'flex': 1.0}
             options |= {
                 'torque_speed': True,
-                'no_load_speed': 0.5,
-                'braking': 10.0,
+                'no_load_speed': 1.0,
+                'braking': 2.0,
                 'torque_pose': True,
             }
         environment = make('biped2d', model, **options)

@@ -61,7 +61,7 @@ class Actuators(Config):
     braking: float = option(
         1.5,
         'largest torque against the motion, in torque limits; with torque_speed',
-        at_least=1, at_most=10,
+        at_least=1, at_most=2,
     )  # fmt: skip
     torque_pose: Any = option(
         None,
@@ -70,7 +70,7 @@ class Actuators(Config):
     )
     delay: float | Sequence[float] = option(
         0.0,
-        'time until a control takes effect, rounded to physics steps; of two bounds, between which it is '
+        'time until a control takes effect, rounded to physics steps; or two bounds, between which it is '
         'drawn for each episode',
         unit='ms', at_least=0, at_most=LONGEST_DELAY,
     )  # fmt: skip
@@ -96,13 +96,13 @@ class Actuators(Config):
         0.0,
         'standard deviation of torque noise, in torque limits; an Ornstein-Uhlenbeck process for each '
         f'degree of freedom, with a correlation time of {NOISE_TIME:g} s',
-        at_least=0, at_most=1,
+        at_least=0, at_most=0.5,
     )  # fmt: skip
     strength: float | Sequence[float] = option(
         1.0,
-        'factor of all torques of a motor or muscle, gains and limits included; of two bounds, between '
+        'factor of all torques of a motor or muscle, gains and limits included; or two bounds, between '
         'which it is drawn for each motor and episode',
-        above=0, at_most=10,
+        above=0, at_most=2,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -41,7 +41,7 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
       damping: damping of the springs relative to their stiffness, s.
 
     Raises:
-      ValueError: a body has several of the joints.
+      ValueError: a body has several of the joints, or an MJCF file refers to other files.
     """
     character = Character(spec)
     limits = dict(zip(spec.joints, character.torque_limits, strict=True))
@@ -49,6 +49,11 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
     if text is None:
         path = spec.path or resources.directory('xml') / f'{spec.name}.xml'
         text = pathlib.Path(path).read_text(encoding='utf-8')
+        if ' file=' in text:
+            raise ValueError(
+                f'backlash and flex: {path} refers to other files; make the character by '
+                '`characters.from_file`, which reads them'
+            )
     tree = ElementTree.fromstring(text)
     contact = tree.find('contact')
     if contact is None:

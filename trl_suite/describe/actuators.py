@@ -9,7 +9,7 @@ from trl_suite.actuation import Actuators
 from trl_suite.actuation.realism import NOT_FOR_MUSCLES
 from trl_suite.util.tables import Section, Table, section
 
-_SYMBOLS = {'at_least': '>=', 'at_most': '<=', 'above': '>', 'below': '<'}
+_WORDS = ('at_least', 'above', 'at_most', 'below')
 
 
 def actuator_options(actuation: str | None = None) -> Section:
@@ -26,9 +26,8 @@ def actuator_options(actuation: str | None = None) -> Section:
 
 
 def _bounds(field: dataclasses.Field[Any]) -> str:
-    """Returns the bounds of an option, such as '> 0, <= 10'."""
+    """Returns the bounds of an option in words."""
+    found = field.metadata['bounds']
     return ', '.join(
-        f'{_SYMBOLS[key]} {bound:g}'
-        for key, bound in field.metadata['bounds'].items()
-        if bound is not None
+        f'{word.replace("_", " ")} {found[word]:g}' for word in _WORDS if found[word] is not None
     )

@@ -225,15 +225,20 @@ def pose_factor(curve: int, angle: float, positive: bool, curves: Curves) -> flo
     if curve < 0:
         return 1.0
     values = curves.positive if positive else curves.negative
-    last = curves.angle.shape[1] - 1
-    if not angle > curves.angle[curve, 0]:
-        return values[curve, 0]
-    for k in range(last):
-        low, high = curves.angle[curve, k], curves.angle[curve, k + 1]
-        if angle < high:
-            share = (angle - low) / (high - low)
-            return values[curve, k] + share * (values[curve, k + 1] - values[curve, k])
-    return values[curve, last]
+    low, high = 0, curves.angle.shape[1] - 1
+    if not angle > curves.angle[curve, low]:
+        return values[curve, low]
+    if angle >= curves.angle[curve, high]:
+        return values[curve, high]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if angle < curves.angle[curve, middle]:
+            high = middle
+        else:
+            low = middle
+    begin, end = curves.angle[curve, low], curves.angle[curve, high]
+    share = (angle - begin) / (end - begin)
+    return values[curve, low] + share * (values[curve, high] - values[curve, low])
 
 
 @compiled

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.tasks.actuated import Actuated
 from trl_suite.tasks.components.footstep_plan import SIDE
 from trl_suite.tasks.composed import Composed
 from trl_suite.tasks.disturbances import Disturbed
@@ -51,7 +52,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
       ValueError: the task is not a high-level one, or has the interface 'frame'.
     """
     task = environments.task
-    while isinstance(task, (Composed, Disturbed)):
+    while isinstance(task, (Actuated, Composed, Disturbed)):
         task = task.task
     if not isinstance(task, HierarchicalNavigation):
         raise ValueError(
