@@ -1,6 +1,6 @@
 """Evaluates the shipped policies under each disturbance of world and sensors at three strengths.
 
-    python benchmarks/robustness.py [IDS ...] [--episodes 32] [--seed 0] [--threads 1]
+    python benchmarks/robustness.py [IDS ...] [--episodes 12] [--seeds 0 1] [--step-limit 128]
         [--json benchmarks/robustness.json] [--page docs/realism_worlds.md]
 
 Every cell has the same seeds, so that terrain and start of an episode are the same with and without
@@ -90,21 +90,21 @@ def cells() -> list[tuple[str, bool, dict[str, Any]]]:
 def run(
     ids: list[str],
     episodes: int,
-    seed: int,
+    seeds: list[int],
     threads: int,
     step_limit: int | None,
     path: pathlib.Path,
 ) -> dict[str, Any]:
-    """Evaluates all cells that the file does not have yet; returns all."""
-    settings = {'episodes': episodes, 'seed': seed, 'step_limit': step_limit}
-    found: dict[str, Any] = {**settings, 'rows': {}}
+    """Evaluates all cells that the file does not have yet; returns all, by seed, id and cell."""
+    settings = {'episodes': episodes, 'step_limit': step_limit}
+    found: dict[str, Any] = {**settings, 'seeds': {}}
     if path.exists():
         found = json.loads(path.read_text())
         if {name: found[name] for name in settings} != settings:
             raise ValueError(f'{path} has other settings; remove it, or give another --json')
-    jobs = [(id_, *cell) for cell in cells() for id_ in ids]
-    for id_, key, ground, options in tqdm.tqdm(jobs):
-        row = found['rows'].setdefault(id_, {})
+    jobs = [(seed, id_, *cell) for seed in seeds for cell in cells() for id_ in ids]
+    for seed, id_, key, ground, options in tqdm.tqdm(jobs):
+        row = found['seeds'].setdefault(str(seed), {}).setdefault(id_, {})
         if key in row or (ground and not _sees_ground(id_)):
             continue
         limits = {} if step_limit is None else {'step_limit': step_limit // _shorter(id_)}
@@ -119,6 +119,28 @@ def run(
     return found
 
 
+def pooled(found: dict[str, Any], id_: str, key: str) -> tuple[float, float] | None:
+    """Returns mean and 95 % confidence interval of the return over all seeds; None without any."""
+    rows = [rows[id_] for rows in found['seeds'].values() if id_ in rows]
+    results = [row[key] for row in rows if key in row]
+    if not results:
+        return None
+    mean = sum(result['return'] for result in results) / len(results)
+    interval = math.hypot(*(result['return_interval'] or math.nan for result in results))
+    return mean, interval / len(results)
+
+
+def share(found: dict[str, Any], id_: str, key: str) -> str:
+    """Returns the return relative to that without disturbance, over the seeds that have both."""
+    both = {
+        seed: {id_: rows[id_]}
+        for seed, rows in found['seeds'].items()
+        if key in rows.get(id_, {}) and 'none' in rows[id_]
+    }
+    mean, none = (pooled({'seeds': both}, id_, each) for each in (key, 'none'))
+    return '–' if mean is None or none is None else f'{100 * mean[0] / none[0]:.0f}'
+
+
 def _shorter(id_: str) -> int:
     """Returns by what the step limit is divided, since steps are cycles or footsteps."""
     return 8 if 'FSM_' in id_ or 'HLC_' in id_ else 1
@@ -130,17 +152,19 @@ def _sees_ground(id_: str) -> bool:
 
 def table(found: dict[str, Any]) -> str:
     """Returns the results as Markdown: a row for each disturbance, a column for each environment."""
-    ids = [id_ for id_ in IDS if id_ in found['rows']]
-    limit = found['step_limit']
+    ids = [id_ for id_ in IDS if any(id_ in rows for rows in found['seeds'].values())]
+    limit, seeds = found['step_limit'], ', '.join(found['seeds'])
     length = (
         ''
         if limit is None
         else f', at most {limit} steps each, or {limit // 8} cycles and footsteps'
     )
     lines = [
-        f'Mean return of {found["episodes"]} episodes (seed {found["seed"]}{length}) of the shipped policies, '
-        'which were trained without any disturbance, divided by their return without it, in percent; three '
-        'strengths from left to right. A dash: the ground is not observed, or not evaluated.',
+        f'Mean return of the shipped policies, which were trained without any disturbance, divided by their '
+        f'return without it, in percent; three strengths from left to right. {found["episodes"]} episodes for '
+        f'each of the seeds {seeds}{length}; a cell has the same terrains and starts as the others of its '
+        'column. A dash: the ground is not observed. Steps of `FSM` environments are gait cycles, those of '
+        '`HLC` footsteps, and so are their delays.',
         '',
         '| disturbance | strengths | ' + ' | '.join(f'`{id_}`' for id_ in ids) + ' |',
         '|---' * (2 + len(ids)) + '|',
@@ -149,26 +173,20 @@ def table(found: dict[str, Any]) -> str:
         texts = ', '.join(text for text, _ in strengths)
         entries = []
         for id_ in ids:
-            row = found['rows'][id_]
-            shares = [
-                f'{100 * row[key]["return"] / row["none"]["return"]:.0f}' if key in row else '–'
-                for key in (f'{name}: {text}' for text, _ in strengths)
-            ]
+            shares = [share(found, id_, f'{name}: {text}') for text, _ in strengths]
             entries.append('–' if set(shares) == {'–'} else ' '.join(shares))
-        lines.append(f'| {name} | {texts} {unit} | ' + ' | '.join(entries) + ' |')
-    none = ' | '.join(
-        f'{found["rows"][id_]["none"]["return"]:.0f} ± {found["rows"][id_]["none"]["return_interval"] or math.nan:.0f}'
-        for id_ in ids
-    )
-    lines.append(f'| return without | (95 %) | {none} |')
+        lines.append(f'| {name} | {f"{texts} {unit}".strip()} | ' + ' | '.join(entries) + ' |')
+    none = [pooled(found, id_, 'none') or (math.nan, math.nan) for id_ in ids]
+    cells_ = ' | '.join(f'{mean:.0f} ± {interval:.1f}' for mean, interval in none)
+    lines.append(f'| none: the return itself | 95 % confidence | {cells_} |')
     return '\n'.join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('ids', nargs='*', default=list(IDS))
-    parser.add_argument('--episodes', type=int, default=32)
-    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--episodes', type=int, default=12)
+    parser.add_argument('--seeds', type=int, nargs='+', default=[0, 1])
     parser.add_argument('--threads', type=int, default=1)
     parser.add_argument(
         '--step-limit', type=int, help='of an episode; gaits and planners: an eighth of it'
@@ -181,7 +199,7 @@ def main() -> None:
     for id_ in arguments.ids:
         catalogue.find(id_)
     found = run(
-        arguments.ids, arguments.episodes, arguments.seed, arguments.threads, arguments.step_limit,
+        arguments.ids, arguments.episodes, arguments.seeds, arguments.threads, arguments.step_limit,
         arguments.json,
     )  # fmt: skip
     text = table(found)

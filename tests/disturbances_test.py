@@ -725,16 +725,16 @@ class ProgramsTest(FolderTest):
         ground = ('terrain_dropout', '', True, [('0.5', {'sensors': {'terrain_dropout': 0.5}})])
         self.enterContext(mock.patch.object(robustness, 'DISTURBANCES', [strong, ground]))
         self.enterContext(mock.patch.object(robustness, 'IDS', ids))
-        found = robustness.run(ids, 2, 0, 1, 40, path)
+        found = robustness.run(ids, 2, [0], 1, 40, path)
         self.assertEqual(json.loads(path.read_text()), found)
-        flat, gaps = (found['rows'][id_] for id_ in ids)
+        flat, gaps = (found['seeds']['0'][id_] for id_ in ids)
         self.assertLess(flat['push: 9']['return'], 0.8 * flat['none']['return'])
         self.assertNotIn('terrain_dropout: 0.5', flat)
         self.assertIn('terrain_dropout: 0.5', gaps)
         with mock.patch.object(robustness.evaluation, 'evaluate', side_effect=AssertionError):
-            self.assertEqual(robustness.run(ids, 2, 0, 1, 40, path), found)  # nothing is left
+            self.assertEqual(robustness.run(ids, 2, [0], 1, 40, path), found)  # nothing is left
         with self.assertRaisesRegex(ValueError, 'other settings'):
-            robustness.run(ids, 3, 0, 1, 40, path)
+            robustness.run(ids, 3, [0], 1, 40, path)
         share = round(100 * flat['push: 9']['return'] / flat['none']['return'])
         self.assertIn(f'| push | 9 m/s | {share} |', robustness.table(found))
 

@@ -118,7 +118,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     def add_options(command: argparse.ArgumentParser) -> None:
         command.add_argument(
             '--option', type=_option, action='append', metavar='NAME=JSON', dest='options',
-            help="option of the task, as randomize=robot or 'sensors={\"noise\": 0.01}'; may be repeated",
+            help='option of the task, such as randomize=robot; the value is JSON or a name; may be repeated',
         )  # fmt: skip
 
     command = add('list', 'list the environments of the catalogue')

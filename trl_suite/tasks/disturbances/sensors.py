@@ -69,13 +69,13 @@ class SensorConfig(Config):
                     raise ValueError(f'{where} is {value!r}; expected a number from 0 to {most:g}')
         for block, value in _entries(self.delay):
             where = f'delay[{block!r}]' if block else 'delay'
-            errors_ = f'{where} is {value!r}; expected whole numbers of steps up to {MOST_DELAY}'
+            message = f'{where} is {value!r}; expected whole numbers of steps up to {MOST_DELAY}'
             try:
                 low, high = bounds(where, value)
             except (TypeError, ValueError):
-                raise ValueError(errors_) from None
+                raise ValueError(message) from None
             if low % 1 or high % 1 or not 0 <= low <= high <= MOST_DELAY:
-                raise ValueError(errors_)
+                raise ValueError(message)
 
 
 # Noise of 'robot': uniform noise of +-a has the standard deviation a / sqrt(3). legged_gym
@@ -166,7 +166,8 @@ class SensorRules(NamedTuple):
       noise, bias: standard deviations, (size,).
       wrong: probability that a flag is wrong, (size,).
       dropout: probability that a number is missing, (size,).
-      shared: whether bias and delay are those of the column before, (size,) bool, twice: (2, size).
+      shared: whether the bias (first row) and the delay (second row) of a number are those of the
+        number before it, (2, size) bool.
       delay: bounds of the age, (size, 2) steps.
       state: the state.
     """

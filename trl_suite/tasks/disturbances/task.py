@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,9 +17,10 @@ from trl_suite.engine.variation import Variation
 from trl_suite.tasks.disturbances import sensors, worlds
 from trl_suite.tasks.disturbances.sensors import AGAIN, FRESH, NEXT, SensorConfig, sense_all
 from trl_suite.tasks.disturbances.worlds import PushConfig, WorldConfig
-from trl_suite.tasks.task import Marker, Outcome, Task
+from trl_suite.tasks.task import Marker, Outcome, Task, _each
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled_loop, packed
+from trl_suite.util.options import Config
 from trl_suite.util.random import Streams
 
 PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
@@ -87,11 +89,9 @@ class Disturbed(Task):
 
     @property
     def signature(self) -> str:
-        given = [f'{name} {value}' for name, value in self._given() if value is not None]
+        configs = {'randomize': self._world_config, 'sensors': self._sensor_config}
+        given = [f'{name} {_given(config)}' for name, config in configs.items() if config]
         return f'{self.task.signature} with {", ".join(given)}'
-
-    def _given(self) -> tuple[tuple[str, Any], ...]:
-        return ('randomize', self._world_config), ('sensors', self._sensor_config)
 
     def bind(self, world: World) -> None:
         self.task.bind(world)
@@ -286,12 +286,14 @@ def _seeded(env_id: int, seed: np.random.SeedSequence, stream: np.ndarray) -> No
     stream[env_id] = streams.state[0]
 
 
+def _given(config: Config) -> dict[str, Any]:
+    """Returns the options that differ from their defaults."""
+    return {
+        field.name: getattr(config, field.name)
+        for field in dataclasses.fields(config)
+        if getattr(config, field.name) != field.default
+    }
+
+
 def _row(array: np.ndarray, env_id: int) -> Any:
     return array.item(env_id) if array.ndim == 1 else array[env_id].copy()
-
-
-def _each(entries: dict[str, Any], function: Callable[[np.ndarray], Any]) -> dict[str, Any]:
-    return {
-        name: _each(entry, function) if isinstance(entry, dict) else function(entry)
-        for name, entry in entries.items()
-    }
