@@ -96,49 +96,36 @@ class Settings:
     evaluation_episodes: int = 32
 
 
-# A policy collects and learns in rounds, because one that has learnt with a falling learning rate
-# runs several times as far as one that learns with a constant rate all the time.
+# One policy for all terrains of a character. It collects and learns in rounds, because a policy that
+# has learnt with a falling learning rate runs several times as far as one that learns with a constant
+# rate all the time. With rounds of 32,768 cycles the dog fell four times as often as before: 8,000
+# updates pass 60 times over so few transitions.
 GENERALIST: dict[str, Any] = {
-    'samples': 3e5, 'expert_cycles': 0, 'begin': 0, 'updates': 0, 'renew_every': 32768,
-    'learning_rate': 2e-4, 'epsilon': 0.06, 'greedy': 0.2, 'retries': 6, 'back': (1, 4),
-    'evaluate_every': 8192, 'evaluation_episodes': 0,
+    'samples': 196608, 'updates': 0, 'renew_every': 98304, 'epsilon': 0.06, 'greedy': 0.2,
+    'retries': 6, 'back': (1, 4), 'evaluate_every': 8192, 'evaluation_episodes': 0,
 }  # fmt: skip
-FROM_SCRATCH: dict[str, Any] = {
-    'samples': 196608, 'expert_cycles': 98304, 'begin': 2e3, 'renew_every': 98304,
-    'learning_rate': 3e-4, 'back': (1, 5), 'retry_cycles': 3,
-}  # fmt: skip
+STARTED: dict[str, Any] = {'expert_cycles': 0, 'begin': 0, 'learning_rate': 1e-4}
+SCRATCH: dict[str, Any] = {'expert_cycles': 98304, 'back': (1, 5), 'retry_cycles': 3}
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
+    'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
     'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
-    # One policy for all terrains of a character.
-    'FSM_Hopper2D_Terrain_Mixed_Easy-v0': {
-        **GENERALIST,
-        **FROM_SCRATCH,
-        'also': ('FSM_Hopper2D_*',),
-        'num_envs': 70,
-        'view': 10.0,  # a hopper must choose its hops four cycles, or 9 m, ahead
-    },
-    'FSM_Biped2D_Terrain_Mixed-v0': {
-        **GENERALIST,
-        **FROM_SCRATCH,
-        'also': ('FSM_Biped2D_*',),
-        'num_envs': 64,
-    },
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
-        **GENERALIST,
-        'start': 'FSM_Dog2D_Terrain_Mixed-v0',
-        'also': ('FSM_Dog2D_*',),
+        **GENERALIST, **STARTED, 'start': 'FSM_Dog2D_Terrain_Mixed-v0', 'also': ('FSM_Dog2D_*',),
         'num_envs': 78,
     },
     'FSM_Raptor2D_Terrain_Slopes_Mixed-v0': {
-        **GENERALIST,
-        'start': 'FSM_Raptor2D_Terrain_Mixed-v0',
-        'also': ('FSM_Raptor2D_*',),
-        'num_envs': 70,
+        **GENERALIST, **STARTED, 'start': 'FSM_Raptor2D_Terrain_Mixed-v0',
+        'also': ('FSM_Raptor2D_*',), 'num_envs': 70,
     },
-}
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {**GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',)},
+    # A hopper must choose its hops four cycles, or 9 m, ahead.
+    'FSM_Hopper2D_Terrain_Mixed-v0': {
+        **GENERALIST, **SCRATCH, 'also': ('FSM_Hopper2D_*',), 'num_envs': 70, 'view': 10.0,
+    },
+}  # fmt: skip
 CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hold as float32
 CLIP = 5.0  # bound of the networks' inputs, in standard deviations
 _STATE = (
