@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from trl_suite.actuation import realism, series
 from trl_suite.actuation.realism import Actuators
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.tasks.task import Outcome, Task
+from trl_suite.tasks.task import Task
+from trl_suite.tasks.wrapper import Wrapper
 from trl_suite.util import random
 
 _STREAM = 29  # distinguishes the draws of actuators from other draws with the same seed
 
 
-class Actuated(Task):
+class Actuated(Wrapper):
     """Another task, whose joints are driven by the motors that `Actuators` describes.
 
     `info` has 'delay' (ms) and 'strength_NAME' of each joint or muscle, if they are options.
@@ -40,39 +41,11 @@ class Actuated(Task):
           actuators: the options.
           character: the character whose joints are driven; it has its actuators.
         """
-        self.task, self.actuators, self._character = task, actuators, character
+        self.actuators, self._character = actuators, character
         self._curves = realism.curves_of(actuators, character)
         if actuators.backlash or actuators.flex:
             series.finish(character, task.physics_timestep)
-        self.set_timesteps(task.control_timestep, task.physics_timestep)
-        self.fields, self.action_map, self.blocks = task.fields, task.action_map, task.blocks
-        self.in_parts = task.in_parts
-
-    def __getattr__(self, name: str) -> Any:
-        if name == 'task' or name.startswith('__'):  # `task` is not set yet while a copy is made
-            raise AttributeError(name)
-        return getattr(self.task, name)
-
-    @property
-    def watch(self) -> Any:
-        """Callback within steps of variable duration of the other task; for rendering."""
-        return self.task.watch  # type: ignore[attr-defined]
-
-    @watch.setter
-    def watch(self, look: Callable[[], None] | None) -> None:
-        self.task.watch = look  # type: ignore[attr-defined]
-
-    @property
-    def root_entity(self) -> composer.Entity:
-        return self.task.root_entity
-
-    @property
-    def outcome(self) -> Outcome:  # type: ignore[override]
-        return self.task.outcome
-
-    @property
-    def steps_per_call(self) -> int:
-        return self.task.steps_per_call
+        super().__init__(task)
 
     @property
     def signature(self) -> str:
@@ -131,23 +104,9 @@ class Actuated(Task):
         state.noise[env_id] = rng.standard_normal(state.noise.shape[1])
         self._streams.seed(env_id, seed.spawn(1)[0])
 
-    # A step is that of the other task.
-
-    def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
-        self.task.step(action, env_ids)
-
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self._age = self.motors.age[0]
         self.task.apply_action(action, env_ids)
-
-    def simulate(self, env_ids: np.ndarray) -> None:
-        self.task.simulate(env_ids)
-
-    def finish_step(self, env_ids: np.ndarray) -> None:
-        self.task.finish_step(env_ids)
-
-    def observe(self, env_ids: np.ndarray | None = None) -> None:
-        self.task.observe(env_ids)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         if self.motors.age[0] == self._age:

@@ -17,17 +17,18 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from trl_suite.engine import World
 from trl_suite.tasks.task import Task, consecutive, outcome
+from trl_suite.tasks.wrapper import Wrapper
 from trl_suite.util import errors
 
 Function = Callable[[Any], np.ndarray]
 OPTIONS = ('rewards', 'observations', 'failures')
 
 
-class Composed(Task):
+class Composed(Wrapper):
     """Another task with additional reward terms, observation blocks and failures.
 
     Each custom function is called with this task and returns an array with one row per simulation.
@@ -64,7 +65,8 @@ class Composed(Task):
           ValueError: a name that is in use, an invalid weight or size, or an object that is not a
             function.
         """
-        self.task = task
+        super().__init__(task)
+        self.in_parts = False  # custom functions compute the values of all simulations
         self._rewards, self._extras = dict(rewards or {}), dict(observations or {})
         self._failures = dict(failures or {})
         for name, (weight, function) in self._rewards.items():
@@ -76,30 +78,10 @@ class Composed(Task):
                 raise ValueError(f'the task already has a block {name!r}; choose another name')
         for name, function in self._failures.items():
             _check('failure', name, function, True, '')
-        self.set_timesteps(task.control_timestep, task.physics_timestep)
-        self.fields, self.action_map = task.fields, task.action_map
         sizes = {name: part.stop - part.start for name, part in task.blocks.items()}
         self.blocks = consecutive(sizes | {name: size for name, (size, _) in self._extras.items()})
         self._own = sum(sizes.values())
         self.mirror = None  # unknown for the added blocks
-
-    def __getattr__(self, name: str) -> Any:
-        if name == 'task' or name.startswith('__'):  # `task` is not set yet while a copy is made
-            raise AttributeError(name)
-        return getattr(self.task, name)
-
-    @property
-    def watch(self) -> Any:
-        """Callback within steps of variable duration of the other task; for rendering."""
-        return self.task.watch  # type: ignore[attr-defined]
-
-    @watch.setter
-    def watch(self, look: Callable[[], None] | None) -> None:
-        self.task.watch = look  # type: ignore[attr-defined]
-
-    @property
-    def root_entity(self) -> composer.Entity:
-        return self.task.root_entity
 
     @property
     def signature(self) -> str:
@@ -120,8 +102,6 @@ class Composed(Task):
         self.failed[env_ids] = self.diverged[env_ids] = False
         self._write(env_ids)
 
-    in_parts = False  # custom functions compute the values of all simulations
-
     def step(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
         self.world.share(lambda part: self.task.step(action, part), env_ids)
@@ -132,9 +112,6 @@ class Composed(Task):
     def apply_action(self, action: np.ndarray, env_ids: np.ndarray) -> None:
         self.action[env_ids] = np.clip(action[env_ids], -1.0, 1.0)
         self.task.apply_action(action, env_ids)
-
-    def simulate(self, env_ids: np.ndarray) -> None:
-        self.task.simulate(env_ids)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.task.finish_step(env_ids)

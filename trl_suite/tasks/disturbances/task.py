@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from trl_suite.engine import World
 from trl_suite.engine.pushes import DIRECTION, DURATION, FORCE, INTERVAL
@@ -18,6 +18,7 @@ from trl_suite.tasks.disturbances import sensors, worlds
 from trl_suite.tasks.disturbances.sensors import AGAIN, FRESH, NEXT, SensorConfig, sense_all
 from trl_suite.tasks.disturbances.worlds import PushConfig, WorldConfig
 from trl_suite.tasks.task import Marker, Outcome, Task, _each
+from trl_suite.tasks.wrapper import Wrapper
 from trl_suite.util import errors
 from trl_suite.util.compiled import compiled_loop, packed
 from trl_suite.util.options import Config
@@ -27,7 +28,7 @@ PUSH_COLOUR = (0.9, 0.2, 0.15, 1.0)
 _METRES_PER_NEWTON = 0.004  # of the arrow that shows a push
 
 
-class Disturbed(Task):
+class Disturbed(Wrapper):
     """Another task with worlds that vary between episodes, pushes and sensors.
 
     Worlds are drawn from the random state that `reset` gets, without taking numbers from it: the
@@ -59,33 +60,13 @@ class Disturbed(Task):
         if sensor is not None:
             # Tasks whose steps last longer than 1/30 s have a callback within steps.
             sensor = sensors.fitting(sensor, hasattr(task, 'watch'))
-        self.task, self._world_config, self._sensor_config = task, world, sensor
+        self._world_config, self._sensor_config = world, sensor
         self._push: PushConfig | None = world.push if world is not None else None
         if world is not None:
             _check(task, world)
         if sensor is not None:
             sensors.check(sensor, task.blocks)
-        self.set_timesteps(task.control_timestep, task.physics_timestep)
-        self.fields, self.action_map, self.blocks = task.fields, task.action_map, task.blocks
-        self.in_parts = task.in_parts
-
-    def __getattr__(self, name: str) -> Any:
-        if name == 'task' or name.startswith('__'):  # `task` is not set yet while a copy is made
-            raise AttributeError(name)
-        return getattr(self.task, name)
-
-    @property
-    def watch(self) -> Any:
-        """Callback within steps of variable duration of the other task; for rendering."""
-        return self.task.watch  # type: ignore[attr-defined]
-
-    @watch.setter
-    def watch(self, look: Callable[[], None] | None) -> None:
-        self.task.watch = look  # type: ignore[attr-defined]
-
-    @property
-    def root_entity(self) -> composer.Entity:
-        return self.task.root_entity
+        super().__init__(task)
 
     @property
     def signature(self) -> str:
@@ -179,9 +160,6 @@ class Disturbed(Task):
         self._clear_impulse(env_ids)
         self._steps_before = int(self.world.engine.steps[0])
         self.task.apply_action(action, env_ids)
-
-    def simulate(self, env_ids: np.ndarray) -> None:
-        self.task.simulate(env_ids)
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         self.task.finish_step(env_ids)

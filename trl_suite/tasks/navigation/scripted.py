@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.tasks.actuated import Actuated
 from trl_suite.tasks.components.footstep_plan import SIDE
-from trl_suite.tasks.composed import Composed
-from trl_suite.tasks.disturbances import Disturbed
 from trl_suite.tasks.navigation.hierarchical import HierarchicalNavigation
 from trl_suite.tasks.navigation.hierarchical_rules import PLAN_NAMES
+from trl_suite.tasks.wrapper import unwrapped
 from trl_suite.terrain.spatial.windows import AHEAD, ASIDE, SAMPLES
 
 LENGTH, SHORT = (
@@ -51,9 +49,7 @@ def scripted(environments: Any) -> Callable[[np.ndarray], np.ndarray]:
     Raises:
       ValueError: the task is not a high-level one, or has the interface 'frame'.
     """
-    task = environments.task
-    while isinstance(task, (Actuated, Composed, Disturbed)):
-        task = task.task
+    task = unwrapped(environments.task)
     if not isinstance(task, HierarchicalNavigation):
         raise ValueError(
             f'the task {type(task).__name__} has no scripted policy; goal_navigation and soccer have one'
