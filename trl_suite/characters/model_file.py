@@ -16,12 +16,12 @@ from lxml import etree
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
-# Of a file, besides bodies: what must have a name to be found again.
 MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
 _PARTS = (
     'body', 'joint', 'freejoint', 'geom', 'site', 'link', 'collision', 'composite', 'flexcomp',
 )  # fmt: skip
 _COPIES = ('replicate', 'composite', 'flexcomp')  # elements whose attribute 'count' multiplies
+# Of a file, besides bodies: what must have a name to be found again.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
 
