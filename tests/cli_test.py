@@ -868,12 +868,13 @@ class ProgramTest(CommandTest):
         self.assertRegex(done.stderr, '^trl-suite: error: [^\n]*MUJOCO_GL must be one of[^\n]*\n$')
 
     def test_output_that_cannot_be_written(self):
-        for redirection, message in (
-            ('>&-', 'standard output is closed'),
-            ('>/dev/full', 'No space'),
+        for command, message in (
+            ('list --tag blind >&-', 'standard output is closed'),
+            ('list --tag blind >/dev/full', 'No space'),
+            ('--help >/dev/full', 'No space'),
         ):
             done = subprocess.run(
-                ['bash', '-c', f'"{sys.executable}" -m trl_suite list --tag blind {redirection}'],
+                ['bash', '-c', f'"{sys.executable}" -m trl_suite {command}'],
                 capture_output=True, text=True, timeout=60, check=False,
             )  # fmt: skip
             self.assertEqual((done.returncode, done.stdout), (2, ''))

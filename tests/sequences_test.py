@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import copy
 import json
+import os
 import pathlib
 import sys
 import tempfile
@@ -304,6 +305,29 @@ class RunTest(parameterized.TestCase):
         self.assertCountEqual(
             [path.name for path in self.folder.iterdir()], ['result.json', 'result.stage1']
         )
+
+    def test_two_runs_that_write_one_result(self):
+        """The second one is refused as long as the first one lasts."""
+        message = f'process {os.getpid()} writes .*result.json; wait for it, or choose another'
+        with (
+            mock.patch.object(Keeper, 'train', lambda *_: self.run_short(Keeper())),
+            self.assertRaisesRegex(RuntimeError, message),
+        ):
+            self.run_short(Keeper())
+        self.assertLen(self.run_short(Keeper())['scores'], 3)
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
+
+    def test_what_killed_runs_left_is_removed(self):
+        """Also by a process with the same number, as in a container that is started again."""
+        with self.assertRaises(KeyboardInterrupt):
+            self.run_short(Keeper(1))
+        (self.folder / 'result.stage0').mkdir()
+        part = self.folder / f'.result.stage2.{os.getpid()}.part'
+        part.mkdir()
+        (part / 'history.json').write_text('half')
+        (self.folder / '.result.json.lock').write_text('1234')
+        self.assertLen(self.run_short(Keeper())['scores'], 3)
+        self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
 
     def test_a_learner_that_exceeds_its_budget_is_refused(self):
         class Greedy(Counter):

@@ -32,7 +32,7 @@ import pathlib
 import re
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import trl_suite
 from trl_suite.cli import engine
@@ -54,12 +54,7 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     """
     try:
         with program.terminable():
-            try:
-                arguments = _parser(prog).parse_args(argv)
-            except SystemExit:  # after --help and --version
-                if sys.stdout is not None:
-                    sys.stdout.flush()
-                raise
+            arguments = _parser(prog).parse_args(argv)
             if sys.stdout is None:
                 raise OSError('standard output is closed')
             command = engine.load(f'trl_suite.cli.{arguments.command}')
@@ -94,6 +89,13 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f'{message} (see {self.prog} --help)')
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # argparse ignores errors of writing.
+        file = file or sys.stderr
+        if file is not None:
+            file.write(message)
+            file.flush()
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:
