@@ -102,10 +102,12 @@ def read(app: Any, name: str, source: list[str]) -> None:
 
 
 def moving(match: re.Match[str]) -> str:
-    """Returns the moving picture of an environment, or its film strip if there is none."""
-    if not (DOCS / 'moving' / f'{match[1]}.webp').exists():
-        return match[0]
-    return f'![{match[1]}](../moving/{match[1]}.webp)'
+    """Returns the moving picture of an environment, or its film strip, and how to see more of it."""
+    picture = match[0]
+    if (DOCS / 'moving' / f'{match[1]}.webp').exists():
+        picture = f'![{match[1]}](../moving/{match[1]}.webp)'
+    view = f'trl-suite view {match[1]} --browser'
+    return f'{picture}\n\nIn the [web browser](../guide.md#in-a-web-browser): `{view}`'
 
 
 def mark_code(app: Any, what: str, name: str, item: Any, options: Any, lines: list[str]) -> None:

@@ -15,6 +15,7 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
+from trl_suite.arenas import scene
 from trl_suite.rendering import overlays, replays, web_scene
 from trl_suite.viewing import browser, session
 
@@ -129,9 +130,17 @@ class SceneTest(parameterized.TestCase):
         model, data = environment.physics.model.ptr, environment.physics.data.ptr
         field = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[0])
         mesh = web_scene._height_field(model, data, field)
-        near = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(1) < 10]
-        heights = environment.task.arena.height(near[None, :, 0], near[None, :, 1])[0]
-        np.testing.assert_allclose(near[:, 2], heights, atol=0.5 * web_scene.STEP + 1e-5)
+        # Everywhere but where fine and coarse cells meet; the window ends at 16 m.
+        distance = np.abs(mesh.vertices[:, :2]).max(1)
+        border = np.abs(distance - web_scene.NEAR) < 1e-3
+        x, y, z = mesh.vertices[~border & (distance < 15)].T
+        heights = environment.task.arena.height(x[None], y[None])[0]
+        np.testing.assert_allclose(z, heights, atol=0.5 * web_scene.STEP + 1e-5)
+        # Without overlaps: the area seen from above is that of the field.
+        self.assertAlmostEqual(mesh.area_faces @ mesh.face_normals[:, 2], 32.0**2, delta=1e-2)
+        for at in (x, y):
+            near = np.unique(np.round(at[np.abs(at) < 7.9], 3))
+            np.testing.assert_allclose(np.diff(near), 0.2, atol=2e-3)
         self.assertGreater((mesh.face_normals[:, 2] > 0).mean(), 0.999)
 
     def test_ports(self):
@@ -167,6 +176,19 @@ class SceneTest(parameterized.TestCase):
         capsules = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)).sum()
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
+
+    @parameterized.parameters(DOG, SOCCER)
+    def test_the_sky_is_that_of_the_model(self, id_):
+        environment = suite.make(id_)
+        sky = web_scene._sky(environment.physics.model.ptr).astype(float)
+        top, horizon = np.array(scene.LOOKS[suite.find(id_).domain].sky) * 255
+        half = len(sky) // 2
+        # From between both colours at the top of the side face to the middle of the gradient.
+        share = ((sky[:, 0] - top) / (horizon - top)).mean(1)
+        self.assertBetween(share[0], 0.0, 0.3)
+        self.assertAlmostEqual(share[half - 1], 0.5, delta=0.05)
+        self.assertTrue((np.diff(share[:half]) >= -0.01).all())
+        self.assertEqual(np.ptp(sky[half:], axis=0).max(), 0)
 
     @parameterized.parameters(DOG, HILLS)
     def test_samples_lie_where_they_are_observed(self, id_):
@@ -275,8 +297,10 @@ class ChromiumTest(FolderTest):
         return iio.imread(page.screenshot())[..., :3].astype(int)
 
     def wait_until_drawn(self, page):
-        """Waits for the ground, which fills the lower part: as long as it is white, nothing is there."""
-        self.wait_for(lambda: self.picture(page)[230:330].std() > 10, 'nothing is drawn')
+        """Waits for the ground, which fills the lower part: as long as it has one colour, nothing is."""
+        self.wait_for(
+            lambda: self.picture(page)[230:330].std((0, 1)).max() > 10, 'nothing is drawn'
+        )
         return self.picture(page)
 
     def wait_until_it_moves(self, page):

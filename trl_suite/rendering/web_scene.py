@@ -37,13 +37,16 @@ SHADES = (1.0, 0.88)  # brightness of the squares
 PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
 DEPTH = 1.0  # m; thickness of planar ground below its lowest point
 STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
+NEAR = 8.0  # m; distance from the centre of a height field within which all vertices are drawn
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
 SECTIONS = 24  # number of faces around a cylinder or cone
+AMBIENT = 0.5  # intensity of ambient light; 1 would bleach pale ground
 GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
 SHAFT, TIP = 0.8, 0.2  # fractions of the length of an arrow
 SAMPLE_COLOUR, SAMPLE_SIZE = (242, 64, 38), 0.05  # points of observed terrain: colour; diameter, m
 CAMERA = np.array([0.0, -4.0, 1.0])  # m; position of the camera from the character
 FIELD_OF_VIEW = 0.8  # rad
+FRONT = 4  # number of a skybox's face
 
 _ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1)
 
@@ -133,6 +136,8 @@ class WebScene:
         with server.atomic():
             server.scene.reset()
             server.scene.set_up_direction('+z')
+            server.scene.configure_environment_map(environment_intensity=AMBIENT)
+            server.scene.set_background_image(_sky(model))
             server.initial_camera.position = CAMERA
             server.initial_camera.look_at = np.zeros(3)
             server.initial_camera.fov = FIELD_OF_VIEW
@@ -386,22 +391,59 @@ def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
 
 
 def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
-    """Returns the surface of a height field in world coordinates, to `STEP` in height."""
+    """Returns the surface of a height field in world coordinates, to `STEP` in height.
+
+    Cells farther than `NEAR` from its middle are twice as wide.
+    """
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     start = int(model.hfield_adr[field])
     x, y, z, _ = model.hfield_size[field]
-    heights = z * model.hfield_data[start : start + rows * columns]
+    heights = (z * model.hfield_data[start : start + rows * columns]).reshape(rows, columns)
+    # Fine cells are those between the first and last of these rows and columns.
+    top, left = _first_fine(rows, y), _first_fine(columns, x)
+    bottom, right = rows - 1 - top, columns - 1 - left
+    if top or left:  # no cracks: along the border fine cells are as straight as coarse ones
+        for line in (
+            heights[top, left : right + 1], heights[bottom, left : right + 1],
+            heights[top : bottom + 1, left], heights[top : bottom + 1, right],
+        ):  # fmt: skip
+            line[1:-1:2] = 0.5 * (line[:-2:2] + line[2::2])
     across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
-    local = np.stack([across.ravel(), along.ravel(), heights], axis=1)
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, above = corner + 1, corner + columns
-    faces = np.concatenate(
-        [np.stack([corner, right, above + 1], 1), np.stack([corner, above + 1, above], 1)]
-    )
+    local = np.stack([across.ravel(), along.ravel(), heights.ravel()], axis=1)
+    row, column = np.mgrid[0 : rows - 1, 0 : columns - 1]
+    fine = (row >= top) & (row < bottom) & (column >= left) & (column < right)
+    coarse = ~fine & (row % 2 == 0) & (column % 2 == 0)
+    faces = np.concatenate([_cells(fine, 1, columns), _cells(coarse, 2, columns)])
+    used, faces = np.unique(faces, return_inverse=True)
+    local, faces = local[used], faces.reshape(-1, 3)
     turned = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
     turned[:, 2] = STEP * np.round(turned[:, 2] / STEP)
     return trimesh.Trimesh(turned.astype(np.float32), faces, process=False)
+
+
+def _first_fine(vertices: int, half: float) -> int:
+    """Returns from which vertex of a side, as far as to its mirror image, cells are fine.
+
+    Args:
+      vertices: number of vertices along the side.
+      half: half length of the side, m.
+    """
+    cells = vertices - 1
+    if cells % 2:  # cannot be paired
+        return 0
+    return 2 * int(max(0.0, np.ceil(0.5 * (0.5 * cells - NEAR * cells / (2 * half)))))
+
+
+def _cells(kept: np.ndarray, size: int, columns: int) -> np.ndarray:
+    """Returns two triangles for each cell of a grid, as indices of vertices."""
+    row, column = np.nonzero(kept)
+    corner = row * columns + column
+    right, above = corner + size, corner + size * columns
+    beyond = above + size
+    return np.concatenate(
+        [np.stack([corner, right, beyond], 1), np.stack([corner, beyond, above], 1)]
+    )
 
 
 def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
@@ -415,6 +457,22 @@ def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
     )
     mesh.visual = trimesh.visual.TextureVisuals(mesh.vertices[:, :2] / (2 * TILE), material)
     return mesh
+
+
+def _sky(model: Any) -> np.ndarray | None:
+    """Returns the sky of a model as a picture, (h, 1, 3) uint8: its colours above the horizon.
+
+    None if it has no sky.
+    """
+    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    if not len(skies):
+        return None
+    texture = model.tex(int(skies[0]))
+    size, channels = int(texture.width[0]), int(texture.nchannel[0])
+    start = int(texture.adr[0]) + FRONT * size * size * channels
+    face = model.tex_data[start : start + size * size * channels].reshape(size, size, channels)
+    column = face[: size // 2, :1, :3]
+    return np.concatenate([column, np.repeat(column[-1:], size // 2, axis=0)])
 
 
 def _material_colours(model: Any) -> np.ndarray:
