@@ -621,6 +621,7 @@ class ShippedTest(parameterized.TestCase):
         studies = {
             'footsteps',
             'default_gaits',
+            'oracles',
             'plans',
             'shared',
             'transfer',
