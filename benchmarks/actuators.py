@@ -88,12 +88,15 @@ def cpu(environments: VectorEnvironment, steps: int) -> float:
     return 1e6 * spent / float(environments.task.world.engine.steps.sum() - before)
 
 
-def costs() -> None:
+def costs(titles: list[str]) -> None:
     """Measures the time of each option relative to ideal actuators."""
-    result = {}
-    for title, id_ in COST_IDS.items():
+    result = files.read_json(RESULTS).get('costs', {}) if RESULTS.exists() else {}
+    for title in titles or COST_IDS:
+        id_ = COST_IDS[title]
         made = {}
         for name, options in {'ideal': {}, **OPTIONS}.items():
+            if 'gait' in title and 'delay' in options:
+                options = {**options, 'delay': realism.GAIT_DELAY}
             own = {
                 key: value for key, value in options.items() if fits(suite.find(id_), {key: value})
             }
@@ -317,9 +320,12 @@ def page() -> None:
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('what', choices=('costs', 'effects', 'plots', 'page'))
+    parser.add_argument('titles', nargs='*', help='for costs: only these columns')
     parser.add_argument('--episodes', type=int, default=24)
     args = parser.parse_args()
     if args.what == 'effects':
         effects(args.episodes)
+    elif args.what == 'costs':
+        costs(args.titles)
     else:
-        {'costs': costs, 'plots': plots, 'page': page}[args.what]()
+        {'plots': plots, 'page': page}[args.what]()

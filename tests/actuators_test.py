@@ -131,6 +131,26 @@ class OptionsTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, f'{name} is not an option of muscle control'):
             suite.make(MUSCLE, task_kwargs={'actuators': {name: 0.1}})
 
+    def test_torques_of_gaits_cannot_be_late(self):
+        with self.assertRaisesRegex(ValueError, 'at most 2 ms for a gait'):
+            suite.make(GAIT, task_kwargs={'actuators': {'delay': (0, 3)}})
+
+    @parameterized.parameters('dog', 'raptor', 'biped2d_simbicon', 'hopper')
+    def test_gaits_go_on_with_real_actuators(self, character):
+        options = {
+            'torque_speed': True,
+            'delay': 2,
+            'noise': 0.02,
+            'flex': 0.02,
+            'strength': (0.95, 1.05),
+        }
+        environment = make(character, None, 'gait', **options)
+        for _ in range(2):
+            step = environment.step(np.zeros(len(environment.action_map)))
+        self.assertFalse(environment.info['diverged'])
+        self.assertGreater(environment.info['distance'], 0.5)
+        self.assertTrue(np.isfinite(flat(step)).all())
+
     def test_a_character_without_curves_has_none(self):
         with self.assertRaisesRegex(ValueError, "'dog' has no curves of its own"):
             suite.build('dog', task_kwargs={'actuators': {'torque_pose': True}})
@@ -649,7 +669,8 @@ class CompositionTest(parameterized.TestCase):
         self.compare(MUSCLE, self.options(MUSCLE, name), 10)
 
     def test_bit_identity_of_gaits(self):
-        self.compare(GAIT, {name: ALL[name] for name in ALL if name != 'torque_pose'}, 3)
+        options = {name: ALL[name] for name in ALL if name != 'torque_pose'}
+        self.compare(GAIT, options | {'delay': (0, 2)}, 3)
 
     def test_bit_identity_of_hierarchies(self):
         self.compare('PD_Biped3D_HLC_Soccer-v0', ALL, 2)

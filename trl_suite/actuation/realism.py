@@ -26,6 +26,7 @@ from trl_suite.util.options import Config, option
 
 NOISE_TIME = 0.02  # s; correlation time of the torque noise
 LONGEST_DELAY = 1000.0  # ms
+GAIT_DELAY = 2.0  # ms; with a longer delay of torques that are feedback, gaits are unstable
 _AXES = ('_x', '_y', '_z')
 _LATERAL = 1  # the y axis
 _VELOCITY, _TENDONS = (
@@ -326,7 +327,7 @@ class Strength:
 
 
 def check(actuators: Actuators, actuation: str) -> None:
-    """Checks that the options suit an actuation model.
+    """Checks that the options suit an actuation model, or 'gait'.
 
     Raises:
       ValueError: they do not; the message has the name of the option.
@@ -334,3 +335,8 @@ def check(actuators: Actuators, actuation: str) -> None:
     for name, reason in NOT_FOR_MUSCLES.items():
         if actuation == 'muscle' and name in actuators.changed:
             raise ValueError(f'{name} is not an option of muscle control: {reason}')
+    if actuation == 'gait' and bounds(actuators.delay)[1] > GAIT_DELAY:
+        raise ValueError(
+            f'delay is {actuators.delay}; expected at most {GAIT_DELAY:g} ms for a gait, whose '
+            'torques are computed from the state 600 times a second: it is unstable if they are late'
+        )
