@@ -18,7 +18,7 @@ from dm_control import mjcf
 
 from trl_suite import actuation, characters, evaluation, policies, suite
 from trl_suite.actuation import realism, series, strength_curves
-from trl_suite.describe.actuators import actuator_options
+from trl_suite.describe.options import table_of
 from trl_suite.engine import motors
 from trl_suite.util import files, tables
 from trl_suite.vector import VectorEnvironment
@@ -302,8 +302,7 @@ def effect_table(found: dict[str, object]) -> str:
 def page() -> None:
     """Writes the tables between their markers."""
     found = files.read_json(RESULTS) if RESULTS.exists() else {}
-    (options,) = actuator_options().parts
-    parts = {'options': tables.markdown_table(options)}
+    parts = {'options': tables.markdown_table(table_of(actuation.Actuators))}
     if 'costs' in found:
         parts['costs'] = cost_table(found['costs'])
     if 'effects' in found:

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from trl_suite.describe import common, options
-from trl_suite.describe.actuators import actuator_options
 from trl_suite.describe.differences import differences_of
 from trl_suite.registry.build import task_type
 from trl_suite.registry.spec import EnvSpec
@@ -38,9 +37,7 @@ def sections(spec: EnvSpec, environment: Environment) -> Iterator[tuple[str, str
     """Yields titles and texts: character, observation, action, rules, time, differences."""
     for title, parts_ in parts(spec, environment):
         yield title, tables.text(parts_)
-    title, parts_ = actuator_options(spec.actuation)
-    yield title, tables.text(parts_)
-    for title, parts_ in options.disturbances():
+    for title, parts_ in options.disturbances(spec.actuation):
         yield title, tables.text(parts_)
     yield (
         'Differences from the original (reasons in docs/differences.md)',

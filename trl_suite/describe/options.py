@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from trl_suite.actuation.realism import NOT_FOR_MUSCLES, Actuators
 from trl_suite.registry.build import task_options
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.tasks.disturbances import sensors, worlds
@@ -25,14 +26,14 @@ _EVERYWHERE = (
         '-',
         '',
         "properties of the world and pushes, drawn in every episode: 'mild', 'robot', 'harsh' or a dict, see "
-        'docs/realism.md',
+        'docs/realism_worlds.md',
     ),
     (
         'sensors',
         '-',
         '',
         "noise, bias, drop-outs and delay of observations: 'mild', 'robot', 'harsh' or a dict, see "
-        'docs/realism.md',
+        'docs/realism_worlds.md',
     ),
     (
         'actuators',
@@ -57,8 +58,10 @@ def options(spec: EnvSpec) -> Section:
     return section('Options in task_kwargs', Table(('option', 'default', 'unit', 'meaning'), cells))
 
 
-def disturbances() -> Iterator[Section]:
-    """Yields the options of worlds, pushes and sensors, which are the same for all environments."""
+def disturbances(actuation: str) -> Iterator[Section]:
+    """Yields the options of actuators, worlds, pushes and sensors, for an actuation model."""
+    omitted = NOT_FOR_MUSCLES if actuation == 'muscle' else ()
+    yield section('Options of actuators', table_of(Actuators, omitted))
     yield section(
         'Options of randomize',
         'Each is a number, or two bounds between which it is drawn at the start of an episode.',
@@ -74,13 +77,15 @@ def disturbances() -> Iterator[Section]:
     )
 
 
-def table_of(config: type[Config]) -> Table:
-    """Returns a table of the options of a config, with their bounds."""
+def table_of(config: type[Config], omitted: Collection[str] = ()) -> Table:
+    """Returns a table of the options of a config, with their bounds, except omitted ones."""
     cells = []
     for field in dataclasses.fields(config):
+        if field.name in omitted:
+            continue
         data, limits = field.metadata, []
-        for key, bound in data['bounds'].items():
-            if bound is not None:
+        for key in ('at_least', 'above', 'at_most', 'below'):
+            if (bound := data['bounds'][key]) is not None:
                 limits.append(f'{key.replace("_", " ")} {bound:.4g}')
         cells.append(
             (field.name, _shown(field.default), data['unit'], ', '.join(limits), data['meaning'])
