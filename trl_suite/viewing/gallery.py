@@ -47,7 +47,7 @@ SECONDS, LONGER = 4.0, 12.0  # duration of a film strip; of one for tasks with p
 SCENES = {
     'PD_Biped3D_HLC_Soccer-v0': (8, 6.0, 16.0, 'back'),
     'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0, 8.5, 'back'),
-    'PD_Biped3D_HLC_Conveyors-v0': (3, 3.0, 13.0, 'back'),
+    'PD_Biped3D_HLC_Conveyors-v0': (2, 15.0, 25.0, 'back'),
     'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 9.0, 18.0, 'back'),
 }
 COLUMNS = 6  # pictures of a film strip

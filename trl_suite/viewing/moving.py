@@ -29,7 +29,7 @@ SEEDS = range(1, 7)  # tried in order until an episode does not fail
 SCENES = {
     'PD_Biped3D_HLC_Soccer-v0': (8, 8.0),
     'PD_Biped3D_Terrain_Soccer_Hard-v0': (5, 3.0),
-    'PD_Biped3D_HLC_Conveyors-v0': (3, 3.0),
+    'PD_Biped3D_HLC_Conveyors-v0': (2, 16.0),
     'PD_Biped3D_HLC_Conveyors_Wide-v0': (2, 11.0),
 }
 # Camera angles in order of preference: azimuth from the heading, and elevation, degrees.
