@@ -57,7 +57,7 @@ class Actuators(Config):
         20.0,
         'joint speed at which a motor can only brake; with torque_speed',
         unit='rad/s',
-        above=0,
+        at_least=1,
     )
     braking: float = option(
         1.5,
