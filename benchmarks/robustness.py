@@ -159,10 +159,16 @@ def table(found: dict[str, Any]) -> str:
         if limit is None
         else f', at most {limit} steps each, or {limit // 8} cycles and footsteps'
     )
+    # An unfinished run has cells that not all seeds have.
+    keys = [
+        {(id_, key) for id_, row in rows.items() for key in row} for rows in found['seeds'].values()
+    ]
+    every, any_ = len(set.intersection(*keys)), len(set.union(*keys))
+    partly = '' if every == any_ else f' ({any_ - every} of {any_} cells: fewer seeds)'
     lines = [
         f'Mean return of the shipped policies, which were trained without any disturbance, divided by their '
         f'return without it, in percent; three strengths from left to right. {found["episodes"]} episodes for '
-        f'each of the seeds {seeds}{length}; a cell has the same terrains and starts as the others of its '
+        f'each of the seeds {seeds}{partly}{length}; a cell has the same terrains and starts as the others of its '
         'column. A dash: the ground is not observed. Steps of `FSM` environments are gait cycles, those of '
         '`HLC` footsteps, and so are their delays.',
         '',
