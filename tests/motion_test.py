@@ -669,6 +669,11 @@ class ReaderTest(parameterized.TestCase):
         ('infinite', {'Frames': [GOOD, (*GOOD[:8], np.inf)]}, 'frame 1, column 8: inf'),
         ('huge', {'Frames': [GOOD, (*GOOD[:8], 10**400)]}, 'frame 1, column 8'),
         ('standing', {'Frames': [GOOD, (0, *GOOD[1:]), GOOD]}, 'frame 1, duration: 0 s'),
+        (
+            'tiny',
+            {'Frames': [GOOD, (1e-30, *GOOD[1:]), GOOD]},
+            'frame 1, duration: 1e-30 s; that is',
+        ),
         ('backwards', {'Frames': [(-0.1, *GOOD[1:]), GOOD]}, 'frame 0, duration: -0.1 s'),
         (
             'zero',

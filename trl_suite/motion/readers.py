@@ -263,6 +263,11 @@ def _clip(
             raise ValueError(f'{path}: frame {i}, {field}: the quaternion is zero')
         frames[:, here] /= norms[:, None]
     times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
+    for i in np.flatnonzero(np.diff(times) <= 0):
+        raise ValueError(
+            f'{path}: frame {i}, duration: {frames[i, 0]:g} s; that is lost beside the {times[i]:g} s '
+            'before it'
+        )
     balls = list(_balls(sizes))
     for column in balls:
         frames[:, column : column + 4] = _lying(frames[:, column : column + 4])
@@ -279,4 +284,7 @@ def _clip(
         x, y, z = frames[:, 1:4].T
         head = np.column_stack([x, -z, y, _lying(frames[:, 4:8])])
     poses = np.concatenate([head, frames[:, _HEADER:]], axis=1)
-    return Clip(path.stem, times, poses, root, joints, sizes, loop, f'read from {path.name}')
+    try:
+        return Clip(path.stem, times, poses, root, joints, sizes, loop, f'read from {path.name}')
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
