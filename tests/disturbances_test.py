@@ -513,6 +513,24 @@ class IdentityTest(parameterized.TestCase):
         self.assertGreater(ends, 0)
         self.assertTrue(any(step.info['impulse'].any() for step in found))
 
+    @parameterized.parameters(PLANAR, GAIT, STEPS, PLAN)
+    def test_with_actuators(self, id_):
+        """All options together: simulations equal single environments, and go on when restored."""
+        actuators = {
+            'torque_speed': True, 'delay': (0, 20), 'noise': 0.02, 'strength': (0.9, 1.1),
+            **({'flex': 0.05} if id_ == PLANAR else {}),
+        }  # fmt: skip
+        options = {'randomize': EVERY, 'sensors': MEASURED, 'actuators': actuators}
+        steps = 4 if id_ in (GAIT, PLAN) else 12
+        assert_rows_are_singles(id_, 4, steps, steps // 2, options, scale=0.3)
+        one, other = (
+            suite.make(id_, {'random': seed, 'step_limit': 1000, **options}) for seed in (1, 2)
+        )
+        one.reset(), other.reset()
+        for each in (one, other):
+            advance(each, 0, 3, 0.3)
+        assert_goes_on(one, other, lambda each, seed: advance(each, seed, 3, 0.3))
+
     def test_number_of_threads_does_not_matter(self):
         found = []
         for threads in (1, 2, 3):
