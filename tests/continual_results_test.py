@@ -97,7 +97,7 @@ class ResultsTest(absltest.TestCase):
         other = json.loads(path.read_text()) | {'budget': 200, 'seed': 1}
         other['digest'] = results.digest(other)
         (self.folder / 'other.json').write_text(json.dumps(other))
-        with self.assertRaisesRegex(ValueError, 'other settings'):
+        with self.assertRaisesRegex(ValueError, 'settings differ'):
             continual_results.load(self.folder)
         path.write_text(path.read_text().replace('0.5', '0.6'))
         with self.assertRaisesRegex(ValueError, 'Plaid_s0.json: digest'):
