@@ -29,6 +29,10 @@ import ppo
 import ppo_settings
 import train_all
 
+# Ray that is started on this machine makes a token, and would then send it to the clusters of these
+# tests, which have none.
+os.environ['RAY_AUTH_MODE'] = 'disabled'
+
 try:
     import ray
     from ray import cluster_utils
