@@ -55,15 +55,22 @@ class SpatialArena(composer.Arena):
         scene.prepare(root, look)
         _paint(root, look)
         # Parts of the ground do not collide with each other: moving boxes pass through them.
-        common = {
-            'friction': FRICTION, 'solref': SOLREF, 'solimp': SOLIMP, 'condim': 3, 'contype': 1,
-            'conaffinity': 0,
-        }  # fmt: skip
+        # A default class, since formatting the attributes of each box takes most of the time.
+        ground_class = root.default.add('default', dclass='ground')
+        ground_class.geom.set_attributes(
+            type='box', size=(SIZE,) * 3, friction=FRICTION, solref=SOLREF, solimp=SOLIMP,
+            condim=3, contype=1, conaffinity=0,
+        )  # fmt: skip
         ground = root.worldbody.add('body', name='terrain')
         self.plane = self.field = None
         if holds.level:
             self.plane = ground.add(
-                'geom', name='plane', type='plane', size=(0, 0, 1), material='ground', **common
+                'geom',
+                dclass=ground_class,
+                name='plane',
+                type='plane',
+                size=(0, 0, 1),
+                material='ground',
             )
         if holds.grid:
             root.asset.add(
@@ -73,22 +80,22 @@ class SpatialArena(composer.Arena):
             self.field = ground.add(
                 # Rotated by 90 degrees, so that cells are split into triangles from back left to
                 # front right, as in queries; a row of data is then along y, the first one ahead.
-                'geom', name='field', type='hfield', hfield='field', material='ground',
-                quat=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)), **common,
+                'geom', dclass=ground_class, name='field', type='hfield', hfield='field',
+                material='ground', quat=(np.sqrt(0.5), 0, 0, np.sqrt(0.5)),
             )  # fmt: skip
         # Spread along x, so that the compiler's bounding volumes are useful.
         self.boxes = [
             root.worldbody.add(
-                'geom', name=f'box_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 0, PARKED),
-                material='block' if holds.level else 'ground', **common,
+                'geom', dclass=ground_class, name=f'box_{i}', pos=(SIZE * i, 0, PARKED),
+                material='block' if holds.level else 'ground',
             )
             for i in range(holds.boxes)
         ]  # fmt: skip
         self.belts = [
             root.worldbody.add(
                 # The compiler enables surface velocities only if one is not 0.
-                'geom', name=f'belt_{i}', type='box', size=(SIZE,) * 3, pos=(SIZE * i, 1, PARKED),
-                surfacevel=(1, 0, 0, 0, 0, 0), material='belt', **common,
+                'geom', dclass=ground_class, name=f'belt_{i}', pos=(SIZE * i, 1, PARKED),
+                surfacevel=(1, 0, 0, 0, 0, 0), material='belt',
             )
             for i in range(holds.belts)
         ]  # fmt: skip
@@ -100,8 +107,7 @@ class SpatialArena(composer.Arena):
                 armature=DRIVE,
             )  # fmt: skip
             body.add(
-                'geom', name=f'mover_{i}', type='box', size=(SIZE,) * 3, mass=1, material='mover',
-                **common,
+                'geom', dclass=ground_class, name=f'mover_{i}', mass=1, material='mover',
             )  # fmt: skip
             self.movers.append(body)
         self._physics: Any = None
