@@ -955,8 +955,8 @@ class ReadmeTest(CommandTest):
             if command.startswith('view'):  # serves until it is interrupted
                 continue
             with self.subTest(command):
-                pictures = SIZE if command.startswith('rollout') else ()
-                self.output(*shlex.split(command), *pictures)
+                short = (*SIZE, '--steps', '8') if command.startswith('rollout') else ()
+                self.output(*shlex.split(command), *short)
         self.assert_only('rollout.mp4', 'steps.png', 'slopes.png', 'soccer.mp4', 'gallery')
 
 

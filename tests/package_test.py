@@ -12,6 +12,7 @@ import tempfile
 import textwrap
 import tomllib
 
+import pytest
 from absl.testing import absltest
 
 import trl_suite
@@ -141,6 +142,7 @@ class ImportTest(absltest.TestCase):
 class WheelTest(absltest.TestCase):
     """A wheel installed elsewhere works without the checkout."""
 
+    @pytest.mark.slow  # .ci/run runs it
     def test_wheel_contains_all_data(self):
         temporary = tempfile.TemporaryDirectory()
         self.addCleanup(temporary.cleanup)
