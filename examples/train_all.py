@@ -270,6 +270,12 @@ def enter(id_: str, seed: int, run: Run) -> None:
         policies.save(run.policy, trained / f'{id_}.npz')
     with files.replacing(trained / f'{id_}.json') as part:
         part.write_text(json.dumps({'id': id_, 'shipped': best['seed'], 'runs': every}) + '\n')
+    shared = trained / policies.SHARED
+    used = json.loads(shared.read_text()) if shared.exists() else {}
+    if id_ in used and used[id_]['evaluation']['return'] < best['evaluation']['return']:
+        del used[id_]  # the policy of another environment, which `share_gaits.py` has entered
+        with files.replacing(shared) as part:
+            part.write_text(json.dumps(used) + '\n')
 
 
 def on_ray(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Callable[[str, int], Run]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import pathlib
 import sys
@@ -102,6 +103,21 @@ class JobsTest(parameterized.TestCase):
                 self.assertEqual(set(policies.available()), expected)
                 VectorEnvironment(id_, 1, 1, 0).close()
         self.assertGreater(len(policies.available()), 50)
+
+    def test_a_better_run_replaces_the_policy_of_another_environment(self):
+        id_, other = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0'
+        for returned, used in ((20.0, other), (22.0, id_)):
+            folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+            entry = {'policy': other, 'evaluation': {'return': 21.0}}
+            (folder / policies.SHARED).write_text(json.dumps({id_: entry}))
+            run = train_all.Run(
+                {'seed': 1, 'settings': {}, 'evaluation': {'return': returned}},
+                policies.reference(id_), 'here', 1.0,
+            )  # fmt: skip
+            with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+                train_all.enter(id_, 1, run)
+                self.assertEqual(policies.trained_for(id_), used)
+                self.assertIn(id_, policies.available())
 
     def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
