@@ -281,6 +281,25 @@ class VideoTest(FolderTest):
             rendering.video(slowly(), self.folder / 'a.gif')
         self.assertRegex(shown.getvalue(), r'\d+picture ')
 
+    def test_an_interrupt_while_the_encoder_starts(self):
+        started = []
+
+        def start(*args, **kwargs):
+            started.append(popen(*args, **kwargs))
+            os.kill(os.getpid(), signal.SIGINT)
+            return started[-1]
+
+        popen = subprocess.Popen
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.addCleanup(signal.signal, signal.SIGINT, before)
+        with (
+            mock.patch.object(subprocess, 'Popen', start),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            rendering.video(numbered(3), self.folder / 'a.mp4')
+        self.assertIsNotNone(started[0].poll())  # it has ended, and cannot create the file later
+        self.assert_only()
+
     def test_gif(self):
         path = self.folder / 'a.gif'
         rendering.video(numbered(5), str(path), fps=20)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import tqdm
 
+from trl_suite.util import program
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
 
@@ -83,24 +84,28 @@ class Video:
             self._images.append(self._library.fromarray(image))
             return
         if self._encoder is None:
-            self._encoder = self._started(*image.shape[:2])
+            self._start(*image.shape[:2])
+        assert self._encoder is not None
         assert self._encoder.stdin is not None
         try:
             self._encoder.stdin.write(np.ascontiguousarray(image).data)
         except OSError:
             raise self._failure(self._encoder) from None
 
-    def _started(self, height: int, width: int) -> subprocess.Popen[bytes]:
+    def _start(self, height: int, width: int) -> None:
         """Starts ffmpeg, whose exit status tells whether all was written; imageio ignores it."""
         command = [
             self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
             '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
             'yuv420p', '-crf', '15', str(self._part),
         ]  # fmt: skip
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            start_new_session=True,  # an interrupt from the keyboard is for this process alone
-        )  # fmt: skip
+        # An interrupt between the start and the return would leave an encoder that nobody ends, and
+        # that creates the file after it was removed.
+        with program.signals_delayed():
+            self._encoder = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                start_new_session=True,  # an interrupt from the keyboard is for this process alone
+            )  # fmt: skip
 
     def _failure(self, encoder: subprocess.Popen[bytes]) -> OSError:
         """Returns why the encoder ended, which it must have done."""

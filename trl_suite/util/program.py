@@ -41,6 +41,22 @@ def _terminate(number: int, frame: object) -> None:
     raise Terminated
 
 
+@contextlib.contextmanager
+def signals_delayed() -> Iterator[None]:
+    """Delays SIGINT and SIGTERM to the end of the context, if this is the main thread.
+
+    A child process that is started inside ignores both until it is killed.
+    """
+    if not hasattr(signal, 'pthread_sigmask'):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def begin_script() -> None:
     """Makes a script report errors as the commands do: in one line on stderr.
 
