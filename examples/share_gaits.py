@@ -38,6 +38,13 @@ def stored(id_: str, episodes: int) -> dict[str, Any] | None:
     return found if {name: found[name] for name in asked} == asked else None
 
 
+def remove_unused(shared: dict[str, Any]) -> None:
+    """Removes the policies of environments that use another one, unless others use theirs."""
+    for id_ in shared.keys() - {entry['policy'] for entry in shared.values()}:
+        for suffix in ('npz', 'json'):
+            (resources.directory('trained') / f'{id_}.{suffix}').unlink(missing_ok=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('policy', metavar='ID', help='environment of the policy')
@@ -67,8 +74,7 @@ def main() -> None:
         shared[id_] = {'policy': arguments.policy, 'evaluation': found, 'before': before}
         with files.replacing(path) as part:
             part.write_text(json.dumps(dict(sorted(shared.items()))) + '\n')
-        for suffix in ('npz', 'json'):
-            path.with_name(f'{id_}.{suffix}').unlink(missing_ok=True)
+        remove_unused(shared)
 
 
 if __name__ == '__main__':

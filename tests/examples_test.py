@@ -24,6 +24,7 @@ import evaluate_plans
 import expert
 import ppo
 import ppo_settings
+import share_gaits
 import train_all
 
 
@@ -118,6 +119,16 @@ class JobsTest(parameterized.TestCase):
                 train_all.enter(id_, 1, run)
                 self.assertEqual(policies.trained_for(id_), used)
                 self.assertIn(id_, policies.available())
+
+    def test_a_policy_that_others_use_is_kept(self):
+        folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        for id_ in 'abcd':
+            (folder / f'{id_}.npz').touch()
+        with mock.patch.dict(os.environ, TRL_SUITE_TRAINED=str(folder)):
+            share_gaits.remove_unused(
+                {'b': {'policy': 'a'}, 'c': {'policy': 'b'}, 'e': {'policy': 'd'}}
+            )
+        self.assertCountEqual([path.stem for path in folder.iterdir()], 'abd')
 
     def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
