@@ -582,9 +582,10 @@ def solved() -> str:
             f'{middle["distance"]:.0f} m',
         ))  # fmt: skip
     said = (
-        'Medians over the environments of each family that have a policy, each evaluated without noise '
-        'in 50 episodes (gaits: 200): the return divided by its maximum, the share of episodes that '
-        'lasted to the end, and the mean distance.'
+        'Medians over the environments of each family that have a policy, each evaluated with the mean of '
+        'its actions in 50 episodes (`terrainrl`: 200): the return divided by its maximum, the share of '
+        'episodes that lasted to the end, and the mean distance. Episodes of `terrainrl` end with a fall '
+        'only.'
     )
     header = ('family', 'with a policy', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
