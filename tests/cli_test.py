@@ -19,6 +19,7 @@ from unittest import mock
 
 import imageio.v3 as iio
 import numpy as np
+import pytest
 from absl.testing import absltest, parameterized
 
 from trl_suite import cli, evaluation, policies, rendering, suite
@@ -948,6 +949,7 @@ class ReadmeTest(CommandTest):
         )
         self.assertEqual((done.returncode, done.stderr), (0, ''))
 
+    @pytest.mark.slow  # .ci/run runs it
     def test_commands_run(self):
         commands = re.findall(r'^(?:.* && \S*/)?trl-suite (.*)$', self.text, re.MULTILINE)
         self.assertLen(commands, 12)

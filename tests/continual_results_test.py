@@ -8,6 +8,7 @@ import tempfile
 from unittest import mock
 
 import numpy as np
+import pytest
 from absl.testing import absltest
 
 from trl_suite import evaluation, sequences
@@ -117,6 +118,7 @@ class PageTest(absltest.TestCase):
                 self.assertEqual(sequences.departures(result), [])
                 self.assertEqual(result['sequence'], path.parent.name)
 
+    @pytest.mark.slow  # .ci/run runs it
     def test_the_learner_of_the_page_runs(self):
         text = (continual_results.DOCS / 'continual_learning.md').read_text(encoding='utf-8')
         code = text.split('```python\n')[1].split('```')[0]

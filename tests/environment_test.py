@@ -12,7 +12,7 @@ import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 from dm_env import test_utils
-from helpers import KINDS, advance, assert_goes_on, assert_rows_are_singles, links_on_ground
+from helpers import KINDS, advance, assert_goes_on, links_on_ground
 
 from trl_suite import characters, motion, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
@@ -251,11 +251,6 @@ def every_environment(id_):
                 np.testing.assert_array_equal(ours, theirs)
 
         if id_ in KINDS:  # with other options: in the test of each task
-
-            def test_simulations_equal_single_environments(self):
-                steps = 2 if gait else 4 if high else 12
-                scale = 0.3 if gait else 1.0
-                assert_rows_are_singles(id_, 2, steps, max(steps - 3, 1), scale=scale)
 
             def test_a_restored_state_continues_exactly(self):
                 steps = 1 if gait else 2 if high else 5

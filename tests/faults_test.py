@@ -1,8 +1,8 @@
 """Full disks, and signals at random times: nothing is lost, and nothing is left half-written.
 
 A server process imports the suite once and forks a child for every run, so that a run takes a second. The
-fast tests interrupt each program once; the slow ones (`-m slow`) by each signal in FUZZ_EXAMPLES rounds, at
-times drawn from a seed that is printed.
+fast tests interrupt two programs once; the slow ones (`-m slow`) all of them by each signal, in FUZZ_EXAMPLES
+rounds, at times drawn from a seed that is printed.
 """
 
 import json
@@ -289,9 +289,7 @@ class FaultsTest(parameterized.TestCase):
             self.assertEqual(held, expected[path], path)
 
     @parameterized.named_parameters(
-        ('rollout', signal.SIGTERM, 'command', *ROLLOUT),
-        ('gallery', signal.SIGINT, 'command', *GALLERY),
-        ('training', signal.SIGKILL, 'train'), ('sequence', signal.SIGKILL, 'learn'),
+        ('rollout', signal.SIGTERM, 'command', *ROLLOUT), ('sequence', signal.SIGKILL, 'learn'),
     )  # fmt: skip
     def test_a_signal(self, number, *arguments):
         self.interrupted(0, [number], *arguments)

@@ -12,6 +12,7 @@ from unittest import mock
 
 import cli_test
 import numpy as np
+import pytest
 import torch
 from absl.testing import absltest, parameterized
 
@@ -574,6 +575,7 @@ class BaselinesTest(parameterized.TestCase):
         (continual_baselines.MultiTask, np.ones((3, 3))),
         (plaid.Plaid, np.tri(3)),
     )
+    @pytest.mark.slow  # .ci/run runs these
     def test_every_stage_trains_in_its_own_environments(self, kind, expected):
         """The samples of a stage are those of its terrain, or of those that the method needs."""
         _, result = self.run_short(kind, 'result')
@@ -584,6 +586,7 @@ class BaselinesTest(parameterized.TestCase):
         self.assertNotEqual(result['scores'][0], result['initial'])
 
     @parameterized.parameters(continual_baselines.FineTuning, continual_baselines.EWC, plaid.Plaid)
+    @pytest.mark.slow
     def test_a_stopped_run_resumes_exactly(self, kind):
         _, whole = self.run_short(kind, 'whole')
         train = kind.train
