@@ -199,7 +199,8 @@ def train(
     """Trains to the end, from the decisions in `folder` if there are any; returns the curve.
 
     Raises:
-      ValueError: the decisions are damaged, or were made with other settings.
+      ValueError: the decisions are damaged, or were made with other settings, or the folder holds a
+        run of another program.
       RuntimeError: another process trains in the folder.
     """
     with checkpoints.only_run(folder):
@@ -291,6 +292,8 @@ def load(folder: pathlib.Path, settings: Settings) -> tuple[np.ndarray, np.ndarr
     Raises:
       ValueError: they are damaged, or were made with other settings.
     """
+    if (folder / 'checkpoint.pt').exists():
+        raise ValueError(f'{folder} holds a run of learn_gaits.py; expected another folder')
     path = folder / 'decisions.npz'
     if not path.exists():
         return np.empty((0, 0)), np.empty((0, 0)), []

@@ -70,6 +70,9 @@ class SearchTest(absltest.TestCase):
             with self.assertRaisesRegex(ValueError, 'other settings'):
                 other = search_gaits.Settings(samples=8, alive=1.0)
                 search_gaits.train(HOPPER, 1, other, folder, 1)
+            (folder / 'checkpoint.pt').touch()
+            with self.assertRaisesRegex(ValueError, 'holds a run of learn_gaits.py'):
+                search_gaits.train(HOPPER, 1, TINY, folder, 1)
 
 
 if __name__ == '__main__':
