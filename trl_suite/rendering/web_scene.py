@@ -313,7 +313,7 @@ def _shape(name: str) -> trimesh.Trimesh:
     if name == 'box':
         return trimesh.creation.box(extents=(2, 2, 2))
     if name == 'sphere':
-        return trimesh.creation.icosphere(subdivisions=3)
+        return trimesh.creation.icosphere(subdivisions=2)
     if name == 'cylinder':
         return trimesh.creation.cylinder(1.0, 2.0, SECTIONS)
     if name == 'cone':
