@@ -7,6 +7,7 @@ import shutil
 import socket
 import time
 import unittest
+from unittest import mock
 
 import imageio.v3 as iio
 import mujoco
@@ -193,6 +194,40 @@ class SceneTest(parameterized.TestCase):
         capsules = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE)).sum()
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
+
+    def test_former_ground_stays_while_clients_load_the_new_one(self):
+        environment = suite.make(HILLS, {'random': 4})
+        environment.reset()
+        server = web_scene.start_server('127.0.0.1', 0)
+        self.addCleanup(web_scene.stop_server, server)
+        shown, removed = {}, []
+        scene = web_scene.WebScene(server, environment)
+        add = server.scene.add_batched_meshes_trimesh
+
+        def adding(name, *arguments, **options):
+            self.assertNotIn(name, shown)
+            handle = shown[name] = add(name, *arguments, **options)
+            remove = handle.remove
+            handle.__dict__['remove'] = lambda: (removed.append(name), shown.pop(name), remove())
+            return handle
+
+        heights = environment.physics.model.hfield_data
+        with mock.patch.object(server.scene, 'add_batched_meshes_trimesh', adding):
+            scene.update()
+            for _ in range(2 * web_scene.HELD):  # new ground in each frame
+                heights[0] = 0.5 * (1 - heights[0])
+                scene.update()
+            self.assertLen(shown, web_scene.HELD + 1)
+            scene.update()
+            self.assertLen(shown, web_scene.HELD)
+            for _ in range(web_scene.HELD):
+                scene.update()
+            self.assertLen(shown, 1)
+            (former,) = shown
+            heights[0] = 0.5 * (1 - heights[0])
+            scene.update(jump=True)
+            self.assertLen(shown, 1)
+            self.assertNotIn(former, shown)
 
     @parameterized.parameters(DOG, SOCCER)
     def test_the_sky_is_that_of_the_model(self, id_):
