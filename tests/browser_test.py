@@ -1,11 +1,13 @@
 """The viewer in the web browser and replays: what they draw, and what a real browser shows of it."""
 
+import base64
 import contextlib
 import io
 import shutil
 import socket
 import time
 import unittest
+from unittest import mock
 
 import imageio.v3 as iio
 import mujoco
@@ -26,9 +28,25 @@ FRAME = 1 / 30  # s
 CHROMIUM = next(
     filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), ''
 )
-# Without a sandbox, as containers need it, and with WebGL on the processor.
-FLAGS = ('--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+# Without a sandbox, as containers need it, and with WebGL on the processor. The page around it is drawn
+# without WebGL, which would take ten times as long.
+FLAGS = (
+    '--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
+    '--disable-gpu-compositing', '--disable-gpu-rasterization',
+)  # fmt: skip
 PATIENCE = 120_000  # ms; on a busy machine drawing by the processor is slow
+# Keeps what was drawn, so that it can be read at any time. A screenshot waits for two frames of the whole
+# page, which takes up to 30 s without a graphics card.
+KEEP = """
+const getContext = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, options) {
+  return getContext.call(this, kind, {...options, preserveDrawingBuffer: true});
+};
+"""
+READ = """() => [...document.querySelectorAll('canvas')]
+  .sort((one, other) => other.width * other.height - one.width * one.height)[0]
+  .toDataURL()
+"""
 
 
 def zero(environment):
@@ -177,6 +195,40 @@ class SceneTest(parameterized.TestCase):
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
 
+    def test_former_ground_stays_while_clients_load_the_new_one(self):
+        environment = suite.make(HILLS, {'random': 4})
+        environment.reset()
+        server = web_scene.start_server('127.0.0.1', 0)
+        self.addCleanup(web_scene.stop_server, server)
+        shown, removed = {}, []
+        scene = web_scene.WebScene(server, environment)
+        add = server.scene.add_batched_meshes_trimesh
+
+        def adding(name, *arguments, **options):
+            self.assertNotIn(name, shown)
+            handle = shown[name] = add(name, *arguments, **options)
+            remove = handle.remove
+            handle.__dict__['remove'] = lambda: (removed.append(name), shown.pop(name), remove())
+            return handle
+
+        heights = environment.physics.model.hfield_data
+        with mock.patch.object(server.scene, 'add_batched_meshes_trimesh', adding):
+            scene.update()
+            for _ in range(2 * web_scene.HELD):  # new ground in each frame
+                heights[0] = 0.5 * (1 - heights[0])
+                scene.update()
+            self.assertLen(shown, web_scene.HELD + 1)
+            scene.update()
+            self.assertLen(shown, web_scene.HELD)
+            for _ in range(web_scene.HELD):
+                scene.update()
+            self.assertLen(shown, 1)
+            (former,) = shown
+            heights[0] = 0.5 * (1 - heights[0])
+            scene.update(jump=True)
+            self.assertLen(shown, 1)
+            self.assertNotIn(former, shown)
+
     @parameterized.parameters(DOG, SOCCER)
     def test_the_sky_is_that_of_the_model(self, id_):
         environment = suite.make(id_)
@@ -278,6 +330,7 @@ class ChromiumTest(FolderTest):
     def open(self, address, **options):
         """Opens a page of its own; what it complains about is kept."""
         context = self.chromium.new_context(viewport={'width': 640, 'height': 400}, **options)
+        context.add_init_script(KEEP)
         page = context.new_page()
         page.set_default_timeout(PATIENCE)
         page.on('console', lambda message: self.messages.append((message.type, message.text)))
@@ -294,21 +347,33 @@ class ChromiumTest(FolderTest):
             time.sleep(0.2)
 
     def picture(self, page):
-        return iio.imread(page.screenshot())[..., :3].astype(int)
+        """Returns what WebGL has drawn."""
+        image = page.evaluate(READ).partition(',')[2]
+        return iio.imread(base64.b64decode(image))[..., :3].astype(int)
 
     def wait_until_drawn(self, page):
         """Waits for the ground, which fills the lower part: as long as it has one colour, nothing is."""
-        self.wait_for(
-            lambda: self.picture(page)[230:330].std((0, 1)).max() > 10, 'nothing is drawn'
-        )
+
+        def drawn():
+            picture = self.picture(page)
+            return picture[len(picture) // 2 :].std((0, 1)).max() > 10
+
+        self.wait_for(drawn, 'nothing is drawn')
         return self.picture(page)
 
-    def wait_until_it_moves(self, page):
-        first = self.wait_until_drawn(page)
-        self.wait_for(
-            lambda: (np.abs(self.picture(page) - first)[100:300] > 20).mean() > 0.005,
-            'the picture stays as it is',
-        )
+    def wait_until_it_moves(self, page, changes=3):
+        """Waits for some changes: one alone may be of the light, which is loaded last."""
+        last = self.wait_until_drawn(page)
+        left = changes
+
+        def moves():
+            nonlocal last, left
+            before, last = last, self.picture(page)
+            if last.shape == before.shape:
+                left -= (np.abs(last - before) > 20).mean() > 0.005
+            return left <= 0
+
+        self.wait_for(moves, 'the picture stays as it is')
 
     def assert_quiet(self, *allowed):
         self.assertEmpty([text for kind, text in self.messages if kind == 'error'])

@@ -8,6 +8,7 @@ episode here, and the first body that moves need not be the character.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import errno
 import functools
@@ -39,6 +40,7 @@ DEPTH = 1.0  # m; thickness of planar ground below its lowest point
 STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
 NEAR = 8.0  # m; distance from the centre of a height field within which all vertices are drawn
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
+HELD = 10  # frames for which former ground stays, while clients load the new one
 SECTIONS = 24  # number of faces around a cylinder or cone
 AMBIENT = 0.5  # intensity of ambient light; 1 would bleach pale ground
 GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
@@ -133,6 +135,9 @@ class WebScene:
         self._focus = np.full(3, np.nan)  # the point that the view follows
         self._handles: dict[str, Any] = {}
         self._laid: list[np.ndarray] = []  # data from which the meshes of the ground were made
+        self._ground_handles: list[Any] = []
+        self._former_ground: collections.deque[tuple[int, list[Any]]] = collections.deque()
+        self._frame = self._builds = 0
         with server.atomic():
             server.scene.reset()
             server.scene.set_up_direction('+z')
@@ -172,7 +177,7 @@ class WebScene:
         offset = -self._focus if self.follow else np.zeros(3)
         with self._server.atomic():
             self._draw_shapes(offset)
-            self._draw_ground(offset)
+            self._draw_ground(offset, jump)
             if samples is not None:
                 self._draw_samples(samples + offset)
             elif 'samples' in self._handles:
@@ -209,11 +214,15 @@ class WebScene:
                 flat_shading=not name.startswith(('sphere', 'tube')), **values,
             )  # fmt: skip
         for name, handle in self._handles.items():
-            if name not in batches and not name.startswith(('ground', 'samples')):
+            if name not in batches and name != 'samples':
                 handle.visible = False
 
-    def _draw_ground(self, offset: np.ndarray) -> None:
-        """Moves the ground; builds its meshes again if the ground has changed."""
+    def _draw_ground(self, offset: np.ndarray, jump: bool) -> None:
+        """Moves the ground; builds its meshes again if the ground has changed.
+
+        Clients load a mesh with a texture in the background. Without the former ground, there would
+        be none until then.
+        """
         model, data = self._model, self._physics.data.ptr
         # Of an infinite plane, a finite part is drawn, which moves by multiples of two squares.
         middle = np.round(self._focus / (2 * TILE)) * 2 * TILE
@@ -225,25 +234,31 @@ class WebScene:
         ]  # fmt: skip
         if not self._laid or not all(map(np.array_equal, sources, self._laid)):
             self._laid = [source.copy() for source in sources]
-            kept = set()
             lowest = self._focus[2] + FAR_BELOW
             if self._profile is None:
                 meshes = _ground(model, data, ground, middle, lowest)
             else:  # one surface instead of overlapping boxes
                 meshes = {int(model.geom_matid[ground][0]): _planar_ground(self._profile)}
-            for material, mesh in meshes.items():
-                kept.add(f'ground_{material}')
-                self._handles[f'ground_{material}'] = self._server.scene.add_batched_meshes_trimesh(
-                    f'/ground_{material}', _tiled(mesh, self._colours[material]),
+            self._former_ground.append((self._frame + HELD, self._ground_handles))
+            self._builds += 1
+            number = self._builds % (HELD + 2)  # no mesh that is still shown has this name
+            self._ground_handles = [
+                self._server.scene.add_batched_meshes_trimesh(
+                    f'/ground_{material}_{number}', _tiled(mesh, self._colours[material]),
                     batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), lod='off', cast_shadow=False,
                     batched_positions=offset[None],
-                )  # fmt: skip
-            for name, handle in self._handles.items():
-                if name.startswith('ground') and name not in kept:
-                    handle.visible = False
-        for name, handle in self._handles.items():
-            if name.startswith('ground'):
-                handle.batched_positions = offset[None]
+                )
+                for material, mesh in meshes.items()
+            ]  # fmt: skip
+        # Where an episode starts, the former ground would be seen beside or in the new one.
+        while self._former_ground and (jump or self._former_ground[0][0] <= self._frame):
+            for handle in self._former_ground.popleft()[1]:
+                handle.remove()
+        for handle in (
+            *self._ground_handles, *(each for _, handles in self._former_ground for each in handles)
+        ):  # fmt: skip
+            handle.batched_positions = offset[None]
+        self._frame += 1
 
     def _draw_samples(self, points: np.ndarray) -> None:
         points = points.astype(np.float32)
@@ -313,7 +328,7 @@ def _shape(name: str) -> trimesh.Trimesh:
     if name == 'box':
         return trimesh.creation.box(extents=(2, 2, 2))
     if name == 'sphere':
-        return trimesh.creation.icosphere(subdivisions=3)
+        return trimesh.creation.icosphere(subdivisions=2)
     if name == 'cylinder':
         return trimesh.creation.cylinder(1.0, 2.0, SECTIONS)
     if name == 'cone':

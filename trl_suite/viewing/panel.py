@@ -133,6 +133,9 @@ class Panel:
             low, high = slider_range(key, value)
             step = 10.0 ** np.floor(np.log10((high - low) / SLIDER_STEPS))
             sliders[key] = gui.add_slider(key, min=low, max=high, step=step, initial_value=value)
+        self._fitted += [preset, *sliders.values()]
+        if not sliders:
+            return
         apply = gui.add_button('Use this terrain')
         apply.on_click(
             lambda _: viewer.choose_terrain(
@@ -142,7 +145,7 @@ class Panel:
                 }
             )
         )
-        self._fitted += [preset, apply, *sliders.values()]
+        self._fitted.append(apply)
 
     def _add_plot(self, title: str) -> Any:
         uplot = load_viser().uplot
