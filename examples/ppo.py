@@ -517,7 +517,12 @@ class Trainer:
         policy = self.exported()
         s = self.settings
         found = evaluation.evaluate(
-            self.spec, policy, s.evaluation_episodes, EVALUATION_SEED, self.threads, s.evaluated_with
+            self.spec,
+            policy,
+            s.evaluation_episodes,
+            EVALUATION_SEED,
+            self.threads,
+            s.evaluated_with,
         )
         returned, steps, number = self.recent.tolist()
         point = {
