@@ -372,8 +372,8 @@ RANDOMIZED: dict[str, dict[str, Any]] = {
     'Torque_Dog2D_LLC_Imitate_Flat-v0': {},
     'MTU_Raptor2D_LLC_Imitate_Flat-v0': {},
     'PD_Biped2D_Gaps_Terrain-v0': {},
+    'PD_Raptor2D_Slopes_Terrain-v0': {},
     'PD_Biped3D_Imitate-v0': {},
-    'PD_Biped3D_Imitate-Hills_Terrain-v0': {},
     # Plans and rewards of the last stage of its training; pushes are those of the preset.
     'PD_Biped3D_LLC_General_Step-v0': {'stages': STAGES[-1:], 'evaluation_episodes': 32},
     'PD_Biped3D_HLC_Forest-v0': {
