@@ -89,6 +89,7 @@ def _round(model: mujoco.MjModel, feet: np.ndarray) -> None:
         turn = np.zeros(4)
         mujoco.mju_quatZ2Vec(turn, np.eye(3)[long])
         mujoco.mju_mulQuat(model.geom_quat[geom], model.geom_quat[geom].copy(), turn)
+        model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # it has a rotation now
         model.geom_type[geom] = mujoco.mjtGeom.mjGEOM_CAPSULE
         model.geom_size[geom] = radius, max(size[long] - radius, 1e-3), 0
         model.geom_rbound[geom] = size[long]

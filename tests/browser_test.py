@@ -6,6 +6,7 @@ import shutil
 import socket
 import time
 import unittest
+from unittest import mock
 
 import imageio.v3 as iio
 import mujoco
@@ -201,6 +202,38 @@ class SceneTest(parameterized.TestCase):
         at = ([[x]], [[y]]) if task.arena.terrain.spatial else ([[x]],)
         under = task.arena.height(*map(np.array, at)).item()
         np.testing.assert_allclose(samples[:, 2] - under, observed, atol=1e-9)
+
+
+class OptionTest(absltest.TestCase):
+    def test_options_of_the_task(self):
+        """The command passes them on, and every environment that the viewer shows has them."""
+        from trl_suite import cli
+
+        options = (
+            'view',
+            DOG,
+            '--browser',
+            '--port',
+            '8765',
+            '--option',
+            'randomize={"friction": 0.3}',
+        )
+        with (
+            mock.patch.object(browser, 'Browser') as made,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            self.assertEqual(cli.main(options), 0)
+        self.assertEqual(made.call_args.args[-1], {'randomize': {'friction': 0.3}})
+        viewer = browser.Browser(DOG, port=0, task_kwargs={'randomize': {'friction': 0.3}})
+        self.addCleanup(viewer.stop)
+        viewer.choose_environment('PD_Raptor2D_Flat-v0')
+        for _ in range(2):
+            world = viewer.session.environment.info['world']
+            self.assertEqual(world, {'friction': 0.3})
+            viewer._serve()
+        self.assertEqual(viewer._loaded.spec.id, 'PD_Raptor2D_Flat-v0')
+        with self.assertRaisesRegex(ValueError, "did you mean 'randomize'"):
+            browser.Browser(DOG, port=0, task_kwargs={'randomise': 'robot'})
 
 
 class ReplayTest(FolderTest):

@@ -41,7 +41,9 @@ class ContactTest(parameterized.TestCase):
         self.assertBetween(forces.mean(), 0.95, 1.05)
 
     # Bounds around the measured numbers of the page.
-    @parameterized.parameters(('biped', 11, 18, 3.5, 6), ('dog', 9, 16, 12, 20), ('raptor', 5, 10, 4, 7))
+    @parameterized.parameters(
+        ('biped', 11, 18, 3.5, 6), ('dog', 9, 16, 12, 20), ('raptor', 5, 10, 4, 7)
+    )
     def test_feet_rattle_by_fractions_of_a_millimetre(self, name, least, most, light, heavy):
         found = walked(name, NONE)
         self.assertBetween(found['lift-offs'], least, most)
