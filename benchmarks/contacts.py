@@ -158,7 +158,8 @@ class Subject:
         self.forces: list[np.ndarray] = []  # of every physics step, (feet,) N
         self.heights: list[np.ndarray] = []  # of the lowest point of every foot, (feet,) m
         self.target = None
-        self.world, world.step = world, self.step
+        self.world: Any = world
+        self.world.step = self.step
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
         """Replaces `World.step`; both make the same physics steps."""
@@ -237,7 +238,9 @@ class Subject:
 
 def measure(id_: str, name: str, episodes: int, seed: int) -> dict[str, float]:
     """Returns the means over episodes under a change."""
-    change = {key: rest for key, *rest in CHANGES}[name]
+    change = next(
+        (model, options, smooth) for key, model, options, smooth in CHANGES if key == name
+    )
     policy = policies.reference(id_)
     subject = Subject(id_, seed, change)
     found = [subject.episode(policy) for _ in range(episodes)]

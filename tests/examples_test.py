@@ -133,7 +133,7 @@ class RandomizedTest(parameterized.TestCase):
     def test_every_run_is_shipped(self):
         self.assertEqual(policies.available('randomized'), tuple(sorted(ppo_settings.RANDOMIZED)))
 
-    @parameterized.parameters(*(policies.available('randomized') or (None,)))
+    @parameterized.parameters(*((id_,) for id_ in policies.available('randomized') or (None,)))
     def test_what_is_shipped_keeps_its_return(self, id_):
         """At least 0.9 of the first policy's without disturbances, and 0.9 of that with `robot`."""
         if id_ is None:
