@@ -377,8 +377,8 @@ RANDOMIZED: dict[str, dict[str, Any]] = {
     # Plans and rewards of the last stage of its training; pushes are those of the preset.
     'PD_Biped3D_LLC_General_Step-v0': {'stages': STAGES[-1:], 'evaluation_episodes': 32},
     'PD_Biped3D_HLC_Forest-v0': {
-        'samples': 3e4, 'averaged': 1e4, 'start_count': 2e5, 'value_first': 8e3,
-        'learning_rate': 1e-4, 'evaluate_every': 1e4,
+        'samples': 4e4, 'averaged': 1e4, 'start_count': 2e5, 'value_first': 8e3,
+        'learning_rate': 1e-4, 'evaluate_every': 1e4, 'evaluation_episodes': 16,
     },
 }  # fmt: skip
 
