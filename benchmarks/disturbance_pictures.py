@@ -1,14 +1,15 @@
 """Draws what each option of worlds and sensors does, for docs/realism_worlds.md.
 
-    python benchmarks/disturbance_pictures.py [--output docs/pictures/realism]
+    python benchmarks/disturbance_pictures.py [NAMES ...] [--output docs/pictures/realism]
 
-Writes `worlds.png`, `sensors.png` and `push.png`. Needs `pip install 'trl_suite[video]'` and a
+Writes `worlds.png`, `sensors.png`, `push.png` and `randomized.png`; with names only these. Needs `pip install 'trl_suite[video]'` and a
 shipped policy of each environment.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import pathlib
 from typing import Any
 
@@ -19,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from trl_suite import policies, rendering, suite
+from trl_suite.util import resources
 from trl_suite.util.program import begin_script
 
 WALK, GROUND, PUSHED = 'PD_Biped2D_Flat-v0', 'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-v0'
@@ -117,15 +119,43 @@ def draw_push(path: pathlib.Path) -> None:
     rendering.film_strip(frames, path, len(frames))
 
 
+def draw_randomized(path: pathlib.Path) -> None:
+    """Learning curves of the policies that were trained in randomized worlds."""
+    ids = policies.available('randomized')
+    figure, axes = plt.subplots(
+        2, -(-len(ids) // 2), figsize=(11, 4.6), squeeze=False, layout='constrained'
+    )
+    for axis, id_ in zip(axes.flat, ids, strict=False):
+        file = resources.directory('trained') / 'randomized' / f'{id_}.json'
+        entry = json.loads(file.read_text())
+        curve = [[point['samples'], point['normalized_return']] for point in entry['curve']]
+        samples, returns = np.transpose(curve)
+        axis.plot(samples / 1e6, returns, '.-')
+        axis.plot(entry['shipped_at'] / 1e6, np.max(returns), 'o', fillstyle='none')
+        axis.set_title(id_, fontsize=7)
+        axis.set_xlim(0)
+    for axis in axes[-1]:
+        axis.set_xlabel('samples (M)')
+    for axis in axes[:, 0]:
+        axis.set_ylabel('return, harsh')
+    figure.savefig(path, dpi=90)
+
+
+PICTURES = {
+    'worlds': draw_worlds, 'sensors': draw_sensors, 'push': draw_push, 'randomized': draw_randomized,
+}  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('names', nargs='*', default=list(PICTURES), help='pictures')
     parser.add_argument(
         '--output', type=pathlib.Path, default=pathlib.Path('docs/pictures/realism')
     )
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    for draw, name in ((draw_worlds, 'worlds'), (draw_sensors, 'sensors'), (draw_push, 'push')):
-        draw(arguments.output / f'{name}.png')
+    for name in arguments.names:
+        PICTURES[name](arguments.output / f'{name}.png')
         print(arguments.output / f'{name}.png', flush=True)
 
 

@@ -63,6 +63,8 @@ DISTURBANCES: list[tuple[str, str, bool, list[tuple[str, dict[str, Any]]]]] = [
     ('damping', 'factor', False, _worlds('damping', 2.0, 4.0, 8.0)),
     ('gravity', 'm/s²', False, _worlds('gravity', 10.8, 12.8, 15.8)),
     ('slope', 'rad', False, _worlds('slope', (-0.03, 0.03), (-0.1, 0.1), (-0.2, 0.2))),
+    ('contact_depth', 'm', False, _worlds('contact_depth', 0.001, 0.003, 0.01)),
+    ('contact_time', 's', False, _worlds('contact_time', 0.01, 0.02, 0.04)),
     (
         'push, every 2 s for 0.2 s', 'm/s', False,
         [(f'{speed:g}', {'randomize': {'push': {'speed': speed, 'interval': 2.0}}}) for speed in (0.2, 0.5, 1.0)],

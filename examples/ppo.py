@@ -515,8 +515,14 @@ class Trainer:
     def evaluate(self, folder: pathlib.Path, divergence: float) -> None:
         """Adds a point to the curve; keeps the policy if it is the best so far."""
         policy = self.exported()
+        s = self.settings
         found = evaluation.evaluate(
-            self.spec, policy, self.settings.evaluation_episodes, EVALUATION_SEED, self.threads
+            self.spec,
+            policy,
+            s.evaluation_episodes,
+            EVALUATION_SEED,
+            self.threads,
+            s.evaluated_with,
         )
         returned, steps, number = self.recent.tolist()
         point = {

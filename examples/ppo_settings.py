@@ -62,7 +62,7 @@ class Settings:
     # coordinates are added to the inputs (see `trl_suite.policies.placed`).
     places: tuple[str, ...] = ()
     # Curriculum stages: the share of the samples at which each begins, and its task options,
-    # including `terrain`. Evaluations use the options of the environment.
+    # including `terrain`. Evaluations use the options of the environment, or `evaluated_with`.
     stages: tuple[tuple[float, dict[str, Any]], ...] = ()
     # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with
     # its weights, scales and noise; the weights of inputs that it does not have are 0. Or from one
@@ -82,6 +82,7 @@ class Settings:
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
+    evaluated_with: dict[str, Any] = dataclasses.field(default_factory=dict)  # task options
 
 
 def rising(preset: str, low: dict[str, float], heights: Sequence[float]) -> tuple[Any, ...]:
@@ -357,6 +358,31 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
 )
 
+# Policies for worlds and sensors that vary, in `trained/randomized`: `train_randomized.py` continues
+# the training of shipped ones with this preset of `randomize` and `sensors`. Low learning rates, to
+# avoid forgetting.
+PRESET = 'harsh'
+CONTINUED = {
+    'samples': 0.6e6, 'averaged': 5e4, 'learning_rate': 1.5e-4, 'last_learning_rate': 2e-5,
+    'start_count': 1e6, 'value_first': 4e4, 'value_goes_on': True, 'least_share': {},
+    'stages_averaged': 1, 'enough': np.inf, 'evaluation_episodes': 64,
+}  # fmt: skip
+FEWER = {'samples': 2.5e5, 'value_first': 2e4, 'evaluate_every': 5e4, 'evaluation_episodes': 32}
+RANDOMIZED: dict[str, dict[str, Any]] = {
+    'PD_Biped2D_LLC_Imitate_Flat-v0': {},
+    'Torque_Dog2D_LLC_Imitate_Flat-v0': {'enough': 0.76},
+    'MTU_Raptor2D_LLC_Imitate_Flat-v0': FEWER,
+    'PD_Biped2D_Gaps_Terrain-v0': FEWER,
+    'PD_Raptor2D_Slopes_Terrain-v0': FEWER,
+    'PD_Biped3D_Imitate-v0': FEWER,
+    # Plans and rewards of the last stage of its training; pushes are those of the preset.
+    'PD_Biped3D_LLC_General_Step-v0': {**FEWER, 'stages': STAGES[-1:]},
+    'PD_Biped3D_HLC_Forest-v0': {
+        'samples': 2e4, 'averaged': 6e3, 'start_count': 2e5, 'value_first': 6e3,
+        'learning_rate': 1e-4, 'evaluate_every': 1e4, 'evaluation_episodes': 16,
+    },
+}  # fmt: skip
+
 
 def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
     """Returns the values of all entries that match an id; later entries have precedence."""
@@ -370,3 +396,17 @@ def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """Returns the settings of an environment."""
     return Settings(**{**matching(id_, OVERRIDES), **changes})
+
+
+def randomized_settings_for(id_: str, **changes: Any) -> Settings:
+    """Returns the settings with which the shipped policy of an environment is trained further.
+
+    Raises:
+      KeyError: the environment is not in `RANDOMIZED`.
+    """
+    own = {**CONTINUED, 'start': id_, **RANDOMIZED[id_], **changes}
+    disturbed = {'randomize': PRESET, 'sensors': PRESET}
+    (_, options), *_ = own.get('stages') or ((0.0, {}),)
+    options = {name: value for name, value in options.items() if name != 'pushes'}
+    stages = ((0.0, {**options, **disturbed}),)
+    return settings_for(id_, **{**own, 'stages': stages, 'evaluated_with': disturbed})

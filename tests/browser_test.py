@@ -255,6 +255,38 @@ class SceneTest(parameterized.TestCase):
         np.testing.assert_allclose(samples[:, 2] - under, observed, atol=1e-9)
 
 
+class OptionTest(absltest.TestCase):
+    def test_options_of_the_task(self):
+        """The command passes them on, and every environment that the viewer shows has them."""
+        from trl_suite import cli
+
+        options = (
+            'view',
+            DOG,
+            '--browser',
+            '--port',
+            '8765',
+            '--option',
+            'randomize={"friction": 0.3}',
+        )
+        with (
+            mock.patch.object(browser, 'Browser') as made,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            self.assertEqual(cli.main(options), 0)
+        self.assertEqual(made.call_args.args[-1], {'randomize': {'friction': 0.3}})
+        viewer = browser.Browser(DOG, port=0, task_kwargs={'randomize': {'friction': 0.3}})
+        self.addCleanup(viewer.stop)
+        viewer.choose_environment('PD_Raptor2D_Flat-v0')
+        for _ in range(2):
+            world = viewer.session.environment.info['world']
+            self.assertEqual(world, {'friction': 0.3})
+            viewer._serve()
+        self.assertEqual(viewer._loaded.spec.id, 'PD_Raptor2D_Flat-v0')
+        with self.assertRaisesRegex(ValueError, "did you mean 'randomize'"):
+            browser.Browser(DOG, port=0, task_kwargs={'randomise': 'robot'})
+
+
 class ReplayTest(FolderTest):
     @parameterized.parameters(
         (DOG, 0.2), (GOAT, 0.2), (HILLS, 1.0), (SOCCER, 0.2), (BELTS, 0.2)

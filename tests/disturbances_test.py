@@ -29,6 +29,7 @@ BALL = 'PD_Biped3D_HLC_Soccer-v0'
 EVERY = {  # all that can be varied
     'friction': (0.4, 1.2), 'mass': (0.8, 1.2), 'link_mass': (0.9, 1.1), 'inertia': (0.9, 1.1),
     'com_offset': (0.0, 0.03), 'damping': (0.5, 2.0), 'gravity': (9.0, 10.5), 'slope': (-0.05, 0.05),
+    'contact_depth': (0.001, 0.01), 'contact_time': (0.005, 0.02),
     'push': {'force': (50, 200), 'duration': (0.02, 0.2), 'interval': (0.0, 0.3)},
 }  # fmt: skip
 SENSORS = {'noise': 0.01, 'bias': 0.01, 'delay': (0, 2)}
@@ -183,6 +184,8 @@ class WorldTest(parameterized.TestCase):
             spec.joint(name).damping[:] = spec.joint(name).damping * world['damping']
         for geom in spec.geoms:
             geom.friction[0] = world['friction']
+            geom.solimp[0], geom.solimp[2] = 0, world['contact_depth']
+            geom.solref[0] = world['contact_time']
         spec.option.gravity = found.opt.gravity
         expected = spec.compile()
         for name in (
@@ -204,7 +207,10 @@ class WorldTest(parameterized.TestCase):
             atol=1e-9,
         )
         solid = (found.geom_contype | found.geom_conaffinity) != 0
-        np.testing.assert_allclose(found.geom_friction[solid], expected.geom_friction[solid])
+        for name in ('geom_friction', 'geom_solimp', 'geom_solref'):
+            np.testing.assert_allclose(
+                getattr(found, name)[solid], getattr(expected, name)[solid], err_msg=name
+            )
 
     def test_every_reset_starts_from_the_nominal_values(self):
         """Bounds that are equal to the nominal values leave the model as it is, after any draws."""
@@ -705,6 +711,7 @@ class ExtremeTest(parameterized.TestCase):
             {'friction': 0.0}, {'mass': 10.0}, {'mass': 0.1, 'inertia': 0.1}, {'gravity': 0.0},
             {'push': {'force': 1e4, 'duration': 0.5, 'interval': 0.1}}, {'slope': 1.5},
             {'gravity': 100.0, 'com_offset': 1.0, 'damping': 1000.0},
+            {'contact_depth': 0.1, 'contact_time': 1.0}, {'contact_depth': 1e-4, 'contact_time': 1e-3},
         ),
     )  # fmt: skip
     def test_numbers_stay_finite(self, id_, world):

@@ -26,6 +26,7 @@ import ppo
 import ppo_settings
 import share_gaits
 import train_all
+import train_randomized
 
 
 class JobsTest(parameterized.TestCase):
@@ -140,6 +141,43 @@ class JobsTest(parameterized.TestCase):
                     for spec in (catalogue.BY_ID[id_], catalogue.BY_ID[start])
                 )
                 self.assertEqual(own, other, id_)
+
+
+class RandomizedTest(parameterized.TestCase):
+    """Policies that were trained further in worlds and with sensors that vary."""
+
+    def test_every_run_continues_from_the_shipped_policy(self):
+        for id_ in ppo_settings.RANDOMIZED:
+            settings = ppo_settings.randomized_settings_for(id_)
+            self.assertEqual(settings.start, id_)
+            [(begin, options)] = settings.stages
+            self.assertEqual((begin, settings.evaluated_with.items() <= options.items()), (0, True))
+            self.assertEqual(settings.evaluated_with.keys(), {'randomize', 'sensors'})
+            self.assertNotIn('pushes', options)  # those of the preset
+            self.assertEqual(settings.hidden, ppo_settings.settings_for(id_).hidden)
+
+    def test_every_run_is_shipped(self):
+        self.assertEqual(policies.available('randomized'), tuple(sorted(ppo_settings.RANDOMIZED)))
+
+    @parameterized.parameters(*((id_,) for id_ in policies.available('randomized') or (None,)))
+    def test_what_is_shipped_keeps_its_return(self, id_):
+        """At least 0.9 of the first policy's without disturbances, and 0.9 of that with `robot`."""
+        if id_ is None:
+            self.skipTest('no policy is shipped')
+        entry = json.loads(train_randomized.place(id_).read_text())
+        before = entry['before']
+        found = {name: result['return'] for name, result in entry['evaluations'].items()}
+        self.assertGreater(found['none'], 0.9 * before['none']['return'])
+        self.assertGreater(found['robot'], 0.9 * found['none'])
+        self.assertGreater(found['harsh'], before['harsh']['return'])
+        policy, options = (
+            policies.reference(id_, 'randomized'),
+            train_randomized.CONDITIONS['robot'],
+        )
+        environments = VectorEnvironment(id_, 1, 1, 0, task_kwargs=options)
+        self.addCleanup(environments.close)
+        policy.check(environments)
+        self.assertEqual(policy.info['samples'], entry['shipped_at'])
 
 
 class TrimTest(absltest.TestCase):

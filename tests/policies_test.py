@@ -592,6 +592,24 @@ class ReferenceTest(FolderTest):
         self.assertEqual([policies.trained_for(id_) for id_ in (dog, steps)], [dog, dog])
         np.testing.assert_array_equal(own.weights[0], other.weights[0])
 
+    def test_a_variant_is_in_a_folder_of_its_own(self):
+        dog = 'PD_Dog2D_Gaps_Terrain-v0'
+        policies.save(make(id=dog), self.folder / f'{dog}.npz')
+        self.assertEqual(policies.available('randomized'), ())
+        with self.assertRaisesRegex(
+            FileNotFoundError, f"no randomized policy is shipped for '{dog}'"
+        ):
+            policies.reference(dog, 'randomized')
+        (self.folder / 'randomized').mkdir()
+        other = make(id=dog, info={'seed': 7})
+        policies.save(other, self.folder / 'randomized' / f'{dog}.npz')
+        self.assertEqual(policies.available('randomized'), (dog,))
+        self.assertEqual(policies.reference(dog, 'randomized').info, {'seed': 7})
+        self.assertEqual(suite.reference_policy('plaid/dog_gaps', 'randomized').info, {'seed': 7})
+        self.assertNotEqual(policies.reference(dog).info, {'seed': 7})
+        with self.assertRaisesRegex(ValueError, "variant of policies 'random'.*'randomized'"):
+            policies.reference(dog, 'random')
+
     def test_no_policies_at_all(self):
         with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; none is installed"):
             policies.reference(GAPS)

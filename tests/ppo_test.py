@@ -342,6 +342,20 @@ class RunTest(parameterized.TestCase):
             trainer.curve = [{'normalized_return': fraction} for fraction in fractions]
             self.assertEqual(trainer.has_learnt(), expected)
 
+    def test_evaluations_may_have_other_options(self):
+        distances = []
+        for options in ({}, {'randomize': {'gravity': 0.0}}):
+            settings = ppo_settings.Settings(**TINY, evaluated_with=options)
+            trainer = ppo.Trainer(FLAT, 0, settings, 1)
+            with (
+                tempfile.TemporaryDirectory() as name,
+                mock.patch.object(evaluation, 'evaluate', wraps=evaluation.evaluate) as called,
+            ):
+                trainer.evaluate(pathlib.Path(name), 0.0)
+            self.assertEqual(called.call_args.args[-1], options)
+            distances.append(trainer.curve[-1]['distance'])
+        self.assertNotEqual(*distances)
+
     def test_curriculum_of_rising_walls(self):
         stages = ppo_settings.rising(
             'mixed_humanoid', {'WallHMin': 0.1, 'WallHMax': 0.2}, (0.0, 0.5)

@@ -71,14 +71,19 @@ def make(
     return build_environment(find(id), task_kwargs, environment_kwargs)
 
 
-def reference_policy(id: str) -> policies.Policy:
+def reference_policy(id: str, variant: str = '') -> policies.Policy:
     """Returns the trained policy that the suite ships for an id or alias.
 
+    Args:
+      id: id or alias of the environment.
+      variant: 'randomized' for the policy that was trained in worlds and with sensors that vary;
+        `policies.available('randomized')` lists the environments that have one.
+
     Raises:
-      ValueError: unknown id; the message has the closest matches.
+      ValueError: unknown id or variant; the message has the closest matches.
       FileNotFoundError: no policy is shipped for it; the message has the closest ids with a policy.
     """
-    return policies.reference(find(id).id)
+    return policies.reference(find(id).id, variant)
 
 
 def build(

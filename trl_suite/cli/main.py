@@ -114,7 +114,8 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     def add_policy(command: argparse.ArgumentParser, default: str) -> None:
         command.add_argument(
             '--policy', default=default, type=_policy_name, metavar='POLICY',
-            help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped policy',
+            help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped policy, randomized: '
+            'one that was trained in worlds and with sensors that vary, which a few environments have',
         )  # fmt: skip
 
     def add_options(command: argparse.ArgumentParser) -> None:

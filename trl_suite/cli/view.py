@@ -27,9 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Opens a window and returns when it is closed, or serves web browsers until interrupted."""
     options = dict(arguments.options or ())
     if arguments.browser:
-        if options:
-            raise ValueError('--option is for the window; the browser has no options of tasks')
-        in_browser(arguments)
+        in_browser(arguments, options)
         return
     check_screen()
     suite = engine.load()
@@ -46,10 +44,10 @@ def run(arguments: argparse.Namespace) -> None:
     view(environment, policy(), f'{suite.find(arguments.id).id}: {name}')
 
 
-def in_browser(arguments: argparse.Namespace) -> None:
+def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
     """Serves web browsers until a keyboard interrupt."""
     viewer = engine.load('trl_suite.viewing.browser').Browser(
-        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port
+        arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options
     )
     print(f'open {viewer.url} in a web browser; press Ctrl+C to stop', flush=True)
     viewer.run()

@@ -33,6 +33,8 @@ class Properties(NamedTuple):
       gravity: magnitude of gravity, (n,) m/s^2.
       slope: angle by which the ground is tilted, (n,) rad.
       slope_direction: direction of the steepest ascent, to the left of +x, (n,) rad.
+      contact_depth: depth over which the impedance of contacts rises from 0, (n,) m.
+      contact_time: time constant of contacts, (n,) s.
     """
 
     friction: np.ndarray
@@ -44,6 +46,8 @@ class Properties(NamedTuple):
     gravity: np.ndarray
     slope: np.ndarray
     slope_direction: np.ndarray
+    contact_depth: np.ndarray
+    contact_time: np.ndarray
 
 
 class Variation:
@@ -84,6 +88,8 @@ class Variation:
         self.mass = float(self._mass.sum())
         n, ones = world.n, np.ones(world.n)
         ground = model.geom_friction[self._slides, 0]
+        first = self._slides[:1] if len(self._slides) else 0
+        soft, stiff = np.ravel(model.geom_solimp[first]), np.ravel(model.geom_solref[first])
         self.properties = Properties(
             friction=np.full(n, ground.max() if len(ground) else 0.0),
             mass=ones.copy(),
@@ -94,6 +100,8 @@ class Variation:
             gravity=np.full(n, math.hypot(*model.opt.gravity)),
             slope=np.zeros(n),
             slope_direction=np.zeros(n),
+            contact_depth=np.full(n, soft[2]),
+            contact_time=np.full(n, stiff[0]),
         )
 
     def apply(self, env_id: int) -> None:
@@ -106,6 +114,11 @@ class Variation:
         if 'friction' in varied:
             model.geom_friction[self._slides, 0] = own.friction[env_id]
             model.pair_friction[:, :2] = own.friction[env_id]
+        if 'contact_depth' in varied:
+            model.geom_solimp[self._slides, 0] = 0.0
+            model.geom_solimp[self._slides, 2] = own.contact_depth[env_id]
+        if 'contact_time' in varied:
+            model.geom_solref[self._slides, 0] = own.contact_time[env_id]
         if 'damping' in varied:
             model.dof_damping[self._dofs] = self._damping * own.damping[env_id]
         if varied & {'gravity', 'slope', 'slope_direction'}:

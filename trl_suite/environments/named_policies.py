@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from trl_suite.environments.environment import Environment
     from trl_suite.rendering import Policy
 
-POLICIES = ('reference', 'clip', 'scripted', 'zero', 'random')  # or a file
+POLICIES = ('reference', *policies.VARIANTS, 'clip', 'scripted', 'zero', 'random')  # or a file
 
 
 def check(name: str) -> str:
@@ -31,14 +31,14 @@ def check(name: str) -> str:
 
 
 def trained(name: str, id: str) -> policies.Policy:
-    """Returns the policy shipped for an environment, 'reference', or one from a file.
+    """Returns a policy shipped for an environment, or one from a file.
 
     Args:
-      name: 'reference', or an .npz file.
+      name: 'reference', one of `policies.VARIANTS`, or an .npz file.
       id: id or alias of the environment.
     """
-    if name == 'reference':
-        return policies.reference(catalogue.find(id).id)
+    if name == 'reference' or name in policies.VARIANTS:
+        return policies.reference(catalogue.find(id).id, '' if name == 'reference' else name)
     return policies.load(name)
 
 

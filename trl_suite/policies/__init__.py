@@ -1,11 +1,20 @@
 """Trained policies as data: small networks in .npz files, evaluated with NumPy only."""
 
-from trl_suite.policies.files import SHARED, available, load, reference, save, trained_for
+from trl_suite.policies.files import (
+    SHARED,
+    VARIANTS,
+    available,
+    load,
+    reference,
+    save,
+    trained_for,
+)
 from trl_suite.policies.network import ACTIVATIONS, Convolution, Policy, placed
 
 __all__ = [
     'ACTIVATIONS',
     'SHARED',
+    'VARIANTS',
     'Convolution',
     'Policy',
     'available',

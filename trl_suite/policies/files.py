@@ -77,17 +77,19 @@ import dataclasses
 import difflib
 import json
 import os
+import pathlib
 from typing import Any
 
 import numpy as np
 
 from trl_suite.policies.mirror import Mirror
 from trl_suite.policies.network import Convolution, Policy
-from trl_suite.util import resources
+from trl_suite.util import errors, resources
 from trl_suite.util.files import check_path, existing, load_arrays, replacing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
+VARIANTS = ('randomized',)  # folders in trained/, with other policies of some environments
 VERSION = 1
 # Key in the file -> dtype kinds, number of axes.
 _FIELDS = {
@@ -216,20 +218,23 @@ def load(path: str | os.PathLike[str]) -> Policy:
         raise ValueError(f'{path}: {error}') from None
 
 
-def reference(id: str) -> Policy:
+def reference(id: str, variant: str = '') -> Policy:
     """Returns the policy shipped for an environment.
 
     Args:
       id: id of the environment; `suite.reference_policy` also accepts aliases.
+      variant: '', or one of `VARIANTS`: 'randomized' is a policy that was trained in worlds and
+        with sensors that vary, which some environments have in addition.
 
     Raises:
       TypeError: the id is not a string.
+      ValueError: unknown variant.
       FileNotFoundError: no policy is shipped for it; the message has the closest ids with a policy,
         or how to install the policies.
     """
     if not isinstance(id, str):
         raise TypeError(f'the id of an environment is a string, not {id!r}')
-    shipped = available()
+    shipped = available(variant)
     if id not in shipped and resources.lacks_policies():
         raise FileNotFoundError(
             f'no policy for {id!r}, because the trained policies are not installed: '
@@ -238,26 +243,33 @@ def reference(id: str) -> Policy:
     if id not in shipped:
         near = difflib.get_close_matches(id, shipped, n=3, cutoff=0)
         raise FileNotFoundError(
-            f'no policy is shipped for {id!r}; '
+            f'no {f"{variant} " if variant else ""}policy is shipped for {id!r}; '
             + (f'the closest ids with a policy: {", ".join(near)}' if near else 'none is installed')
         )
-    other = trained_for(id)
-    path = resources.directory('trained') / f'{other}.npz'
+    other = id if variant else trained_for(id)
+    path = _folder(variant) / f'{other}.npz'
     policy = load(path)
     if policy.id != other:
         raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {other!r}")
     return policy if id == other else dataclasses.replace(policy, id=id)
 
 
-def available() -> tuple[str, ...]:
-    """Returns the ids of the environments that have a shipped policy, sorted."""
-    own = (path.stem for path in resources.directory('trained').glob('*.npz'))
-    return tuple(sorted({*own, *_shared()}))
+def available(variant: str = '') -> tuple[str, ...]:
+    """Returns the ids of the environments that have a shipped policy, sorted; see `reference`."""
+    own = (path.stem for path in _folder(variant).glob('*.npz'))
+    return tuple(sorted({*own, *(() if variant else _shared())}))
 
 
 def trained_for(id: str) -> str:
     """Returns the id of the environment in which the shipped policy of an environment was trained."""
     return _shared().get(id, id)
+
+
+def _folder(variant: str) -> pathlib.Path:
+    """Returns the folder of the policies of a variant, or of '', the policies themselves."""
+    if variant and variant not in VARIANTS:
+        raise ValueError(errors.unknown('variant of policies', variant, VARIANTS))
+    return resources.directory('trained') / variant
 
 
 def _shared() -> dict[str, str]:

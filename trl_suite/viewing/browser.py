@@ -61,6 +61,7 @@ class Browser:
         seed: int = 0,
         host: str = HOST,
         port: int = PORT,
+        task_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         """Opens the viewer; the simulation runs in `run` or after `start`.
 
@@ -71,15 +72,17 @@ class Browser:
           host: address to listen on; '0.0.0.0' accepts connections from every machine of the
             network.
           port: the first port to try, then the following ones.
+          task_kwargs: options of the task, also of environments that are chosen later.
 
         Raises:
-          ValueError: an unknown id, policy or port, or a policy that does not fit.
+          ValueError: an unknown id, policy, option or port, or a policy that does not fit.
           FileNotFoundError: there is no such file.
           ImportError: the extra 'viewer' is not installed.
           OSError: this machine cannot listen on the address.
         """
         web_scene.load_viser()
         self.playing, self.speed, self.seed = True, 1.0, seed
+        self._task_kwargs = {**(task_kwargs or {}), 'random': seed}
         self.shown = {PLAN: True, CLIP: False, SAMPLES: False, **dict.fromkeys(DECORATION, False)}
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopped = threading.Event()
@@ -231,7 +234,7 @@ class Browser:
 
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
         spec = suite.find(spec) if isinstance(spec, str) else spec
-        environment = suite.build_environment(spec, {'random': self.seed}, {})
+        environment = suite.build_environment(spec, self._task_kwargs, {})
         policies = named_policies.available(environment, spec.id, self.seed)
         if policy == 'best':
             policy = next(iter(policies))

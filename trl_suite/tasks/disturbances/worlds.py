@@ -113,6 +113,19 @@ class WorldConfig(Config):
         at_least=-2 * math.pi,
         at_most=2 * math.pi,
     )
+    contact_depth: Range = option(
+        None,
+        'depth over which contacts become stiff, starting from nothing; otherwise they are stiff from the '
+        'first touch',
+        unit='m', at_least=1e-4, at_most=0.1,
+    )  # fmt: skip
+    contact_time: Range = option(
+        None,
+        'time constant of contacts; 0.005 otherwise, and at least two physics steps',
+        unit='s',
+        at_least=1e-3,
+        at_most=1,
+    )
     push: Any = option(None, 'forces on the character: a mapping of options of pushes')
 
     def __post_init__(self) -> None:
