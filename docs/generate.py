@@ -611,7 +611,7 @@ def speed() -> str:
         'Control steps per second (of 10 physics steps each) with random actions; with 256 simulations, '
         'resets with new terrain are included. In brackets: the ratio to raw MuJoCo with the same model, '
         '`mj_step` for one simulation and MuJoCo on the same threads for 256 (it can be above 1, because '
-        'without resets the characters lie on the ground, where physics steps cost more). Measured by '
+        'raw MuJoCo does not reset: its characters lie on the ground, where physics steps cost more). Measured by '
         f'`python benchmarks/vector_environment.py` on {MACHINE}.'
     )
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'
@@ -651,8 +651,8 @@ def speed_page() -> str:
         ),
         '## Vector environment',
         'Resets with new terrain are included. *Ratio* is relative to MuJoCo alone with the same models, '
-        'number of simulations and threads; it can be above 1, because without resets the characters lie on '
-        'the ground, where physics steps cost more. *Serial* is the part of a control step that runs on one '
+        'number of simulations and threads; it can be above 1, because MuJoCo alone does not reset: its '
+        'characters lie on the ground, where physics steps cost more. *Serial* is the part of a control step that runs on one '
         'thread while the others wait, in us per simulation; *resets* is the share of time spent in resets.',
         table(('environment', '', 'control steps per s', 'ratio', 'serial', 'reset, ms', 'resets'), cells),
         '![Rates by simulations and threads](../benchmarks/vector_environment.png)',
