@@ -287,6 +287,24 @@ class OptionTest(absltest.TestCase):
             browser.Browser(DOG, port=0, task_kwargs={'randomise': 'robot'})
 
 
+class BrowserTest(absltest.TestCase):
+    def test_a_refused_choice_is_taken_back(self):
+        viewer = browser.Browser(SOCCER, port=0)
+        self.addCleanup(web_scene.stop_server, viewer._server)
+        self.addCleanup(viewer._uploads.cleanup)
+        preset, policy = viewer._panel._fitted[0], viewer._loaded.policy
+        self.assertEqual(preset.value, 'plane')
+        with mock.patch.object(viewer._panel, 'tell') as tell:
+            preset.value = 'checkers_3d'  # as by a user
+            viewer.upload_policy('mine.npz', b'')
+            viewer._serve()
+        self.assertLen(tell.call_args_list, 2)
+        self.assertIn('a ball needs level ground', tell.call_args_list[0].args[0])
+        self.assertIn('mine.npz', tell.call_args_list[1].args[0])
+        self.assertEqual(viewer._panel._fitted[0].value, 'plane')
+        self.assertEqual(viewer._panel._policy.value, policy)
+
+
 class ReplayTest(FolderTest):
     @parameterized.parameters(
         (DOG, 0.2), (GOAT, 0.2), (HILLS, 1.0), (SOCCER, 0.2), (BELTS, 0.2)

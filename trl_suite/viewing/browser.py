@@ -231,6 +231,7 @@ class Browser:
                 self._requests.get()()
             except (ValueError, OSError, RuntimeError) as error:
                 self._panel.tell(' '.join(str(error).split()))
+                self._panel.show(self._loaded, self.session)  # what was chosen is not shown
 
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
         spec = suite.find(spec) if isinstance(spec, str) else spec
