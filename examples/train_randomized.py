@@ -33,7 +33,7 @@ from trl_suite import evaluation, policies
 from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 
-EPISODES = 128  # of each evaluation
+EPISODES = 64  # of each evaluation
 LONG = 32  # the same for planners, whose steps are whole footsteps
 CONDITIONS: dict[str, dict[str, Any]] = {
     'none': {},
@@ -84,10 +84,11 @@ def measure(id_: str) -> dict[str, Any]:
 
 def table(entries: list[dict[str, Any]]) -> str:
     """Returns the results as Markdown."""
+    episodes = [entry['evaluations']['none']['episodes'] for entry in entries]
     lines = [
-        f'Mean returns of {EPISODES} episodes (of `HLC` environments {LONG}), with 95 % confidence, and in brackets '
-        'the share of complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` '
-        'what the training has cost without disturbances.',
+        f'Mean returns of {min(episodes)} to {max(episodes)} episodes with 95 % confidence, and in brackets the share of '
+        'complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` what the '
+        'training has cost without disturbances.',
         '',
         '| environment | policy | none | mild | robot | harsh | robot / none | none / shipped |',
         '|---|---|---|---|---|---|---|---|',
