@@ -218,6 +218,23 @@ def begun(settings: Mapping[str, Any]) -> str:
     return f'imitation of `--policy {start}` {copied}'
 
 
+def observing(spec: catalogue.EnvSpec) -> list[tuple[str, str]]:
+    """Returns the results of the same environment with observed terrain, if there is one."""
+    other = f'{spec.id.removesuffix("-v0")}_Terrain-v0'
+    found = gallery.record(other) if other in catalogue.BY_ID else None
+    if found is None:
+        return []
+    run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
+    result = run['evaluation']
+    return [
+        (
+            'the same, but with observed terrain',
+            f'[{other}]({other}.md): return {result["normalized_return"]:.1%}, '
+            f'{result["completion_rate"]:.0%} of {result["episodes"]} episodes reached the step limit',
+        )
+    ]
+
+
 def learnt(spec: catalogue.EnvSpec) -> str:
     found = gallery.record(spec.id)
     if found is None:
@@ -244,6 +261,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ('trained for', f'{trained}, seed {run["seed"]}'),
         *([('policy saved after', after)] if taken < 0.99 * samples else []),
         *([('initial policy', begun(run['settings']))] if run['settings'].get('start') else []),
+        *observing(spec),
         ('machine', run['machine']),
     )  # fmt: skip
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''
