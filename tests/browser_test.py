@@ -7,6 +7,7 @@ import shutil
 import socket
 import time
 import unittest
+import urllib.request
 from unittest import mock
 
 import imageio.v3 as iio
@@ -255,7 +256,7 @@ class SceneTest(parameterized.TestCase):
         np.testing.assert_allclose(samples[:, 2] - under, observed, atol=1e-9)
 
 
-class BrowserTest(absltest.TestCase):
+class BrowserTest(parameterized.TestCase):
     def test_a_refused_choice_is_taken_back(self):
         viewer = browser.Browser(SOCCER, port=0)
         self.addCleanup(web_scene.stop_server, viewer._server)
@@ -271,6 +272,22 @@ class BrowserTest(absltest.TestCase):
         self.assertIn('mine.npz', tell.call_args_list[1].args[0])
         self.assertEqual(viewer._panel._fitted[0].value, 'plane')
         self.assertEqual(viewer._panel._policy.value, policy)
+
+    @parameterized.parameters(
+        ('127.0.0.1', '127.0.0.1', False), ('localhost', 'localhost', False),
+        ('0.0.0.0', '127.0.0.1', True),
+    )  # fmt: skip
+    def test_addresses(self, host, own, others):
+        """0.0.0.0 is no address that a browser can open on another machine."""
+        viewer = browser.Browser(DOG, 'zero', host=host, port=0)
+        self.addCleanup(web_scene.stop_server, viewer._server)
+        self.addCleanup(viewer._uploads.cleanup)
+        port = viewer._server.get_port()
+        self.assertEqual(viewer.url, f'http://{own}:{port}')
+        expected = f'http://{socket.gethostname()}:{port}' if others else ''
+        self.assertEqual(viewer.other_url, expected)
+        with urllib.request.urlopen(viewer.url) as page:
+            self.assertEqual(page.status, 200)
 
 
 class ReplayTest(FolderTest):
