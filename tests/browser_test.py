@@ -425,7 +425,6 @@ class ChromiumTest(FolderTest):
         self.wait_until_it_moves(page)
         self.assert_quiet('file:')
 
-    @pytest.mark.slow  # without a graphics card a minute of drawing
     def test_the_viewer(self):
         viewer = browser.Browser(DOG, port=0).start()
         self.addCleanup(viewer.stop)
@@ -440,8 +439,14 @@ class ChromiumTest(FolderTest):
         )
         page.get_by_role('button', name='Play').click()
         self.wait_for(lambda: viewer.playing, 'it does not go on')
-        # Another environment, with another policy, for two who look.
-        other = self.open(viewer.url)
+        self.assert_quiet(viewer.url)
+
+    @pytest.mark.slow  # without a graphics card a minute of drawing
+    def test_two_who_look(self):
+        """One chooses another environment, the other one another policy."""
+        viewer = browser.Browser(DOG, port=0).start()
+        self.addCleanup(viewer.stop)
+        page, other = self.open(viewer.url), self.open(viewer.url)
         page.get_by_label('Environment').click()
         page.get_by_label('Environment').fill(SOCCER)
         page.get_by_role('option', name=SOCCER, exact=True).click()
