@@ -7,6 +7,7 @@ import shutil
 import socket
 import time
 import unittest
+import urllib.request
 from unittest import mock
 
 import imageio.v3 as iio
@@ -287,7 +288,7 @@ class OptionTest(absltest.TestCase):
             browser.Browser(DOG, port=0, task_kwargs={'randomise': 'robot'})
 
 
-class BrowserTest(absltest.TestCase):
+class BrowserTest(parameterized.TestCase):
     def test_a_refused_choice_is_taken_back(self):
         viewer = browser.Browser(SOCCER, port=0)
         self.addCleanup(web_scene.stop_server, viewer._server)
@@ -303,6 +304,22 @@ class BrowserTest(absltest.TestCase):
         self.assertIn('mine.npz', tell.call_args_list[1].args[0])
         self.assertEqual(viewer._panel._fitted[0].value, 'plane')
         self.assertEqual(viewer._panel._policy.value, policy)
+
+    @parameterized.parameters(
+        ('127.0.0.1', '127.0.0.1', False), ('localhost', 'localhost', False),
+        ('0.0.0.0', '127.0.0.1', True),
+    )  # fmt: skip
+    def test_addresses(self, host, own, others):
+        """0.0.0.0 is no address that a browser can open on another machine."""
+        viewer = browser.Browser(DOG, 'zero', host=host, port=0)
+        self.addCleanup(web_scene.stop_server, viewer._server)
+        self.addCleanup(viewer._uploads.cleanup)
+        port = viewer._server.get_port()
+        self.assertEqual(viewer.url, f'http://{own}:{port}')
+        expected = f'http://{socket.gethostname()}:{port}' if others else ''
+        self.assertEqual(viewer.other_url, expected)
+        with urllib.request.urlopen(viewer.url) as page:
+            self.assertEqual(page.status, 200)
 
 
 class ReplayTest(FolderTest):
@@ -440,7 +457,6 @@ class ChromiumTest(FolderTest):
         self.wait_until_it_moves(page)
         self.assert_quiet('file:')
 
-    @pytest.mark.slow  # without a graphics card a minute of drawing
     def test_the_viewer(self):
         viewer = browser.Browser(DOG, port=0).start()
         self.addCleanup(viewer.stop)
@@ -455,8 +471,14 @@ class ChromiumTest(FolderTest):
         )
         page.get_by_role('button', name='Play').click()
         self.wait_for(lambda: viewer.playing, 'it does not go on')
-        # Another environment, with another policy, for two who look.
-        other = self.open(viewer.url)
+        self.assert_quiet(viewer.url)
+
+    @pytest.mark.slow  # without a graphics card a minute of drawing
+    def test_two_who_look(self):
+        """One chooses another environment, the other one another policy."""
+        viewer = browser.Browser(DOG, port=0).start()
+        self.addCleanup(viewer.stop)
+        page, other = self.open(viewer.url), self.open(viewer.url)
         page.get_by_label('Environment').click()
         page.get_by_label('Environment').fill(SOCCER)
         page.get_by_role('option', name=SOCCER, exact=True).click()

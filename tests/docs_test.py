@@ -1,11 +1,13 @@
 """The pages in docs/ and the README: up to date, with existing link targets."""
 
 import importlib.util
+import json
 import pathlib
 import re
 from unittest import mock
 
 from absl.testing import absltest, parameterized
+from helpers import FolderTest
 
 from trl_suite import describe, suite
 from trl_suite.describe import options
@@ -65,6 +67,31 @@ class PagesTest(absltest.TestCase):
         self.assertIn(f'\n{len(suite.BENCHMARKING)} of the environments are registered', text)
         for domain, tasks in suite.TASKS_BY_DOMAIN.items():
             self.assertRegex(text, rf'\n\| \[`{domain}`\]\S+ \| \S+ \| {len(tasks)} \|')
+
+
+class LeaderboardTest(FolderTest):
+    ID = 'PD_Biped2D_Flat-v0'
+
+    def test_the_command_of_the_page_finds_its_folder(self):
+        text = (DOCS / 'leaderboard.md').read_text(encoding='utf-8')
+        folder = re.search(r'--json (\S+)/ID', text)[1]
+        self.assertTrue((ROOT / folder).is_dir())
+        self.assertEqual(ROOT / folder, generate.RESULTS)
+
+    def test_a_result_file_becomes_a_row(self):
+        result = {
+            'id': self.ID, 'seed': 0, 'step_limit': 256, 'episodes': 50, 'normalized_return': 0.5,
+            'completion_rate': 0.75, 'distance': 9.0,
+        }  # fmt: skip
+        path = self.folder / f'{self.ID}.mine.json'
+        with mock.patch.object(generate, 'RESULTS', self.folder):
+            path.write_text(json.dumps(result), encoding='utf-8')
+            self.assertRegex(
+                generate.leaderboard(), rf'{self.ID}.* \| mine \| 0.500 \| 75% \| 9.0 \| 50 \|'
+            )
+            path.write_text(json.dumps({**result, 'episodes': 49}), encoding='utf-8')
+            with self.assertRaisesRegex(ValueError, 'mine.json: 49 episodes; expected 50 or more'):
+                generate.leaderboard()
 
 
 class WordsTest(parameterized.TestCase):

@@ -49,7 +49,8 @@ def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
     viewer = engine.load('trl_suite.viewing.browser').Browser(
         arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options
     )
-    print(f'open {viewer.url} in a web browser; press Ctrl+C to stop', flush=True)
+    elsewhere = f', or {viewer.other_url} on another machine' if viewer.other_url else ''
+    print(f'open {viewer.url} in a web browser{elsewhere}; press Ctrl+C to stop', flush=True)
     viewer.run()
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import pathlib
 import queue
+import socket
 import tempfile
 import threading
 import time
@@ -30,6 +31,7 @@ from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Loaded, Session
 
 HOST, PORT = '127.0.0.1', 8080
+EVERY = '0.0.0.0'  # all addresses of this machine
 IDLE = 0.01  # s; longest wait before requests are handled
 PLOT_INTERVAL = 0.25  # s
 PLAN, CLIP, SAMPLES = 'plan and goal', 'reference clip', 'observed terrain'
@@ -45,7 +47,8 @@ class Browser:
     """A viewer for web browsers. Its methods may be called from any thread.
 
     Attributes:
-      url: address of the page.
+      url: address of the page, on this machine.
+      other_url: its address on other machines, if they can connect; else ''.
       session: the environment and the current policy.
       playing: whether the simulation runs, or is paused.
       speed: simulated time per time; 1 is real time.
@@ -92,7 +95,9 @@ class Browser:
         )  # before the server is started, as an error would leave it running
         self._uploads = tempfile.TemporaryDirectory(prefix='trl_suite_')
         self._server = web_scene.start_server(host, port)
-        self.url = f'http://{host}:{self._server.get_port()}'
+        port = self._server.get_port()
+        self.url = f'http://{HOST if host == EVERY else host}:{port}'
+        self.other_url = f'http://{socket.gethostname()}:{port}' if host == EVERY else ''
         self._panel = panel.Panel(self._server, self)
         self._show(loaded)
 
