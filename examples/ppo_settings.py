@@ -371,16 +371,16 @@ FEWER = {'samples': 2.5e5, 'value_first': 2e4, 'evaluate_every': 5e4, 'evaluatio
 RANDOMIZED: dict[str, dict[str, Any]] = {
     'PD_Biped2D_LLC_Imitate_Flat-v0': {},
     'Torque_Dog2D_LLC_Imitate_Flat-v0': {'enough': 0.76},
-    'MTU_Raptor2D_LLC_Imitate_Flat-v0': FEWER,
-    'PD_Biped2D_Gaps_Terrain-v0': FEWER,
-    'PD_Raptor2D_Slopes_Terrain-v0': FEWER,
+    'MTU_Raptor2D_LLC_Imitate_Flat-v0': {**FEWER, 'enough': 0.37},
+    'PD_Biped2D_Gaps_Terrain-v0': {**FEWER, 'preset': 'robot', 'samples': 1.5e5},
+    'PD_Raptor2D_Slopes_Terrain-v0': {**FEWER, 'samples': 1e5},
     'PD_Biped3D_Imitate-v0': FEWER,
     # Plans and rewards of the last stage of its training; pushes are those of the preset.
     'PD_Biped3D_LLC_General_Step-v0': {**FEWER, 'stages': STAGES[-1:]},
     # With `harsh` its footstep controller falls, whatever the plan.
     'PD_Biped3D_HLC_Forest-v0': {
         'preset': 'robot', 'samples': 5e4, 'averaged': 1e4, 'start_count': 2e5, 'value_first': 1e4,
-        'learning_rate': 1e-4, 'evaluate_every': 1e4, 'evaluation_episodes': 32,
+        'learning_rate': 1e-4, 'evaluate_every': 1e4, 'evaluation_episodes': 32, 'enough': 0.72,
     },
 }  # fmt: skip
 

@@ -34,7 +34,7 @@ from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
-LONG = 32  # the same for planners, whose steps are whole footsteps
+LONG = 16  # the same for planners, whose steps are whole footsteps
 CONDITIONS: dict[str, dict[str, Any]] = {
     'none': {},
     **{name: {'randomize': name, 'sensors': name} for name in ('mild', 'robot', 'harsh')},

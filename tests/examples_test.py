@@ -1,6 +1,7 @@
 """Tests of the programs that train and compare: which runs there are, and in which order."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -165,7 +166,8 @@ class RandomizedTest(parameterized.TestCase):
         if id_ is None:
             self.skipTest('no policy is shipped')
         entry = json.loads(train_randomized.place(id_).read_text())
-        before = entry['before']
+        before, settings = entry['before'], ppo_settings.randomized_settings_for(id_)
+        self.assertEqual(entry['settings'], json.loads(json.dumps(dataclasses.asdict(settings))))
         found = {name: result['return'] for name, result in entry['evaluations'].items()}
         self.assertGreater(found['none'], 0.9 * before['none']['return'])
         self.assertGreater(found['robot'], 0.9 * found['none'])
