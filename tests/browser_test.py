@@ -14,6 +14,7 @@ import imageio.v3 as iio
 import mujoco
 import numpy as np
 import pytest
+import rich.console
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
@@ -360,8 +361,12 @@ class ReplayTest(FolderTest):
         self.assertNotIn('viser', printed.getvalue())
 
     def test_in_a_notebook(self):
+        """The replay is all that is shown: rich, with which viser prints, writes into outputs."""
         environment = suite.make(DOG, {'random': 1})
-        recording = rendering.replay(environment, zero(environment), steps=3)
+        with mock.patch.object(rich, '_console', rich.console.Console(record=True)) as console:
+            recording = rendering.replay(environment, zero(environment), steps=3)
+            self.assertEqual(console.export_text(), '')
+            self.assertFalse(console.quiet)
         self.assertStartsWith(recording._repr_html_(), '<iframe srcdoc="&lt;!')
 
     def test_invalid_arguments_of_a_replay_are_rejected(self):

@@ -12,7 +12,6 @@ import collections
 import contextlib
 import errno
 import functools
-import io
 import socket
 from collections.abc import Iterable, Iterator
 from typing import Any, cast
@@ -77,9 +76,20 @@ def start_server(host: str, port: int) -> Any:
     viser = load_viser()
     errors.check_whole('port', port, 0, LAST_PORT)
     port = _free_port(host, int(port))  # where there is none, viser would wait forever
-    with contextlib.redirect_stdout(io.StringIO()):
+    with _silent_viser():
         server = viser.ViserServer(host, port, verbose=False)
     return server
+
+
+@contextlib.contextmanager
+def _silent_viser() -> Iterator[None]:
+    """Suppresses what viser prints by way of rich, to terminals and into the outputs of notebooks."""
+    console = library('rich', 'trl_suite[viewer]').get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _free_port(host: str, port: int) -> int:
@@ -103,7 +113,7 @@ def _free_port(host: str, port: int) -> int:
 
 def stop_server(server: Any) -> None:
     """Stops a viser server without a message."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    with _silent_viser():
         server.stop()
 
 
