@@ -132,12 +132,15 @@ def draw_randomized(path: pathlib.Path) -> None:
         samples, returns = np.transpose(curve)
         axis.plot(samples / 1e6, returns, '.-')
         axis.plot(entry['shipped_at'] / 1e6, np.max(returns), 'o', fillstyle='none')
-        axis.set_title(id_, fontsize=7)
+        preset = entry['settings']['evaluated_with']['randomize']
+        before = entry['before'][preset]['return'] / suite.find(id_).step_limit
+        axis.axhline(before, color='grey', linestyle=':')
+        axis.set_title(f'{id_}, {preset}', fontsize=7)
         axis.set_xlim(0)
     for axis in axes[-1]:
         axis.set_xlabel('samples (M)')
     for axis in axes[:, 0]:
-        axis.set_ylabel('return, harsh')
+        axis.set_ylabel('return with the preset')
     figure.savefig(path, dpi=90)
 
 

@@ -82,6 +82,11 @@ def measure(id_: str) -> dict[str, Any]:
     return entry
 
 
+def preset(entry: dict[str, Any]) -> str:
+    """Returns the preset with which a policy was trained."""
+    return str(entry['settings']['evaluated_with']['randomize'])
+
+
 def table(entries: list[dict[str, Any]]) -> str:
     """Returns the results as Markdown."""
     episodes = [entry['evaluations']['none']['episodes'] for entry in entries]
@@ -95,7 +100,8 @@ def table(entries: list[dict[str, Any]]) -> str:
     ]
     for entry in entries:
         shipped = entry['before']['none']['return']
-        for name, title in (('before', 'shipped'), ('evaluations', 'randomized')):
+        titles = {'before': 'shipped', 'evaluations': f'randomized, `{preset(entry)}`'}
+        for name, title in titles.items():
             found = entry[name]
             cells = ' | '.join(
                 f'{each["return"]:.1f} ± {each["return_interval"]:.1f} ({each["completion_rate"]:.0%})'
