@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, nargs='+', default=[1])
     parser.add_argument('--samples', type=float, default=2.5e5)
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/limits'))
-    parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('trained/limits.json'))
+    parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/limits.json'))
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
     arguments = parser.parse_args()
     found: dict[str, Any] = {'samples': arguments.samples, 'results': {}}

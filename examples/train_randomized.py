@@ -34,7 +34,7 @@ from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
-LONG = 16  # the same for planners, whose steps are whole footsteps
+LONG = 50  # the same for planners, whose steps are whole footsteps
 CONDITIONS: dict[str, dict[str, Any]] = {
     'none': {},
     **{name: {'randomize': name, 'sensors': name} for name in ('mild', 'robot', 'harsh')},
@@ -89,7 +89,12 @@ def preset(entry: dict[str, Any]) -> str:
 
 def table(entries: list[dict[str, Any]]) -> str:
     """Returns the results as Markdown."""
-    episodes = [entry['evaluations']['none']['episodes'] for entry in entries]
+    episodes = [
+        result['episodes']
+        for entry in entries
+        for name in ('evaluations', 'before')
+        for result in entry[name].values()
+    ]
     lines = [
         f'Mean returns of {min(episodes)} to {max(episodes)} episodes with 95 % confidence, and in brackets the share of '
         'complete ones. `robot / none` is what a policy keeps of its own return, and `none / shipped` what the '
