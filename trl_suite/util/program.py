@@ -43,18 +43,23 @@ def _terminate(number: int, frame: object) -> None:
 
 @contextlib.contextmanager
 def signals_delayed() -> Iterator[None]:
-    """Delays SIGINT and SIGTERM to the end of the context, if this is the main thread.
-
-    A child process that is started inside ignores both until it is killed.
-    """
-    if not hasattr(signal, 'pthread_sigmask'):  # Windows
+    """Delays SIGINT and SIGTERM to the end of the context; only in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    # Blocking them would not suffice: another thread may receive them for the main thread.
+    received: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, frame: received.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for one in received:
+            signal.raise_signal(one)
 
 
 def begin_script() -> None:
