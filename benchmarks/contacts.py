@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import json
 import pathlib
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -309,9 +308,7 @@ def main() -> None:
     text = table(run(arguments.episodes, arguments.seed, arguments.json))
     print(text)
     if arguments.page is not None:
-        page = arguments.page.read_text()
-        pattern = re.compile(f'{re.escape(_MARK)}.*{re.escape(_END)}', re.DOTALL)
-        arguments.page.write_text(pattern.sub(lambda _: f'{_MARK}\n{text}\n{_END}', page))
+        files.replace_between(arguments.page, _MARK, _END, text)
 
 
 if __name__ == '__main__':

@@ -20,7 +20,6 @@ import json
 import os
 import pathlib
 import platform
-import re
 import shutil
 from typing import Any
 
@@ -141,9 +140,7 @@ def main() -> None:
     text = table(entries)
     print(text)
     if arguments.page is not None:
-        page = arguments.page.read_text()
-        pattern = re.compile(f'{re.escape(_MARK)}.*{re.escape(_END)}', re.DOTALL)
-        arguments.page.write_text(pattern.sub(lambda _: f'{_MARK}\n{text}\n{_END}', page))
+        files.replace_between(arguments.page, _MARK, _END, text)
 
 
 if __name__ == '__main__':

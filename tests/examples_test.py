@@ -16,6 +16,7 @@ from absl.testing import absltest, parameterized
 
 from trl_suite import characters, policies
 from trl_suite.registry import catalogue
+from trl_suite.util import files
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -185,6 +186,19 @@ class RandomizedTest(parameterized.TestCase):
         self.addCleanup(environments.close)
         policy.check(environments)
         self.assertEqual(policy.info['samples'], entry['shipped_at'])
+
+
+class PageTest(absltest.TestCase):
+    def test_text_between_marks(self):
+        page = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()), 'page.md')
+        page.write_text('before\n<a>\nold\n</a>\nafter\n')
+        files.replace_between(page, '<a>', '</a>', r'new \1')
+        self.assertEqual(page.read_text(), 'before\n<a>\nnew \\1\n</a>\nafter\n')
+        for text in ('', '<a>', '</a> <a>'):
+            page.write_text(text)
+            with self.assertRaisesRegex(ValueError, "page.md: expected the lines '<a>' and '</a>'"):
+                files.replace_between(page, '<a>', '</a>', 'new')
+            self.assertEqual(page.read_text(), text)
 
 
 class TrimTest(absltest.TestCase):

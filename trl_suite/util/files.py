@@ -154,6 +154,20 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
         part.unlink(missing_ok=True)
 
 
+def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
+    """Replaces the lines between two marks in a page.
+
+    Raises:
+      ValueError: the page does not have both marks, in this order.
+    """
+    before, found, rest = path.read_text(encoding='utf-8').partition(begin)
+    _, ended, after = rest.partition(end)
+    if not (found and ended):
+        raise ValueError(f'{path}: expected the lines {begin!r} and {end!r}')
+    with replacing(path) as part:
+        part.write_text(f'{before}{begin}\n{text}\n{end}{after}', encoding='utf-8')
+
+
 @contextlib.contextmanager
 def locked(path: pathlib.Path, what: str) -> Iterator[None]:
     """Holds a lock file that names this process; a process that ends in any way releases it.
