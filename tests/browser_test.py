@@ -20,7 +20,7 @@ from helpers import FolderTest
 
 from trl_suite import rendering, suite
 from trl_suite.arenas import scene
-from trl_suite.rendering import overlays, replays, web_scene
+from trl_suite.rendering import overlays, replays, web_meshes, web_scene, web_server
 from trl_suite.viewing import browser, session
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
@@ -131,7 +131,7 @@ class SceneTest(parameterized.TestCase):
         environment = suite.make(id_, {'random': 4})
         environment.reset()
         arena = environment.task.arena
-        mesh = web_scene._planar_ground(arena.ground)
+        mesh = web_meshes.planar_mesh(arena.ground)
         # Upper corners of the pieces that the mesh consists of, from its upper triangles.
         tops = mesh.triangles[mesh.face_normals[:, 2] > 0.1]
         first, last = tops[:, :, 0].min(1), tops[:, :, 0].max(1)
@@ -149,13 +149,13 @@ class SceneTest(parameterized.TestCase):
         environment.reset()
         model, data = environment.physics.model.ptr, environment.physics.data.ptr
         field = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[0])
-        mesh = web_scene._height_field(model, data, field)
+        mesh = web_meshes.height_field_mesh(model, data, field)
         # Everywhere but where fine and coarse cells meet; the window ends at 16 m.
         distance = np.abs(mesh.vertices[:, :2]).max(1)
-        border = np.abs(distance - web_scene.NEAR) < 1e-3
+        border = np.abs(distance - web_meshes.NEAR) < 1e-3
         x, y, z = mesh.vertices[~border & (distance < 15)].T
         heights = environment.task.arena.height(x[None], y[None])[0]
-        np.testing.assert_allclose(z, heights, atol=0.5 * web_scene.STEP + 1e-5)
+        np.testing.assert_allclose(z, heights, atol=0.5 * web_meshes.STEP + 1e-5)
         # Without overlaps: the area seen from above is that of the field.
         self.assertAlmostEqual(mesh.area_faces @ mesh.face_normals[:, 2], 32.0**2, delta=1e-2)
         for at in (x, y):
@@ -165,27 +165,27 @@ class SceneTest(parameterized.TestCase):
 
     def test_ports(self):
         """The next free one is taken; where there is none, no server waits for ever."""
-        first = web_scene.start_server('127.0.0.1', 0)
-        self.addCleanup(web_scene.stop_server, first)
-        second = web_scene.start_server('127.0.0.1', first.get_port())
-        self.addCleanup(web_scene.stop_server, second)
+        first = web_server.start_server('127.0.0.1', 0)
+        self.addCleanup(web_server.stop_server, first)
+        second = web_server.start_server('127.0.0.1', first.get_port())
+        self.addCleanup(web_server.stop_server, second)
         self.assertGreater(second.get_port(), first.get_port())
         for port in (65536, 10**8, -1, 2.5):
             with self.assertRaisesRegex(ValueError, f'port is {port}; expected a whole number'):
-                web_scene.start_server('127.0.0.1', port)
+                web_server.start_server('127.0.0.1', port)
         with socket.socket() as taken:
             taken.bind(('127.0.0.1', 65535))
             with self.assertRaisesRegex(OSError, 'in use'):
-                web_scene.start_server('127.0.0.1', 65535)
+                web_server.start_server('127.0.0.1', 65535)
         with self.assertRaises(OSError):
-            web_scene.start_server('nosuch.invalid', 8080)
+            web_server.start_server('nosuch.invalid', 8080)
 
     @parameterized.parameters((DOG, {'box', 'tube', 'sphere'}), (SOCCER, {'box', 'sphere', 'cone'}))
     def test_shapes_of_what_mujoco_draws(self, id_, expected):
         environment = suite.make(id_, {'random': 4})
         environment.reset()
-        server = web_scene.start_server('127.0.0.1', 0)
-        self.addCleanup(web_scene.stop_server, server)
+        server = web_server.start_server('127.0.0.1', 0)
+        self.addCleanup(web_server.stop_server, server)
         scene = web_scene.WebScene(server, environment)
         scene.update(overlays.of_task(environment.task))
         self.assertLessEqual(expected, {name.partition('_')[0] for name in scene._handles})
@@ -200,8 +200,8 @@ class SceneTest(parameterized.TestCase):
     def test_former_ground_stays_while_clients_load_the_new_one(self):
         environment = suite.make(HILLS, {'random': 4})
         environment.reset()
-        server = web_scene.start_server('127.0.0.1', 0)
-        self.addCleanup(web_scene.stop_server, server)
+        server = web_server.start_server('127.0.0.1', 0)
+        self.addCleanup(web_server.stop_server, server)
         shown, removed = {}, []
         scene = web_scene.WebScene(server, environment)
         add = server.scene.add_batched_meshes_trimesh
@@ -292,7 +292,7 @@ class OptionTest(absltest.TestCase):
 class BrowserTest(parameterized.TestCase):
     def test_a_refused_choice_is_taken_back(self):
         viewer = browser.Browser(SOCCER, port=0)
-        self.addCleanup(web_scene.stop_server, viewer._server)
+        self.addCleanup(web_server.stop_server, viewer._server)
         self.addCleanup(viewer._uploads.cleanup)
         preset, policy = viewer._panel._fitted[0], viewer._loaded.policy
         self.assertEqual(preset.value, 'plane')
@@ -313,7 +313,7 @@ class BrowserTest(parameterized.TestCase):
     def test_addresses(self, host, own, others):
         """0.0.0.0 is no address that a browser can open on another machine."""
         viewer = browser.Browser(DOG, 'zero', host=host, port=0)
-        self.addCleanup(web_scene.stop_server, viewer._server)
+        self.addCleanup(web_server.stop_server, viewer._server)
         self.addCleanup(viewer._uploads.cleanup)
         port = viewer._server.get_port()
         self.assertEqual(viewer.url, f'http://{own}:{port}')

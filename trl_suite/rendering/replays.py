@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trl_suite.rendering import overlays, web_scene
+from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.rendering.pictures import REPLAY_SUFFIXES
 from trl_suite.util.files import Path, check_path, replacing
 
@@ -55,13 +55,13 @@ class Replay:
         if not 0 < fps < np.inf:
             raise ValueError(f'fps is {fps}; expected a positive number')
         self._overlays = overlays.of_task(environment.task, ghost)
-        web_scene.load_viser()
+        web_server.load_viser()
         self._environment, self._seconds = environment, 1 / fps
         self._recording: Any = None
         self.html = ''
 
     def __enter__(self) -> Replay:
-        self._server = web_scene.start_server('127.0.0.1', 0)
+        self._server = web_server.start_server('127.0.0.1', 0)
         self._scene = web_scene.WebScene(self._server, self._environment)
         return self
 
@@ -94,7 +94,7 @@ class Replay:
                     with replacing(self._path) as part:
                         part.write_text(self.html, encoding='utf-8')
         finally:
-            web_scene.stop_server(self._server)
+            web_server.stop_server(self._server)
 
     def _repr_html_(self) -> str:
         return (

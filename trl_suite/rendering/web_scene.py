@@ -9,38 +9,28 @@ episode here, and the first body that moves need not be the character.
 from __future__ import annotations
 
 import collections
-import contextlib
-import errno
-import functools
-import socket
 from collections.abc import Iterable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import numpy as np
-import trimesh
 
 from trl_suite.arenas import PlanarArena
-from trl_suite.arenas.boxes import HALF_WIDTH
 from trl_suite.arenas.scene import PARKED
 from trl_suite.rendering.overlays import Overlay
-from trl_suite.terrain import SPACING
-from trl_suite.terrain.planar.windows import PlanarWindows
-from trl_suite.util import errors
-from trl_suite.util.libraries import library
+from trl_suite.rendering.web_meshes import (
+    TILE,
+    ground_meshes,
+    planar_mesh,
+    shape_mesh,
+    tiled,
+    to_bytes,
+)
 
-PORTS, LAST_PORT = 1000, 65535  # number of ports tried; the largest port
 LIFT = 0.1  # fraction of a height difference by which the view moves per frame
 ROOM = 2000  # largest number of geoms of overlays and decoration
-TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
-SHADES = (1.0, 0.88)  # brightness of the squares
-PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
-DEPTH = 1.0  # m; thickness of planar ground below its lowest point
-STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
-NEAR = 8.0  # m; distance from the centre of a height field within which all vertices are drawn
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
 HELD = 10  # frames for which former ground stays, while clients load the new one
-SECTIONS = 24  # number of faces around a cylinder or cone
 AMBIENT = 0.5  # intensity of ambient light; 1 would bleach pale ground
 GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
 SHAFT, TIP = 0.8, 0.2  # fractions of the length of an arrow
@@ -50,71 +40,6 @@ FIELD_OF_VIEW = 0.8  # rad
 FRONT = 4  # number of a skybox's face
 
 _ARROWS = (mujoco.mjtGeom.mjGEOM_ARROW, mujoco.mjtGeom.mjGEOM_ARROW1)
-
-
-def load_viser() -> Any:
-    """Imports viser.
-
-    Raises:
-      ImportError: the extra 'viewer' is not installed.
-    """
-    return library('viser', 'trl_suite[viewer]')
-
-
-def start_server(host: str, port: int) -> Any:
-    """Starts a viser server that prints nothing.
-
-    Args:
-      host: address to listen on; '127.0.0.1' accepts connections only from this machine.
-      port: the first port to try; 0 for any free port.
-
-    Raises:
-      ImportError: the extra 'viewer' is not installed.
-      OSError: nothing can listen on this address.
-      ValueError: no such port.
-    """
-    viser = load_viser()
-    errors.check_whole('port', port, 0, LAST_PORT)
-    port = _free_port(host, int(port))  # where there is none, viser would wait forever
-    with _silent_viser():
-        server = viser.ViserServer(host, port, verbose=False)
-    return server
-
-
-@contextlib.contextmanager
-def _silent_viser() -> Iterator[None]:
-    """Suppresses what viser prints by way of rich, to terminals and into the outputs of notebooks."""
-    console = library('rich', 'trl_suite[viewer]').get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
-
-
-def _free_port(host: str, port: int) -> int:
-    """Returns the first port that is free, at or after `port`; 0, any, if that is given.
-
-    Raises:
-      OSError: nothing can listen on this address.
-    """
-    last = min(port + PORTS - 1, LAST_PORT)
-    for number in range(port, last + 1):
-        try:
-            with socket.socket() as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind((host, number))
-                return number
-        except OSError as error:
-            if number == last or error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                raise
-    return port
-
-
-def stop_server(server: Any) -> None:
-    """Stops a viser server without a message."""
-    with _silent_viser():
-        server.stop()
 
 
 class WebScene:
@@ -211,14 +136,14 @@ class WebScene:
             )
             values = {
                 'batched_positions': positions + offset, 'batched_wxyzs': _quaternions(axes),
-                'batched_scales': sizes, 'batched_colors': _bytes(colours[:, :3] ** GAMMA),
+                'batched_scales': sizes, 'batched_colors': to_bytes(colours[:, :3] ** GAMMA),
             }  # fmt: skip
             if name.endswith('_clear'):
                 values['batched_opacities'] = colours[:, 3]
             if name in self._handles:
                 _assign(self._handles[name], visible=True, **values)
                 continue
-            mesh = _mesh(name.removesuffix('_clear'), self._model)
+            mesh = shape_mesh(name.removesuffix('_clear'), self._model)
             self._handles[name] = self._server.scene.add_batched_meshes_simple(
                 f'/{name}', mesh.vertices, mesh.faces, lod='off',
                 flat_shading=not name.startswith(('sphere', 'tube')), **values,
@@ -246,15 +171,15 @@ class WebScene:
             self._laid = [source.copy() for source in sources]
             lowest = self._focus[2] + FAR_BELOW
             if self._profile is None:
-                meshes = _ground(model, data, ground, middle, lowest)
+                meshes = ground_meshes(model, data, ground, middle, lowest)
             else:  # one surface instead of overlapping boxes
-                meshes = {int(model.geom_matid[ground][0]): _planar_ground(self._profile)}
+                meshes = {int(model.geom_matid[ground][0]): planar_mesh(self._profile)}
             self._former_ground.append((self._frame + HELD, self._ground_handles))
             self._builds += 1
             number = self._builds % (HELD + 2)  # no mesh that is still shown has this name
             self._ground_handles = [
                 self._server.scene.add_batched_meshes_trimesh(
-                    f'/ground_{material}_{number}', _tiled(mesh, self._colours[material]),
+                    f'/ground_{material}_{number}', tiled(mesh, self._colours[material]),
                     batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), lod='off', cast_shadow=False,
                     batched_positions=offset[None],
                 )
@@ -332,158 +257,6 @@ def _instances(
             yield f'mesh_{model.geom_dataid[geom.objid]}', position, axes, np.ones(3), colour
 
 
-@functools.cache
-def _shape(name: str) -> trimesh.Trimesh:
-    """Returns a mesh of size 1."""
-    if name == 'box':
-        return trimesh.creation.box(extents=(2, 2, 2))
-    if name == 'sphere':
-        return trimesh.creation.icosphere(subdivisions=2)
-    if name == 'cylinder':
-        return trimesh.creation.cylinder(1.0, 2.0, SECTIONS)
-    if name == 'cone':
-        return trimesh.creation.cone(1.0, 1.0, sections=SECTIONS)
-    return trimesh.creation.annulus(0.999, 1.0, 2.0, sections=SECTIONS)  # a tube
-
-
-def _mesh(name: str, model: Any) -> trimesh.Trimesh:
-    kind, _, number = name.partition('_')
-    if kind != 'mesh':
-        return _shape(name)
-    mesh = model.mesh(int(number))
-    vertices = slice(int(mesh.vertadr[0]), int(mesh.vertadr[0] + mesh.vertnum[0]))
-    faces = slice(int(mesh.faceadr[0]), int(mesh.faceadr[0] + mesh.facenum[0]))
-    return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
-
-
-def _ground(
-    model: Any, data: Any, is_ground: np.ndarray, middle: np.ndarray, lowest: float
-) -> dict[int, trimesh.Trimesh]:
-    """Returns the geoms of the ground in world coordinates, one mesh per material."""
-    parts: dict[int, list[trimesh.Trimesh]] = {}
-    for geom in np.flatnonzero(is_ground):
-        kind, place = model.geom_type[geom], data.geom_xpos[geom]
-        if place[2] < lowest:
-            continue
-        if kind == mujoco.mjtGeom.mjGEOM_PLANE:
-            corners = PLANE * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
-            corners = corners + np.array([middle[0], middle[1], place[2]])
-            mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-        elif kind == mujoco.mjtGeom.mjGEOM_HFIELD:
-            mesh = _height_field(model, data, int(geom))
-        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            axes = data.geom_xmat[geom].reshape(3, 3)
-            box = _shape('box')
-            # Faces share no corners, so that shading is flat.
-            corners = (box.vertices * model.geom_size[geom])[box.faces.ravel()] @ axes.T + place
-            mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-        else:
-            continue
-        parts.setdefault(int(model.geom_matid[geom]), []).append(mesh)
-    return {
-        material: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
-        for material, meshes in parts.items()
-    }
-
-
-def _planar_ground(ground: PlanarWindows) -> trimesh.Trimesh:
-    """Returns the window of a planar ground: its profile, as wide as the boxes of the physics."""
-    heights, vertical = ground.heights[0], ground.vertical[0]
-    x = (ground.start[0] + np.arange(len(heights))) * SPACING
-    # Vertical faces stand in the middle of their cells.
-    face = np.flatnonzero(vertical[1:])
-    middle = 0.5 * (x[face] + x[face + 1])
-    x, z = (
-        np.insert(line, np.repeat(face + 1, 2), np.stack(pair, 1).ravel())
-        for line, *pair in ((x, middle, middle), (heights, heights[face], heights[face + 1]))
-    )
-    slope = np.diff(z) / np.maximum(np.diff(x), 1e-9)
-    kept = np.concatenate([[True], np.abs(np.diff(slope)) > 1e-6, [True]])
-    x, z = x[kept], z[kept]
-    bottom = np.full(len(x), z.min() - DEPTH)
-    front, back = -HALF_WIDTH, HALF_WIDTH
-    strips = [((front, z), (back, z)), ((front, bottom), (front, z)), ((back, z), (back, bottom))]
-    corners = []
-    for (y_right, z_right), (y_left, z_left) in strips:
-        right = np.stack([x, np.full(len(x), y_right), z_right], 1)
-        left = np.stack([x, np.full(len(x), y_left), z_left], 1)
-        # Two triangles for each piece, which share no corners, so that shading is flat.
-        corners.append(
-            np.stack([right[:-1], right[1:], left[1:], right[:-1], left[1:], left[:-1]], 1)
-        )
-    vertices = np.concatenate(corners).reshape(-1, 3)
-    return trimesh.Trimesh(vertices, np.arange(len(vertices)).reshape(-1, 3), process=False)
-
-
-def _height_field(model: Any, data: Any, geom: int) -> trimesh.Trimesh:
-    """Returns the surface of a height field in world coordinates, to `STEP` in height.
-
-    Cells farther than `NEAR` from its middle are twice as wide.
-    """
-    field = int(model.geom_dataid[geom])
-    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-    start = int(model.hfield_adr[field])
-    x, y, z, _ = model.hfield_size[field]
-    heights = (z * model.hfield_data[start : start + rows * columns]).reshape(rows, columns)
-    # Fine cells are those between the first and last of these rows and columns.
-    top, left = _first_fine(rows, y), _first_fine(columns, x)
-    bottom, right = rows - 1 - top, columns - 1 - left
-    if top or left:  # no cracks: along the border fine cells are as straight as coarse ones
-        for line in (
-            heights[top, left : right + 1], heights[bottom, left : right + 1],
-            heights[top : bottom + 1, left], heights[top : bottom + 1, right],
-        ):  # fmt: skip
-            line[1:-1:2] = 0.5 * (line[:-2:2] + line[2::2])
-    across, along = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
-    local = np.stack([across.ravel(), along.ravel(), heights.ravel()], axis=1)
-    row, column = np.mgrid[0 : rows - 1, 0 : columns - 1]
-    fine = (row >= top) & (row < bottom) & (column >= left) & (column < right)
-    coarse = ~fine & (row % 2 == 0) & (column % 2 == 0)
-    faces = np.concatenate([_cells(fine, 1, columns), _cells(coarse, 2, columns)])
-    used, faces = np.unique(faces, return_inverse=True)
-    local, faces = local[used], faces.reshape(-1, 3)
-    turned = local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-    turned[:, 2] = STEP * np.round(turned[:, 2] / STEP)
-    return trimesh.Trimesh(turned.astype(np.float32), faces, process=False)
-
-
-def _first_fine(vertices: int, half: float) -> int:
-    """Returns from which vertex of a side, as far as to its mirror image, cells are fine.
-
-    Args:
-      vertices: number of vertices along the side.
-      half: half length of the side, m.
-    """
-    cells = vertices - 1
-    if cells % 2:  # cannot be paired
-        return 0
-    return 2 * int(max(0.0, np.ceil(0.5 * (0.5 * cells - NEAR * cells / (2 * half)))))
-
-
-def _cells(kept: np.ndarray, size: int, columns: int) -> np.ndarray:
-    """Returns two triangles for each cell of a grid, as indices of vertices."""
-    row, column = np.nonzero(kept)
-    corner = row * columns + column
-    right, above = corner + size, corner + size * columns
-    beyond = above + size
-    return np.concatenate(
-        [np.stack([corner, right, beyond], 1), np.stack([corner, beyond, above], 1)]
-    )
-
-
-def _tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
-    """Textures the ground with squares along the world's x and y; sides get stripes."""
-    from PIL import Image
-
-    shades = np.array(SHADES)[np.array([[0, 1], [1, 0]])]
-    pixels = np.kron(shades[..., None] * colour[:3], np.ones((32, 32, 1)))
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(_bytes(pixels)), metallicFactor=0.0, roughnessFactor=1.0
-    )
-    mesh.visual = trimesh.visual.TextureVisuals(mesh.vertices[:, :2] / (2 * TILE), material)
-    return mesh
-
-
 def _sky(model: Any) -> np.ndarray | None:
     """Returns the sky of a model as a picture, (h, 1, 3) uint8: its colours above the horizon.
 
@@ -520,7 +293,3 @@ def _quaternions(axes: np.ndarray) -> np.ndarray:
     for quaternion, matrix in zip(found, axes.reshape(-1, 9).astype(float), strict=True):
         mujoco.mju_mat2Quat(quaternion, matrix)
     return found.astype(np.float32)
-
-
-def _bytes(colours: np.ndarray) -> np.ndarray:
-    return (255 * np.clip(colours, 0, 1)).round().astype(np.uint8)

@@ -26,7 +26,7 @@ import mujoco
 from trl_suite import suite
 from trl_suite.environments import named_policies
 from trl_suite.registry.spec import EnvSpec
-from trl_suite.rendering import overlays, web_scene
+from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Loaded, Session
 
@@ -83,7 +83,7 @@ class Browser:
           ImportError: the extra 'viewer' is not installed.
           OSError: this machine cannot listen on the address.
         """
-        web_scene.load_viser()
+        web_server.load_viser()
         self.playing, self.speed, self.seed = True, 1.0, seed
         self._task_kwargs = {**(task_kwargs or {}), 'random': seed}
         self.shown = {PLAN: True, CLIP: False, SAMPLES: False, **dict.fromkeys(DECORATION, False)}
@@ -94,7 +94,7 @@ class Browser:
             spec, policy
         )  # before the server is started, as an error would leave it running
         self._uploads = tempfile.TemporaryDirectory(prefix='trl_suite_')
-        self._server = web_scene.start_server(host, port)
+        self._server = web_server.start_server(host, port)
         port = self._server.get_port()
         self.url = f'http://{HOST if host == EVERY else host}:{port}'
         self.other_url = f'http://{socket.gethostname()}:{port}' if host == EVERY else ''
@@ -122,7 +122,7 @@ class Browser:
         except KeyboardInterrupt:
             pass
         finally:
-            web_scene.stop_server(self._server)
+            web_server.stop_server(self._server)
             self._uploads.cleanup()
 
     def start(self) -> Browser:

@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import suite
 from trl_suite import terrain as terrains
-from trl_suite.rendering.web_scene import load_viser
+from trl_suite.rendering.web_server import load_viser
 from trl_suite.terrain.checks import LIMITS
 from trl_suite.viewing.session import PUSHES, Loaded, Session
 

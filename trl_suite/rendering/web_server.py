@@ -1,0 +1,79 @@
+"""The server of the package viser, which sends a scene to browsers."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+from trl_suite.util import errors
+from trl_suite.util.libraries import library
+
+PORTS, LAST_PORT = 1000, 65535  # number of ports tried; the largest port
+
+
+def load_viser() -> Any:
+    """Imports viser.
+
+    Raises:
+      ImportError: the extra 'viewer' is not installed.
+    """
+    return library('viser', 'trl_suite[viewer]')
+
+
+def start_server(host: str, port: int) -> Any:
+    """Starts a viser server that prints nothing.
+
+    Args:
+      host: address to listen on; '127.0.0.1' accepts connections only from this machine.
+      port: the first port to try; 0 for any free port.
+
+    Raises:
+      ImportError: the extra 'viewer' is not installed.
+      OSError: nothing can listen on this address.
+      ValueError: no such port.
+    """
+    viser = load_viser()
+    errors.check_whole('port', port, 0, LAST_PORT)
+    port = _free_port(host, int(port))  # where there is none, viser would wait forever
+    with _silent_viser():
+        server = viser.ViserServer(host, port, verbose=False)
+    return server
+
+
+def stop_server(server: Any) -> None:
+    """Stops a viser server without a message."""
+    with _silent_viser():
+        server.stop()
+
+
+@contextlib.contextmanager
+def _silent_viser() -> Iterator[None]:
+    """Suppresses what viser prints by way of rich, to terminals and into the outputs of notebooks."""
+    console = library('rich', 'trl_suite[viewer]').get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+def _free_port(host: str, port: int) -> int:
+    """Returns the first port that is free, at or after `port`; 0, any, if that is given.
+
+    Raises:
+      OSError: nothing can listen on this address.
+    """
+    last = min(port + PORTS - 1, LAST_PORT)
+    for number in range(port, last + 1):
+        try:
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((host, number))
+                return number
+        except OSError as error:
+            if number == last or error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise
+    return port
