@@ -1,10 +1,4 @@
-"""Users' own motions for a character: reading, retargeting by joint names, cutting to a cycle.
-
-    from trl_suite import retargeting, suite
-
-    motion = retargeting.read('walk.bvh', 'biped2d_full')
-    clip = retargeting.cycle(retargeting.retarget(motion, 'biped2d_full'))
-    environment = suite.build('biped2d_full', clip=clip)
+"""Transfer of a motion to a character by joint names.
 
 Links get the directions of the motion's bones; rotations that a joint of the character cannot
 perform are discarded (a hinge keeps the component about its axis). Violated limits, sliding feet
@@ -13,31 +7,17 @@ and ground penetration are not corrected: `trl_suite.retargeting.clip_check` rep
 
 from __future__ import annotations
 
-import dataclasses
-import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from trl_suite import characters
-from trl_suite.motion import Capture, Clip, quaternion, readers
-from trl_suite.motion import clip as clips
-from trl_suite.motion.capture import read_amc, read_bvh
+from trl_suite.characters import CharacterSpec
+from trl_suite.motion import Capture, Clip, quaternion
 from trl_suite.rendering.kinematic_viewer import KinematicViewer
 from trl_suite.util import errors
-from trl_suite.util.files import Path, existing, read_json
 
-FORMATS = {
-    'bvh': 'BVH (begins with HIERARCHY)', 'amc': 'Acclaim (.amc)', 'json': 'JSON (TerrainRL, DeepMimic)',
-    'npz': 'a clip (.npz)',
-}  # fmt: skip
-HEAD = 65536  # bytes at the beginning of a file from which its format is recognised
 STRAIGHT = 0.2  # m; a motion with a larger displacement is rotated to +x by it, not by its heading
 SINKING = 0.05  # fraction of frames that may penetrate the ground; captured heights are inexact
-CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
-CYCLE_FRAMES = 300  # largest number of frames in the search for a cycle
-RATE_TIME = 0.1  # s; weight of a difference of velocities against one of poses
 _LATERAL = np.array([0.0, -1.0, 0.0])  # axis of pitch, and of hinges in files of the original
 _VERTICAL = np.array([0.0, 0.0, 1.0])
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -58,76 +38,6 @@ NAMES: dict[str, tuple[str, ...]] = {
     '{side}_forearm': ('{side}_elbow', '{s}radius', '{side}forearm', '{side}elbow'),
     '{side}_wrist': ('{side}_wrist', '{s}hand', '{side}hand', '{side}wrist'),
 }  # fmt: skip
-
-CharacterLike = str | characters.CharacterSpec
-
-
-def read(
-    path: Path, character: CharacterLike, skeleton: Path | None = None, **options: Any
-) -> Clip | Capture:
-    """Reads a motion file; its format is recognised from its content, not from its name.
-
-    Args:
-      path: BVH; Acclaim (.amc, CMU); JSON of TerrainRL, with the character's joints in its order, or
-        of DeepMimic, with the joints of its humanoid or its dog; or a file of `Clip.save` (.npz).
-      character: the character of a TerrainRL file; other formats ignore it.
-      skeleton: the .asf file that belongs to an Acclaim file; None for other formats.
-      **options: of `motion.read_bvh` or `motion.read_amc`.
-
-    Raises:
-      ValueError: another format, a malformed file, or options of another format.
-      FileNotFoundError: there is no such file.
-      ImportError: for BVH, if the extra 'clips' is not installed.
-    """
-    path = existing(path)
-    found = _format(path)
-    if found == 'amc' and skeleton is None:
-        raise ValueError(f'{path}: an .amc file needs its skeleton, an .asf file')
-    if found != 'amc' and skeleton is not None:
-        raise ValueError(
-            f'{path}: a skeleton ({skeleton}) was given, but the file is not an .amc file'
-        )
-    if found == 'bvh':
-        return read_bvh(path, **options)
-    if found == 'amc':
-        assert skeleton is not None
-        return read_amc(path, skeleton, **options)
-    if options:
-        raise ValueError(f'{path}: {", ".join(options)}: for .bvh and .amc only')
-    if found == 'npz':
-        return clips.load(path)
-    content = read_json(path)
-    # The two formats differ in `Loop`.
-    if isinstance(content, dict) and isinstance(content.get('Loop'), str):
-        return readers.read_deepmimic(path)
-    layout = KinematicViewer(character).layout
-    return readers.read_terrainrl(path, layout.joints, layout.sizes, layout.root)
-
-
-def _format(path: pathlib.Path) -> str:
-    """Returns which of `FORMATS` a file has."""
-    with path.open('rb') as file:
-        head = file.read(HEAD)
-    if head.startswith(b'PK'):
-        return 'npz'
-    text = head.decode('utf-8-sig', errors='replace').lstrip()
-    if text.startswith('{'):
-        return 'json'
-    if text.upper().startswith('HIERARCHY'):
-        return 'bvh'
-    lines = [line.split('#')[0].strip() for line in text.splitlines()]
-    words = [line.split() for line in lines if line]
-    if any(line[0].lower() in (':bonedata', ':hierarchy', ':root') for line in words):
-        raise ValueError(
-            f'{path}: a skeleton (.asf); expected the motion (.amc) that belongs to it'
-        )
-    # After sections, the first frame begins with its number.
-    first = next((line for line in words if not line[0].startswith(':')), [''])
-    if len(first) == 1 and first[0].isdigit():
-        return 'amc'
-    known = '; '.join(FORMATS.values())
-    what = 'is empty' if not text else 'not a motion file'
-    raise ValueError(f'{path}: {what}; expected one of: {known}')
 
 
 def guess_map(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
@@ -184,7 +94,7 @@ def _joints(motion: Clip | Capture) -> tuple[str, ...]:
 
 def retarget(
     motion: Clip | Capture,
-    character: CharacterLike,
+    character: str | CharacterSpec,
     joint_map: Mapping[str, str] | None = None,
     scale: float | None = None,
 ) -> Clip:
@@ -382,75 +292,3 @@ def _lowest(figure: KinematicViewer, poses: np.ndarray) -> np.ndarray:
         figure.put(pose)
         heights[i] = figure.corners()[..., 2].min()
     return heights
-
-
-def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> Clip:
-    """Cuts one cycle from a clip, so that it can loop.
-
-    The difference between its end and its start is distributed evenly over the cycle, except for
-    the horizontal displacement, which every cycle repeats. Give both times, or none: then the two
-    times with the most similar poses and velocities are chosen, 0.3 to 2.5 s apart.
-
-    Args:
-      clip: a clip that does not loop.
-      start: start of the cycle, s.
-      end: end of the cycle, s.
-
-    Raises:
-      ValueError: times that are not in the clip, one without the other, or a clip that is too short.
-    """
-    if (start is None) is not (end is None):
-        raise ValueError('start and end: expected both or none')
-    if start is None or end is None:
-        start, end = _alike(clip)
-    if not 0 <= start < end <= clip.duration:
-        raise ValueError(
-            f'start and end are {start} and {end}; expected 0 <= start < end <= {clip.duration:.4g} s'
-        )
-    step = float(np.median(np.diff(clip.times)))
-    share = np.linspace(0, 1, max(3, round((end - start) / step) + 1))
-    poses = clip.pose(start + share * (end - start))
-    layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
-    gap = layout.change(poses[-1], poses[0])
-    gap[:flat] = 0.0
-    poses = advanced(clip, poses, share[:, None] * gap)
-    poses[:, :flat] -= poses[0, :flat].copy()
-    return dataclasses.replace(clip, times=share * (end - start), poses=poses, loop=True)
-
-
-def advanced(clip: Clip, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Returns poses (n, columns) after changes (n, rates), in a clip's layout."""
-    layout = clip.layout
-    result = poses.copy()
-    quaternions = [column for q, _ in layout.rotations for column in range(q, q + 4)]
-    turns = [column for _, v in layout.rotations for column in range(v, v + 3)]
-    result[:, np.setdiff1d(np.arange(layout.columns), quaternions)] += change[
-        :, np.setdiff1d(np.arange(layout.rates), turns)
-    ]
-    for q, v in layout.rotations:
-        turn = quaternion.from_vector(change[:, v : v + 3])
-        result[:, q : q + 4] = quaternion.multiply(poses[:, q : q + 4], turn)
-    return result
-
-
-def _alike(clip: Clip) -> tuple[float, float]:
-    """Returns the two times of a clip with the most similar poses and velocities, s."""
-    if clip.duration < CYCLE[0]:
-        raise ValueError(
-            f'clip {clip.name!r} lasts {clip.duration:.3g} s; expected at least {CYCLE[0]} s, or the '
-            'times of the cycle'
-        )
-    count = min(CYCLE_FRAMES, max(len(clip.times), 30))
-    times = np.linspace(0, clip.duration, count)
-    poses, rates = clip.pose(times), RATE_TIME * clip.velocity(times)
-    flat = 1 if clip.root == 'planar' else 2
-    best = (np.inf, 0.0, 0.0)
-    for i, time in enumerate(times):
-        later = np.flatnonzero((times >= time + CYCLE[0]) & (times <= time + CYCLE[1]))
-        if not len(later):
-            break
-        change = clip.layout.change(np.broadcast_to(poses[i], poses[later].shape), poses[later])
-        difference = (change[:, flat:] ** 2).sum(1) + ((rates[later] - rates[i]) ** 2).sum(1)
-        j = int(difference.argmin())
-        best = min(best, (float(difference[j]), time, times[later[j]]))
-    return float(best[1]), float(best[2])

@@ -1,0 +1,85 @@
+"""Cutting one cycle from a clip, so that it can loop."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from trl_suite.motion import Clip, quaternion
+
+CYCLE = (0.3, 2.5)  # s; shortest and longest cycle in the search
+CYCLE_FRAMES = 300  # largest number of frames in the search for a cycle
+RATE_TIME = 0.1  # s; weight of a difference of velocities against one of poses
+
+
+def cycle(clip: Clip, start: float | None = None, end: float | None = None) -> Clip:
+    """Cuts one cycle from a clip, so that it can loop.
+
+    The difference between its end and its start is distributed evenly over the cycle, except for
+    the horizontal displacement, which every cycle repeats. Give both times, or none: then the two
+    times with the most similar poses and velocities are chosen, 0.3 to 2.5 s apart.
+
+    Args:
+      clip: a clip that does not loop.
+      start: start of the cycle, s.
+      end: end of the cycle, s.
+
+    Raises:
+      ValueError: times that are not in the clip, one without the other, or a clip that is too short.
+    """
+    if (start is None) is not (end is None):
+        raise ValueError('start and end: expected both or none')
+    if start is None or end is None:
+        start, end = _alike(clip)
+    if not 0 <= start < end <= clip.duration:
+        raise ValueError(
+            f'start and end are {start} and {end}; expected 0 <= start < end <= {clip.duration:.4g} s'
+        )
+    step = float(np.median(np.diff(clip.times)))
+    share = np.linspace(0, 1, max(3, round((end - start) / step) + 1))
+    poses = clip.pose(start + share * (end - start))
+    layout, flat = clip.layout, 1 if clip.root == 'planar' else 2
+    gap = layout.change(poses[-1], poses[0])
+    gap[:flat] = 0.0
+    poses = _advanced(clip, poses, share[:, None] * gap)
+    poses[:, :flat] -= poses[0, :flat].copy()
+    return dataclasses.replace(clip, times=share * (end - start), poses=poses, loop=True)
+
+
+def _advanced(clip: Clip, poses: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Returns poses (n, columns) after changes (n, rates), in a clip's layout."""
+    layout = clip.layout
+    result = poses.copy()
+    quaternions = [column for q, _ in layout.rotations for column in range(q, q + 4)]
+    turns = [column for _, v in layout.rotations for column in range(v, v + 3)]
+    result[:, np.setdiff1d(np.arange(layout.columns), quaternions)] += change[
+        :, np.setdiff1d(np.arange(layout.rates), turns)
+    ]
+    for q, v in layout.rotations:
+        turn = quaternion.from_vector(change[:, v : v + 3])
+        result[:, q : q + 4] = quaternion.multiply(poses[:, q : q + 4], turn)
+    return result
+
+
+def _alike(clip: Clip) -> tuple[float, float]:
+    """Returns the two times of a clip with the most similar poses and velocities, s."""
+    if clip.duration < CYCLE[0]:
+        raise ValueError(
+            f'clip {clip.name!r} lasts {clip.duration:.3g} s; expected at least {CYCLE[0]} s, or the '
+            'times of the cycle'
+        )
+    count = min(CYCLE_FRAMES, max(len(clip.times), 30))
+    times = np.linspace(0, clip.duration, count)
+    poses, rates = clip.pose(times), RATE_TIME * clip.velocity(times)
+    flat = 1 if clip.root == 'planar' else 2
+    best = (np.inf, 0.0, 0.0)
+    for i, time in enumerate(times):
+        later = np.flatnonzero((times >= time + CYCLE[0]) & (times <= time + CYCLE[1]))
+        if not len(later):
+            break
+        change = clip.layout.change(np.broadcast_to(poses[i], poses[later].shape), poses[later])
+        difference = (change[:, flat:] ** 2).sum(1) + ((rates[later] - rates[i]) ** 2).sum(1)
+        j = int(difference.argmin())
+        best = min(best, (float(difference[j]), time, times[later[j]]))
+    return float(best[1]), float(best[2])
