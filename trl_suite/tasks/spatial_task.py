@@ -13,9 +13,7 @@ from trl_suite import actuation
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.spatial import (
-    SpatialFigure,
-)
+from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.kinematics.spatial_reference import mean_targets
 from trl_suite.motion import Clip, Steps
 from trl_suite.policies.mirror import Mirror

@@ -20,10 +20,8 @@ from trl_suite.characters import Character
 from trl_suite.controllers import CONTROL_TIMESTEP, Gait, dynamics, load
 from trl_suite.controllers.parameters import BASE_ACTIONS
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import (
-    PlanarBody,
-    PlanarFigure,
-)
+from trl_suite.kinematics.planar import PlanarBody
+from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
 from trl_suite.tasks.gait.rules import (
     _GROUND,

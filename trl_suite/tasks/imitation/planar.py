@@ -20,9 +20,7 @@ from trl_suite.actuation.muscles import PLAIN, Muscle
 from trl_suite.arenas import PlanarArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import (
-    PlanarFigure,
-)
+from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import Reference
 from trl_suite.motion import Clip
 from trl_suite.tasks.components import rewards

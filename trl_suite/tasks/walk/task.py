@@ -13,13 +13,9 @@ from trl_suite import actuation
 from trl_suite.arenas import PlanarArena, SpatialArena
 from trl_suite.characters import Character
 from trl_suite.engine import World
-from trl_suite.kinematics.planar import (
-    PlanarFigure,
-)
+from trl_suite.kinematics.planar_figure import PlanarFigure
 from trl_suite.kinematics.planar_reference import link_extents
-from trl_suite.kinematics.spatial import (
-    SpatialFigure,
-)
+from trl_suite.kinematics.spatial_figure import SpatialFigure
 from trl_suite.motion import quaternion
 from trl_suite.tasks import parts
 from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP
