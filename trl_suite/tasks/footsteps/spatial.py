@@ -22,12 +22,12 @@ from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.comparison import (
     comparison,
 )
+from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.components.footstep_plan import (
     CONTACT_SIZE,
     LEFT,
     PLAN_SIZE,
     RIGHT,
-    SIDE,
     check_two_feet,
     footstep_plan,
     plan_markers,
@@ -37,18 +37,14 @@ from trl_suite.tasks.components.goals import GOAL_COLOUR, flag
 from trl_suite.tasks.components.plans import (
     FOOTSTEP_SCALE,
     MAX_LANDING_ERROR,
-    ROOT_TURN_LIMIT,
     Plans,
     Pushes,
     options,
 )
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP, act_all
+from trl_suite.tasks.footsteps.spatial_plans import Planner
 from trl_suite.tasks.footsteps.spatial_rules import (
-    GOAL_REACHED,
-    HIDDEN,
-    NEAR_GOAL,
-    TYPICAL_POSES,
     FootstepRules,
     FootstepState,
     finish_all,
@@ -59,6 +55,8 @@ from trl_suite.tasks.spatial_task import MirroredConfig, SpatialTask
 from trl_suite.tasks.task import Marker, consecutive
 from trl_suite.util.compiled import packed
 from trl_suite.util.options import option
+
+HIDDEN = ('contact', 'plan')  # blocks that the option hidden_plan removes
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -180,7 +178,7 @@ class SpatialFootsteps(SpatialTask):
         )
 
     def _typical_poses(self) -> np.ndarray:
-        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+        return typical_poses(self.steps, self._first)
 
     def bind(self, world: World) -> None:
         common, n = self._bind_rules(world), world.n
@@ -195,6 +193,10 @@ class SpatialFootsteps(SpatialTask):
         self.info_arrays |= {
             name: getattr(self.plan, name) for name in ('landed', 'landing_error', 'heading_error')
         }
+        self._planner = Planner(
+            self.plans, self.arena, self.plan, self.state, self.clock, self._random,
+            goals=self.goal_given, grace_steps=self._grace_steps,
+        )  # fmt: skip
         starts = {name: part.start for name, part in self._full.items()}
         rules = FootstepRules(
             common, comparison(self.character, self.reference, self.TERMS), self.plan, self.state,
@@ -233,7 +235,7 @@ class SpatialFootsteps(SpatialTask):
         twice = 2 * self.phase
         return twice - np.floor(twice)
 
-    # Episodes and plans.
+    # Episodes.
 
     def _start(
         self, env_ids: np.ndarray, random_states: Sequence[np.random.RandomState]
@@ -247,81 +249,15 @@ class SpatialFootsteps(SpatialTask):
         plan.landing_error[env_ids] = plan.heading_error[env_ids] = 0.0
         plan.landed[env_ids] = state.missed[env_ids] = False
         state.push_end[env_ids] = state.excused[env_ids] = 0
-        aside, sizes = np.zeros(len(env_ids)), np.zeros((len(env_ids), 2, 2))
-        for k, i in enumerate(env_ids.tolist()):
-            if self.pushes:
+        if self.pushes:
+            for i in env_ids.tolist():
                 state.push_begin[i] = self._steps_within(i, self.pushes.interval)
-            self._redraw_step(i, always=True)
-            aside[k] = state.width[i]
-            if self.goal_given:
-                place = self.travel.origin[i, :2]
-                state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
-            sizes[k] = self._next_size(i), self._next_size(i)
-        places, angles = self.travel.origin[env_ids, :2], self.travel.origin[env_ids, 2]
-        plan.heading[env_ids] = angles
-        stance = plan.stance[env_ids]
-        anchors = measurement.feet[env_ids, stance, :2]
-        if self.goal_given:
-            self._head_for_goals(env_ids, measurement.root[env_ids, :2])
-        else:
-            # The feet land on both sides of a line through the start, at half a width from it.
-            line = quaternion.turned(anchors - places, -angles)
-            line[:, 1] = 0.5 * SIDE[stance] * aside
-            anchors = places + quaternion.turned(line, angles)
-        for which, foot in enumerate((1 - stance, stance)):
-            anchors = self._lay(env_ids, which, foot, anchors, sizes[:, which])
+        self._planner.begin(env_ids, self.travel.origin[env_ids], measurement)
         self._put_reference(env_ids, measurement, np.full(len(env_ids), self._first))
         if self.hidden_plan:
             for i in env_ids.tolist():
                 place = self.travel.origin[i, :2]
                 state.goal[i] = self.arena.goal(i, self._random[i], place, 'near')
-
-    def _redraw_step(self, i: int, always: bool = False) -> None:
-        """Redraws length and width of steps, always or with probability `change`."""
-        plans, random = self.plans, self._random[i]
-        if always or random.uniform() < plans.change:
-            self.state.length[i] = random.uniform(*plans.length)
-            self.state.width[i] = random.uniform(*plans.width)
-
-    def _next_size(self, i: int) -> tuple[float, float]:
-        """Returns length and width of the next step, m; redraws them with probability `change`."""
-        self._redraw_step(i)
-        return float(self.state.length[i]), float(self.state.width[i])
-
-    def _lay(
-        self,
-        env_ids: np.ndarray,
-        which: int,
-        feet: np.ndarray,
-        places: np.ndarray,
-        sizes: np.ndarray,
-    ) -> np.ndarray:
-        """Writes one landing place to each plan: a step from the position of the other foot.
-
-        Args:
-          env_ids: numbers of simulations, (m,).
-          which: which of the plan's two landing places, 0 or 1.
-          feet: the feet that step, (m,).
-          places: positions of the other feet, (m, 2) m.
-          sizes: lengths and widths of the steps, (m, 2) m.
-
-        Returns:
-          The landing places, (m, 2) m.
-        """
-        steps = sizes.copy()
-        steps[:, 1] *= SIDE[feet]
-        places = places + quaternion.turned(steps, self.heading[env_ids])
-        self.landing[env_ids, which, :2] = places
-        heights = self.arena.height(places[:, :1], places[:, 1:], env_ids)
-        self.landing[env_ids, which, 2] = heights[:, 0]
-        return places
-
-    def _head_for_goals(self, env_ids: np.ndarray, places: np.ndarray) -> None:
-        """Sets planned headings from places (m, 2) to the goals, except within NEAR_GOAL."""
-        displacement = self.goal[env_ids, :2] - places
-        headings = np.arctan2(displacement[:, 1], displacement[:, 0])
-        far = np.hypot(displacement[:, 0], displacement[:, 1]) > NEAR_GOAL
-        self.heading[env_ids[far]] = headings[far]
 
     def _steps_within(self, i: int, seconds: tuple[float, float]) -> int:
         return round(self._random[i].uniform(*seconds) / self.control_timestep)
@@ -351,52 +287,12 @@ class SpatialFootsteps(SpatialTask):
         if land_all(env_ids, self._pack):
             switched = env_ids[self.plan.landed[env_ids]]
             measurement = self.figure.measurement
-            self._replan(switched, measurement)
+            self._planner.replan(switched, measurement)
             self._put_reference(switched, measurement, self._choose(switched, measurement))
         finish_all(env_ids, self._pack)
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
-
-    def _replan(self, env_ids: np.ndarray, measurement: SpatialMeasurement) -> None:
-        """Updates the plans of some simulations at a switch of stance."""
-        plans, count = self.plans, len(env_ids)
-        by_root, turns, sizes = np.zeros(count, bool), np.zeros(count), np.zeros((count, 2, 2))
-        for k, i in enumerate(env_ids.tolist()):
-            random = self._random[i]
-            if plans.from_root and random.uniform() < plans.from_root:
-                by_root[k] = True
-                turns[k] = random.normal(0, plans.root_turn)
-                for which in (0, 1):
-                    ahead = random.uniform(*plans.root_length)
-                    sizes[k, which] = ahead, random.uniform(*plans.root_width)
-                continue
-            if self.goal_given:
-                root = measurement.root[i, :2]
-                if np.hypot(*(root - self.goal[i, :2])) < GOAL_REACHED:
-                    self.goal[i] = self.arena.goal(i, random, root, 'near')
-            elif plans.sharp and random.uniform() < plans.sharp:
-                turns[k] = random.uniform(-np.pi, np.pi)
-                self.state.excused[i] = self.clock.steps[i] + self._grace_steps
-            elif plans.turn:
-                turns[k] = random.normal(0, plans.turn)
-            sizes[k, 1] = self._next_size(i)
-        stance = self.stance[env_ids]
-        on = ~by_root
-        if on.any():
-            going = env_ids[on]
-            if self.goal_given:
-                self._head_for_goals(going, self.landing[going, :, :2].mean(1))
-            self.heading[going] += turns[on]
-            self.landing[going, 0] = self.landing[going, 1]
-            self._lay(going, 1, stance[on], self.landing[going, 0, :2], sizes[on, 1])
-        if by_root.any():
-            going, foot = env_ids[by_root], stance[by_root]
-            off = np.clip(turns[by_root], -ROOT_TURN_LIMIT, ROOT_TURN_LIMIT)
-            self.heading[going] = measurement.heading[going] + off
-            places = measurement.feet[going, foot, :2]
-            for which, feet in enumerate((1 - foot, foot)):
-                places = self._lay(going, which, feet, places, sizes[by_root, which])
 
     def _choose(self, env_ids: np.ndarray, measurement: SpatialMeasurement) -> np.ndarray:
         """Returns the steps of the library that are nearest to the plans of some simulations."""
@@ -457,19 +353,3 @@ class SpatialFootsteps(SpatialTask):
         env_ids = np.array([env_id])
         pose[2] += self.arena.height(pose[None, :1], pose[None, 1:2], env_ids)[0, 0]
         return pose
-
-
-def straight_step(steps: Steps, length: float) -> int:
-    """Returns the straight step of a library whose length is nearest to `length`, m."""
-    straight = np.abs(steps.labels[:, 2]) + np.abs(steps.labels - steps.previous).sum(1)
-    return int(np.lexsort((np.abs(steps.labels[:, 0] - length), straight))[0])
-
-
-def pose_of_step(steps: Steps, step: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses with x = y = 0, and rates, at phases (m,) of a step and its mirror image."""
-    times = (2 * phase - np.floor(2 * phase)) * steps.duration
-    poses, rates = (
-        part(step, times, phase >= 0.5) for part in (steps.pose, steps.velocity)
-    )  # fmt: skip
-    poses[:, :2] = 0.0
-    return poses, rates

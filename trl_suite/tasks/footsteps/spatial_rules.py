@@ -34,11 +34,6 @@ from trl_suite.tasks.components.spatial_rules import (
 from trl_suite.tasks.task import conclude
 from trl_suite.util.compiled import compiled, compiled_loop
 
-NEAR_GOAL = 0.1  # m; a nearer goal does not change the planned heading
-GOAL_REACHED = 1.0  # m; a nearer goal is redrawn
-TYPICAL_POSES = 31  # poses of a step; their mean is action 0 of position control
-HIDDEN = ('contact', 'plan')  # blocks that the option hidden_plan removes
-
 POSE, VELOCITY, END_EFFECTOR, COM, ROOT, HEADING = range(len(rewards.STEP_TERMS))
 
 

@@ -29,6 +29,7 @@ from trl_suite.tasks.components.ball import (
     goal_disc,
     no_ball,
 )
+from trl_suite.tasks.components.first_step import pose_of_step, straight_step, typical_poses
 from trl_suite.tasks.components.footstep_plan import (
     CONTACT_SIZE,
     PLAN_SIZE,
@@ -46,8 +47,6 @@ from trl_suite.tasks.components.spatial_rules import (
     act_all,
 )
 from trl_suite.tasks.components.trace import trace, trace_markers
-from trl_suite.tasks.footsteps.spatial import pose_of_step, straight_step
-from trl_suite.tasks.footsteps.spatial_rules import TYPICAL_POSES
 from trl_suite.tasks.navigation.hierarchical_rules import (
     CONTROLLER,
     FARTHEST_GOAL,
@@ -240,7 +239,7 @@ class HierarchicalNavigation(SpatialTask):
         self.mirror = self._plan_mirror() if mirrors else None
 
     def _typical_poses(self) -> np.ndarray:
-        return self.steps.pose(self._first, np.linspace(0, self.steps.duration, TYPICAL_POSES))
+        return typical_poses(self.steps, self._first)
 
     def _extra_mirror(self, name: str) -> reflection3d.Reflection:
         return plan_mirror(name)
