@@ -12,14 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from trl_suite.actuation.action_map import ActionMap
 from trl_suite.arenas import SpatialArena
 from trl_suite.characters import Character
 from trl_suite.controllers import footstep_controller
 from trl_suite.engine import World
 from trl_suite.motion import Steps
-from trl_suite.policies.mirror import Mirror
-from trl_suite.tasks.components import reflection as reflection3d
 from trl_suite.tasks.components.ball import (
     AT_GOAL,
     GOAL_AWAY,
@@ -40,6 +37,7 @@ from trl_suite.tasks.components.footstep_plan import (
 )
 from trl_suite.tasks.components.goals import flag, goals, set_goal
 from trl_suite.tasks.components.plans import Plans, span
+from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import (
     CONTROL_TIMESTEP,
     SUBSTEPS,
@@ -52,14 +50,8 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     FARTHEST_GOAL,
     GOAL_REACHED,
     GOAL_SIGNS,
-    INTERFACES,
     MAPS,
     NAVIGATION_TERMS,
-    PLAN_NAMES,
-    PLAN_OFFSET,
-    PLAN_SCALE,
-    PLAN_SIGNS,
-    STEP_LENGTH,
     PlanningRules,
     PlanningState,
     begin_steps,
@@ -69,6 +61,13 @@ from trl_suite.tasks.navigation.hierarchical_rules import (
     score_all,
     show_plans,
     take_all,
+)
+from trl_suite.tasks.navigation.plan_actions import (
+    INTERFACES,
+    PLAN_NAMES,
+    STEP_LENGTH,
+    plan_action_map,
+    planning_mirror,
 )
 from trl_suite.tasks.spatial_task import SpatialConfig, SpatialTask, maps
 from trl_suite.tasks.task import (
@@ -200,7 +199,7 @@ class HierarchicalNavigation(SpatialTask):
         self.steps, self.period, self.ball = steps, 2 * steps.duration, ball
         self._first = straight_step(steps, float(np.mean(Plans().length)))
         self.TERMS = SOCCER_TERMS if ball else NAVIGATION_TERMS
-        self._goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
+        goal_signs = {'goal': GOAL_SIGNS, **({'ball': MIRRORED} if ball else {})}
         super().__init__(
             character, arena, steps, SpatialConfig(substeps=config.substeps),
             extras={'contact': CONTACT_SIZE, 'plan': PLAN_SIZE},
@@ -216,49 +215,27 @@ class HierarchicalNavigation(SpatialTask):
         )
         self._frame = config.substeps
         low = max(part.stop for part in self._full.values())
-        action_offset, action_scale, names = step_length * PLAN_OFFSET, PLAN_SCALE, PLAN_NAMES
-        if interface == 'frame':
-            joints = self.joint_map
-            names = (*names, *joints.names)
-            action_offset = np.concatenate([action_offset, np.zeros(len(joints))])
-            action_scale = np.concatenate([action_scale, np.ones(len(joints))])
-        else:
+        if interface == 'plan':
             self.set_timesteps(steps.duration, CONTROL_TIMESTEP / config.substeps)
-        self.action_map = ActionMap(
-            names, 'footstep plan', 'm (turn: rad)', action_offset, action_scale
+        self.action_map = plan_action_map(
+            step_length, self.joint_map if interface == 'frame' else None
         )
         pose = {name: size for name, size in self.figure.blocks.items() if name != 'terrain'}
         self.blocks = consecutive({
             'terrain': SAMPLES**2 if 'height' in config.terrain_observation else 0,
             'surface': 2 * SAMPLES**2 if 'velocity' in config.terrain_observation else 0,
             **pose,
-            **{name: len(signs) for name, signs in self._goal_signs.items()},
+            **{name: len(signs) for name, signs in goal_signs.items()},
             'low_level': low if interface == 'frame' else 0,
         })  # fmt: skip
         mirrors = interface == 'plan' and self.character.spec.mirror
-        self.mirror = self._plan_mirror() if mirrors else None
+        self.mirror = planning_mirror(character, self.blocks, goal_signs) if mirrors else None
 
     def _typical_poses(self) -> np.ndarray:
         return typical_poses(self.steps, self._first)
 
-    def _extra_mirror(self, name: str) -> reflection3d.Reflection:
+    def _extra_mirror(self, name: str) -> Reflection:
         return plan_mirror(name)
-
-    def _plan_mirror(self) -> Mirror:
-        """Returns the reflection of observations and plans."""
-        parts = reflection3d.body(self.character)
-        lines, _ = parts['terrain']
-        ahead = np.ones(len(lines))
-        parts['surface'] = np.append(lines, len(lines) + lines), np.append(ahead, -ahead)
-        for name, signs in self._goal_signs.items():
-            parts[name] = np.arange(len(signs)), np.array(signs)
-        index, sign = reflection3d.joined(self.blocks, parts)
-        links = list(self.character.spec.links)
-        feet = [links.index(name) for name in self.character.spec.end_effectors]
-        right, left = self.blocks['pose'].start + 1 + len(reflection3d.POSE) * np.array(feet)
-        return Mirror(
-            index, sign, np.arange(len(PLAN_SIGNS)), np.array(PLAN_SIGNS), feet=(right, left)
-        )
 
     def bind(self, world: World) -> None:
         common, n = self._bind_rules(world), world.n

@@ -38,15 +38,7 @@ from trl_suite.terrain.spatial.windows import SAMPLES
 from trl_suite.util.compiled import compiled, compiled_loop
 
 CONTROLLER = 'PD_Biped3D_LLC_General_Step-v0'  # its shipped policy is the default controller
-INTERFACES = ('plan', 'frame')
 MAPS = ('height', 'velocity')
-# A plan: x and y of both landing places, m, and turn of the heading, rad. PLAN_OFFSET is the plan
-# at action 0, in step lengths; PLAN_SCALE is the change per unit action, in m and rad.
-PLAN_NAMES: tuple[str, ...] = ('first_x', 'first_y', 'second_x', 'second_y', 'turn')
-PLAN_SIGNS = (1.0, -1.0, 1.0, -1.0, -1.0)  # of the mirrored plan
-PLAN_OFFSET = np.array([1.0, 0.0, 2.0, 0.0, 0.0])
-STEP_LENGTH = 0.5  # m
-PLAN_SCALE = np.array([1.0, 1.0, 2.0, 2.0, np.pi])
 GOAL_REACHED = 1.0  # m; default
 GOAL_SIGNS = (-1.0, 1.0)  # of mirrored bearing and distance
 SPEED_SHARPNESS = 1.5
