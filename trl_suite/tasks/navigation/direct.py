@@ -23,7 +23,8 @@ from trl_suite.tasks.components.ball import Ball
 from trl_suite.tasks.components.comparison import (
     comparison,
 )
-from trl_suite.tasks.components.goals import flag, goals, set_goal
+from trl_suite.tasks.components.goal_drawer import GoalDrawer
+from trl_suite.tasks.components.goals import flag, goals
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import HEIGHT_MAP, act_all
 from trl_suite.tasks.components.trace import trace, trace_markers
@@ -119,6 +120,7 @@ class DirectNavigation(SpatialTask):
         self.TERMS = BALL_TERMS if ball else rewards.DIRECT_TERMS
         reached = config.goal_reached
         self.goal_reached = GOAL_REACHED if reached is None else float(reached)
+        self._goal_drawer = GoalDrawer(arena, ball, 'near')
         super().__init__(
             character, arena, clip, config, actuation_model=actuation_model,
             extras={'goal': 2, 'ball': len(MIRRORED_BALL) if ball else 0},
@@ -137,6 +139,7 @@ class DirectNavigation(SpatialTask):
         self.goals, self.progress, self.trace = goals(n), Progress(np.zeros(n)), trace(n)
         self.saved = (*self.saved, self.goals, self.progress, self.trace)
         self.info_arrays |= {'goals_reached': self.goals.reached, 'speed': self.progress.speed}
+        self._goal_drawer.bind(world, self.goals, self.clock, self._random)
         starts = {name: part.start for name, part in self._full.items()}
         balls = ball.no_ball(n)
         if self.ball:
@@ -168,22 +171,11 @@ class DirectNavigation(SpatialTask):
         self.goals.reached[env_ids] = 0
         self.trace.places[env_ids] = np.nan
         for i in env_ids.tolist():
-            place = self.travel.origin[i, :2]
-            if self.ball:
-                self.ball.state.at_goal[i] = False
-                self.ball.put(i, place, 0, self._random[i])
-            self._draw_goal(i, place)
+            self._goal_drawer.begin(i, self.travel.origin[i, :2])
         if self.ball:
+            self.ball.state.at_goal[env_ids] = False
             self.world.forward(env_ids)
         observe_all(env_ids, True, self._pack)
-
-    def _draw_goal(self, i: int, place: np.ndarray) -> None:
-        random = self._random[i]
-        if self.ball:
-            drawn = self.ball.goal(i, random)
-        else:
-            drawn = self.arena.goal(i, random, place, 'near')
-        set_goal(i, drawn, self.clock.steps[i], random, self.goals)
 
     # A step.
 
@@ -193,19 +185,8 @@ class DirectNavigation(SpatialTask):
 
     def finish_step(self, env_ids: np.ndarray) -> None:
         if travel_all(env_ids, self._pack):
-            self._draw(env_ids)
+            self._goal_drawer.redraw(env_ids, self.figure.measurement.root[:, :2])
         finish_all(env_ids, self._pack)
-
-    def _draw(self, env_ids: np.ndarray) -> None:
-        """Places balls and draws goals again, where they have expired or were reached."""
-        root, count = self.figure.measurement.root, self.clock.steps
-        if self.ball:
-            wanted = env_ids[self.ball.state.wanted[env_ids]]
-            for i in wanted.tolist():
-                self.ball.put(i, root[i, :2], count[i], self._random[i])
-            self.world.forward(wanted)
-        for i in env_ids[self.goals.wanted[env_ids]].tolist():
-            self._draw_goal(i, root[i, :2])
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         observe_all(self.world.all_ids if env_ids is None else env_ids, False, self._pack)

@@ -19,7 +19,6 @@ from trl_suite.engine import World
 from trl_suite.motion import Steps
 from trl_suite.tasks.components.ball import (
     AT_GOAL,
-    GOAL_AWAY,
     MIRRORED,
     SOCCER_TERMS,
     Ball,
@@ -35,7 +34,8 @@ from trl_suite.tasks.components.footstep_plan import (
     plan_markers,
     plan_mirror,
 )
-from trl_suite.tasks.components.goals import flag, goals, set_goal
+from trl_suite.tasks.components.goal_drawer import GoalDrawer
+from trl_suite.tasks.components.goals import flag, goals
 from trl_suite.tasks.components.plans import Plans, span
 from trl_suite.tasks.components.reflection import Reflection
 from trl_suite.tasks.components.spatial_rules import (
@@ -77,7 +77,6 @@ from trl_suite.tasks.task import (
     check_simulated,
     consecutive,
     drawn_seed,
-    random_displacement,
 )
 from trl_suite.terrain import SpatialGround
 from trl_suite.terrain.spatial.windows import SAMPLES
@@ -213,6 +212,7 @@ class HierarchicalNavigation(SpatialTask):
         self.goal_reached = (
             (AT_GOAL if ball else GOAL_REACHED) if reached is None else float(reached)
         )
+        self._goal_drawer = GoalDrawer(arena, ball, 'far', config.goal_distance)
         self._frame = config.substeps
         low = max(part.stop for part in self._full.values())
         if interface == 'plan':
@@ -253,6 +253,7 @@ class HierarchicalNavigation(SpatialTask):
             'speed': self.state.speed,
             'duration': self.state.duration,
         }
+        self._goal_drawer.bind(world, self.goals, self.clock, self._random)
         starts = {name: part.start for name, part in self.blocks.items()}
         balls = no_ball(n)
         if self.ball:
@@ -338,22 +339,7 @@ class HierarchicalNavigation(SpatialTask):
 
     def begin_goal(self, i: int) -> None:
         """Draws the first goal of an episode, and places the ball, from the last measurement."""
-        place = self.figure.measurement.root[i, :2]
-        if self.ball:
-            self.ball.put(i, place, self.clock.steps[i], self._random[i])
-        self._draw_goal(i, place)
-
-    def _draw_goal(self, i: int, place: np.ndarray) -> None:
-        random, away = self._random[i], self.config.goal_distance
-        if self.ball:
-            goal = self.ball.goal(i, random, away or GOAL_AWAY)
-        elif away is None:
-            goal = self.arena.goal(i, random, place)
-        else:
-            x, y = place + random_displacement(random, *away)
-            height = self.arena.height(np.array([[x]]), np.array([[y]]), np.array([i]))
-            goal = np.array([x, y, height[0, 0]])
-        set_goal(i, goal, self.clock.steps[i], random, self.goals)
+        self._goal_drawer.begin(i, self.figure.measurement.root[i, :2])
 
     @property
     def steps_per_call(self) -> int:
@@ -409,19 +395,8 @@ class HierarchicalNavigation(SpatialTask):
     def finish_step(self, env_ids: np.ndarray) -> None:
         check_simulated(self.state.lasted[env_ids])
         if score_all(env_ids, self._pack):
-            self._draw(env_ids)
+            self._goal_drawer.redraw(env_ids, self.figure.measurement.root[:, :2])
         finish_all(env_ids, self._pack)
-
-    def _draw(self, env_ids: np.ndarray) -> None:
-        """Places balls and draws goals again, where they have expired or were reached."""
-        root, count = self.figure.measurement.root, self.clock.steps
-        if self.ball:
-            wanted = env_ids[self.ball.state.wanted[env_ids]]
-            for i in wanted.tolist():
-                self.ball.put(i, root[i, :2], count[i], self._random[i])
-            self.world.forward(wanted)
-        for i in env_ids[self.goals.wanted[env_ids]].tolist():
-            self._draw_goal(i, root[i, :2])
 
     def observe(self, env_ids: np.ndarray | None = None) -> None:
         observe_all(self.world.all_ids if env_ids is None else env_ids, self._pack)
