@@ -38,7 +38,7 @@ def walked(n, switches, **options):
     """Landing places of n walkers whose clocks run, before and after each switch of stance."""
     environments = VectorEnvironment(ID, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
     environments.reset()
-    task, found = environments._task, []
+    task, found = environments.task, []
     while len(found) < switches:
         before = task.plan.landing.copy()
         task.finish_step(np.arange(n))  # the physics stands still

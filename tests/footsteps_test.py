@@ -56,7 +56,7 @@ def walked(n, switches, id_=GENERAL, **options):
     """
     environments = VectorEnvironment(id_, n, 1, seed=0, task_kwargs={'start_phase': 0.0, **options})
     environments.reset()
-    task, found = environments._task, []
+    task, found = environments.task, []
     while len(found) < switches:
         before = task.landing.copy(), task.heading.copy()
         everyone = task.world.all_ids
@@ -235,7 +235,7 @@ class PlanTest(parameterized.TestCase):
 
     def test_plans_made_from_the_root(self):
         environments, found = walked(60, 16, plans={'from_root': 1.0, 'root_turn': 0.45})
-        task = environments._task
+        task = environments.task
         measured = task.figure.measure()
         lengths, widths, turns = [], [], []
         for _, _, after, heading, stance in found:
@@ -367,7 +367,7 @@ class GoalTest(parameterized.TestCase):
 
     def test_the_walk_on_the_trail_continues(self):
         environments, found = walked(20, 4, TRAIL)
-        task = environments._task
+        task = environments.task
         for env_id in range(20):
             spawn = task.travel.origin[env_id]
             way = task.goal[env_id, :2] - spawn[:2]
@@ -646,7 +646,7 @@ class StartTest(parameterized.TestCase):
     def test_phases_are_uniform(self):
         environments = VectorEnvironment(GENERAL, 400, 1, seed=0)
         environments.reset()
-        assert_uniform(environments._task.phase, 0, 1)
+        assert_uniform(environments.task.phase, 0, 1)
 
     def test_pose_is_that_of_the_straight_step(self):
         steps = motion.load_steps('biped3d_mocap')

@@ -424,8 +424,8 @@ class StartTest(parameterized.TestCase):
     def test_phases_are_uniform(self):
         environments = VectorEnvironment(PLANE, 800, 1, seed=0)
         environments.reset()
-        self.assertLess(environments._task.phase.max(), 1)
-        assert_uniform(environments._task.phase, 0, 1)
+        self.assertLess(environments.task.phase.max(), 1)
+        assert_uniform(environments.task.phase, 0, 1)
 
     def test_start_phase(self):
         environment, step = started(HILLS, start_phase=0.6)

@@ -199,7 +199,7 @@ class TaskTest(parameterized.TestCase):
             'PD_Biped3D_LLC_General_Step-v0', 6, 1, seed=0, task_kwargs={'mirrored': True}
         )
         first, _ = plain.reset(), mirrored.reset()
-        mirror, rng, both = plain._task.mirror, np.random.default_rng(0), 0
+        mirror, rng, both = plain.task.mirror, np.random.default_rng(0), 0
         for _ in range(20):
             left = mirror.left(first)
             both += 0 < left.sum() < 6
@@ -208,7 +208,7 @@ class TaskTest(parameterized.TestCase):
             np.testing.assert_array_equal(a.reward, b.reward)
             first = a.observation
             canonical, left = mirror.canonical(first)
-            np.testing.assert_array_equal(left, plain._task.phase >= 0.5)
+            np.testing.assert_array_equal(left, plain.task.phase >= 0.5)
             np.testing.assert_array_equal(b.observation[:, :105], canonical[:, :105])
         self.assertGreater(both, 5)
 

@@ -86,22 +86,22 @@ class IdentityTest(parameterized.TestCase):
             for seed in environments.seeds
         ]
         environments.reset()
-        world, ids = environments._task.world, np.arange(3)
+        world, ids = environments.task.world, np.arange(3)
         for one in alone:
             one.reset()
         for push in range(1, 6):
             for env_id, one in enumerate(alone):
                 x = push * (2.0 + env_id)
-                height = environments._task.arena.grounds[env_id].height(np.array([x]))[0] + 1.0
+                height = environments.task.arena.grounds[env_id].height(np.array([x]))[0] + 1.0
                 world.qpos[env_id, :2] = x, height
                 one.physics.data.qpos[:2] = x, height
                 one.task.world.forward(np.zeros(1, int))
             world.forward(np.arange(3))
             action = np.zeros((3, 20))
             for _ in range(3):
-                environments._task.step(action, ids)
+                environments.task.step(action, ids)
                 steps = [one.step(a) for one, a in zip(alone, action, strict=True)]
-                for one, env_id in zip(steps, environments._task.observation, strict=True):
+                for one, env_id in zip(steps, environments.task.observation, strict=True):
                     np.testing.assert_array_equal(
                         np.concatenate(list(one.observation.values())), env_id
                     )
@@ -472,7 +472,7 @@ class RobustnessTest(parameterized.TestCase):
     def test_divergence_does_not_affect_other_simulations(self):
         other = VectorEnvironment(FLAT, 3, 1, seed=0)
         other.reset()
-        self.environments._task.world.qvel[1, 5] = 1e12
+        self.environments.task.world.qvel[1, 5] = 1e12
         action = np.zeros((3, 6))
         step, calm = self.environments.step(action), other.step(action)
         np.testing.assert_array_equal(step.info['diverged'], [False, True, False])

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from trl_suite import rendering
-from trl_suite.engine import BatchWorld, light_model
 from trl_suite.environments import arguments
 from trl_suite.environments.environment import Environment
+from trl_suite.environments.simulations import Simulations
 from trl_suite.registry.build import build_task
 from trl_suite.registry.catalogue import EnvSpec, spec_of
 from trl_suite.tasks.task import Task
@@ -30,7 +30,6 @@ from trl_suite.util.options import equal
 MOST_ENVS = 2**20  # simulations of one batch
 MOST_THREADS = 4096
 AUTORESET = ('next_step', 'same_step', 'disabled')
-_STATE = ('world', 'task', 'random', 'seeds', 'steps', 'ended', 'fresh')
 
 
 class Step(NamedTuple):
@@ -125,23 +124,14 @@ class VectorEnvironment:
         )
         self.step_limit = arguments.check_step_limit(options.pop('step_limit', own))
         self.time_limit = arguments.check_time_limit(options.pop('time_limit', float('inf')))
-        self._num_threads = int(num_threads)
-        self._task = build_task(self.spec, self._task_kwargs)
-        model = light_model(self._task.root_entity.mjcf_model)
-        self._world: BatchWorld | None = BatchWorld(
-            model, self.num_envs, self._num_threads, self._task.fields
-        )
-        self._task.bind(self._world)
+        task = build_task(self.spec, self._task_kwargs)
+        self._simulations: Simulations | None = Simulations(task, self.num_envs, int(num_threads))
         self._pid = os.getpid()
         self._one_thread = arguments.OneThread()
-        self.blocks, self.action_map = dict(self._task.blocks), self._task.action_map
-        self.control_timestep: float = self._task.control_timestep
-        self._steps = np.zeros(self.num_envs, int)
-        self._ended = np.ones(self.num_envs, bool)  # simulations that need a reset
-        self._fresh = True  # whether no simulation was ever reset
+        self.blocks, self.action_map = dict(task.blocks), task.action_map
+        self.control_timestep: float = task.control_timestep
+        self.seeds = self._simulations.seeds
         self._picture: Environment | None = None
-        self.seeds = np.zeros(self.num_envs, np.uint32)
-        self._random = [np.random.RandomState(0)] * self.num_envs
         self.seed(seed)
 
     def seed(
@@ -160,15 +150,9 @@ class VectorEnvironment:
           ValueError: a negative seed, or a wrong number of seeds.
         """
         with self._one_thread:
-            self._check_usable()
-            if seed is None or isinstance(seed, str) or not np.iterable(seed):
-                sequence = _seed_sequence(seed)
-                seeds = sequence.generate_state(self.num_envs, np.uint32)
-            else:
-                seeds = _seeds(seed, self.num_envs)
-            for env_id in self._numbers(env_ids).tolist():
-                self.seeds[env_id] = seeds[env_id]
-                self._random[env_id] = np.random.RandomState(int(seeds[env_id]))
+            simulations = self._usable()
+            seeds = arguments.all_seeds(seed, self.num_envs)
+            simulations.seed(seeds, arguments.unique_ids(env_ids, self.num_envs))
 
     def reset(
         self,
@@ -186,13 +170,13 @@ class VectorEnvironment:
           The observations of all simulations.
         """
         with self._one_thread:
-            self._check_usable()
-            numbers = self._numbers(env_ids)
-            if self._fresh and len(numbers) < self.num_envs:
+            simulations = self._usable()
+            numbers = arguments.unique_ids(env_ids, self.num_envs)
+            if simulations.fresh and len(numbers) < self.num_envs:
                 raise ValueError('the first reset must be of all simulations')
             if seed is not None:
                 self.seed(seed, numbers)
-            self._fresh = False
+            simulations.fresh = False
             self.share(self.begin, numbers)
             return self._observation()
 
@@ -213,16 +197,20 @@ class VectorEnvironment:
             ended.
         """
         with self._one_thread:
-            self._check_usable()
-            return self._step(action, env_ids)
+            return self._step(self._usable(), action, env_ids)
 
-    def _step(self, action: np.ndarray, env_ids: np.ndarray | Sequence[int] | None) -> Step:
-        if self._fresh:
+    def _step(
+        self,
+        simulations: Simulations,
+        action: np.ndarray,
+        env_ids: np.ndarray | Sequence[int] | None,
+    ) -> Step:
+        if simulations.fresh:
             raise RuntimeError('step before the first reset')
         action = self.action_map.checked(action, self.num_envs)
-        task, world, ended = self._task, self._world, self._ended
-        assert world is not None
-        asked = world.all_ids if env_ids is None else self._numbers(env_ids)
+        task, world = simulations.task, simulations.world
+        steps, ended = simulations.steps, simulations.ended
+        asked = world.all_ids if env_ids is None else arguments.unique_ids(env_ids, self.num_envs)
         resetting, env_ids = asked[ended[asked]], asked[~ended[asked]]
         if len(resetting) and self.autoreset == 'disabled':
             raise RuntimeError(
@@ -240,7 +228,7 @@ class VectorEnvironment:
 
         observation = np.empty(task.observation.shape, self.dtype)
         self.share(work, asked)
-        self._steps[env_ids] += 1
+        steps[env_ids] += 1
         reward, terminated, info = task.reward.copy(), task.failed.copy(), task.info()
         if len(env_ids) < self.num_envs:
             resting = np.ones(self.num_envs, bool)
@@ -249,7 +237,7 @@ class VectorEnvironment:
                 each[resting] = 0
         truncated = np.zeros(self.num_envs, bool)
         if self.step_limit is not None:
-            truncated[asked] = self._steps[asked] >= self.step_limit
+            truncated[asked] = steps[asked] >= self.step_limit
         if self.time_limit < np.inf:
             truncated[asked] |= world.time[asked] >= self.time_limit
         truncated &= ~terminated
@@ -268,35 +256,31 @@ class VectorEnvironment:
     @property
     def info(self) -> dict[str, Any]:
         """Further results of each simulation's last step or reset: see the task's `info`."""
-        self._check_usable()
-        return self._task.info()
+        return self._usable().task.info()
 
     def render(self, env_id: int = 0, **options: Any) -> np.ndarray:
         """Renders one simulation, (h, w, 3) uint8; options as for `trl_suite.rendering.frame`."""
         with self._one_thread:
-            self._check_usable()
-            assert self._world is not None
+            simulations = self._usable()
             if self._picture is None:  # the models of the simulations have no visual assets
                 self._picture = Environment(build_task(self.spec, self._task_kwargs))
                 self._picture.reset()
-            self._ids([env_id])
-            self._picture.task.set_state(0, self._task.get_state(env_id))
-            self._picture.task.world.set_state(0, self._world.get_state(env_id))
+            arguments.given_ids([env_id], self.num_envs)
+            self._picture.task.set_state(0, simulations.task.get_state(env_id))
+            self._picture.task.world.set_state(0, simulations.world.get_state(env_id))
             return rendering.frame(self._picture, **options)
 
     @property
     def task(self) -> Task:
         """The task, whose arrays have a leading axis of n simulations."""
-        self._check_usable()
-        return self._task
+        return self._usable().task
 
     def close(self) -> None:
         """Frees the simulations; may be called twice."""
         with self._one_thread:
-            if self._world is not None and os.getpid() == self._pid:
-                self._world.close()
-            self._world = None
-            self._task = None  # type: ignore[assignment]
+            if self._simulations is not None and os.getpid() == self._pid:
+                self._simulations.world.close()
+            self._simulations = None
             if self._picture is not None:
                 self._picture.close()
                 self._picture = None
@@ -308,19 +292,7 @@ class VectorEnvironment:
           env_ids: numbers of m simulations, or a mask (n,) bool; None for all.
         """
         with self._one_thread:
-            self._check_usable()
-            assert self._world is not None
-            ids = self._ids(env_ids)
-            return {
-                'made_for': self._owner,
-                'world': [self._world.get_state(env_id) for env_id in ids],
-                'task': [self._task.get_state(env_id) for env_id in ids],
-                'random': [self._random[env_id].get_state() for env_id in ids],
-                'seeds': self.seeds[ids],
-                'steps': self._steps[ids],
-                'ended': self._ended[ids],
-                'fresh': self._fresh,
-            }
+            return self._usable().get_state(arguments.given_ids(env_ids, self.num_envs))
 
     def set_state(
         self, state: dict[str, Any], env_ids: np.ndarray | Sequence[int] | None = None
@@ -340,35 +312,12 @@ class VectorEnvironment:
           RuntimeError: only some simulations are restored before the first reset.
         """
         with self._one_thread:
-            self._check_usable()
-            assert self._world is not None
-            if env_ids is not None and self._fresh:
+            simulations = self._usable()
+            if env_ids is not None and simulations.fresh:
                 raise RuntimeError('set_state of some simulations before the first reset')
-            arguments.check_state(state, self._owner, _STATE)
-            ids = self._ids(env_ids)
-            for name in ('world', 'task', 'random'):
-                if not isinstance(state[name], Sequence) or len(state[name]) != len(ids):
-                    found = len(state[name]) if isinstance(state[name], Sequence) else 'no'
-                    raise ValueError(
-                        f'the state has {found} simulations in {name!r}; expected {len(ids)}'
-                    )
-            if len(set(ids)) != len(ids):
-                raise ValueError(f'simulations {ids}; expected each of {len(ids)} simulations once')
-            for name, kinds in (('seeds', 'iu'), ('steps', 'iu'), ('ended', 'b')):
-                arguments.check_saved(name, state[name], kinds, (len(ids),))
-            arguments.check_saved('fresh', state['fresh'], 'b', ())
-            for i in range(len(ids)):
-                arguments.check_saved('world', state['world'][i], 'f', (self._world.state_size,))
-                arguments.check_random(state['random'][i])
-                arguments.check_task(state['task'][i])
-            for i, env_id in enumerate(ids):
-                self._task.set_state(env_id, state['task'][i])
-                self._world.set_state(env_id, state['world'][i])
-                self._random[env_id].set_state(state['random'][i])
-            self.seeds[ids] = state['seeds']
-            self._steps[ids], self._ended[ids] = state['steps'], state['ended']
+            simulations.set_state(state, arguments.given_ids(env_ids, self.num_envs))
             if env_ids is None:
-                self._fresh = state['fresh']
+                simulations.fresh = state['fresh']
 
     def copy_from(
         self, other: VectorEnvironment, other_ids: Sequence[int], env_ids: Sequence[int]
@@ -391,27 +340,22 @@ class VectorEnvironment:
         if not isinstance(other, VectorEnvironment):
             raise TypeError(f'other is {type(other).__name__}; expected VectorEnvironment')
         with self._one_thread, other._one_thread:
-            self._check_usable()
-            other._check_usable()
-            if self._fresh or other._fresh:
+            simulations, others = self._usable(), other._usable()
+            if simulations.fresh or others.fresh:
                 raise RuntimeError('copy_from before the first reset')
-            assert self._world is not None and other._world is not None
             if not (equal(other.spec, self.spec) and equal(other._task_kwargs, self._task_kwargs)):
                 raise ValueError(
                     f'cannot copy simulations of {other.spec.id} to {self.spec.id}: id or options '
                     'differ'
                 )
-            sources, ids = other._ids(other_ids), self._ids(env_ids)
+            sources = arguments.given_ids(other_ids, other.num_envs)
+            ids = arguments.given_ids(env_ids, self.num_envs)
             if len(sources) != len(ids) or len(set(ids)) != len(ids):
                 raise ValueError(
                     f'cannot copy {len(sources)} simulations to simulations {ids}; expected as many '
                     'different ones'
                 )
-            for source, env_id in zip(sources, ids, strict=True):
-                self._task.set_state(env_id, other._task.get_state(source))
-                self._world.set_state(env_id, other._world.get_state(source))
-                self._steps[env_id] = other._steps[source]
-                self._ended[env_id] = other._ended[source]
+            simulations.copy_from(others, sources, ids)
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError(
@@ -421,24 +365,18 @@ class VectorEnvironment:
 
     def share(self, work: Callable[[np.ndarray], None], env_ids: np.ndarray) -> None:
         """Calls `work` on the threads, each time for a part of the simulations."""
-        self._check_usable()
-        assert self._world is not None
-        if self._task.in_parts:
-            self._world.share(work, env_ids)
+        simulations = self._usable()
+        if simulations.task.in_parts:
+            simulations.world.share(work, env_ids)
         else:
             work(env_ids)
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Begins episodes in some simulations, without the checks and observations of `reset`."""
-        self._check_usable()
-        if not len(env_ids):
-            return
-        self._task.reset(env_ids, [self._random[env_id] for env_id in env_ids.tolist()])
-        self._steps[env_ids] = 0
-        self._ended[env_ids] = False
+        self._usable().begin(env_ids)
 
     def _observation(self) -> Any:
-        return self._parts(self._task.observation.astype(self.dtype))
+        return self._parts(self._usable().task.observation.astype(self.dtype))
 
     def _parts(self, flat: np.ndarray) -> Any:
         """Returns observations (n, size) in the form that the user gets: an array, or a dict."""
@@ -446,78 +384,17 @@ class VectorEnvironment:
             return flat
         return {name: flat[:, part] for name, part in self.blocks.items()}
 
-    def _numbers(self, env_ids: np.ndarray | Sequence[int] | None) -> np.ndarray:
-        """Returns the numbers of simulations, sorted and without repeats."""
-        return np.unique(np.array(self._ids(env_ids), int))
-
-    def _ids(self, env_ids: np.ndarray | Sequence[int] | None) -> list[int]:
-        """Returns the numbers of simulations as they are given.
+    def _usable(self) -> Simulations:
+        """Returns the simulations.
 
         Raises:
-          TypeError: they are neither integers nor a mask.
-          ValueError: there are no such simulations, or a mask has another shape.
+          RuntimeError: after `close`, or in a forked process.
         """
-        if env_ids is None:
-            return list(range(self.num_envs))
-        numbers = np.atleast_1d(np.asarray(env_ids))
-        if numbers.dtype == bool:
-            if numbers.shape != (self.num_envs,):
-                raise ValueError(f'mask has shape {numbers.shape}; expected ({self.num_envs},)')
-            return np.flatnonzero(numbers).tolist()
-        if not numbers.size:
-            return []
-        if numbers.dtype.kind not in 'iu' or numbers.ndim > 1:
-            raise TypeError(
-                f'env_ids is {env_ids!r}; expected integers, the numbers of simulations, or a mask '
-                f'of {self.num_envs} bools'
-            )
-        if numbers.min() < 0 or numbers.max() >= self.num_envs:
-            raise ValueError(
-                f'env_ids are {numbers.tolist()}; expected numbers in [0, {self.num_envs})'
-            )
-        return numbers.tolist()
-
-    @property
-    def _owner(self) -> str:
-        """The value of 'made_for' in states of this environment."""
-        return f'simulations of {self._task.signature}'
-
-    def _check_usable(self) -> None:
-        if self._world is None:
+        if self._simulations is None:
             raise RuntimeError('the environment is closed')
         if os.getpid() != self._pid:
             raise RuntimeError(
                 'a vector environment cannot be used after a fork: the child has no copy of its '
                 "threads. Make it in the child, or use multiprocessing's start method 'spawn'"
             )
-
-
-def _seed_sequence(seed: Any) -> np.random.SeedSequence:
-    """Returns the sequence of a seed for all simulations.
-
-    Raises:
-      TypeError: it is not an integer.
-      ValueError: it is negative.
-    """
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
-        raise TypeError(f'seed is {seed!r}; expected an integer, one for each simulation, or None')
-    if seed is not None and seed < 0:
-        raise ValueError(f'seed is {seed}; expected 0 or a positive integer')
-    return np.random.SeedSequence(seed)
-
-
-def _seeds(seed: Sequence[int], num_envs: int) -> np.ndarray:
-    """Returns the given seeds of all simulations, (n,).
-
-    Raises:
-      ValueError: there are not n, or they are no integers in [0, 2**32).
-    """
-    try:
-        seeds = np.asarray(seed)
-    except ValueError:  # lists of different lengths
-        seeds = np.asarray(None)
-    if seeds.dtype.kind in 'iu' and seeds.shape != (num_envs,):
-        raise ValueError(f'seed has {seeds.size} seeds for {num_envs} simulations')
-    if seeds.dtype.kind not in 'iu' or (seeds < 0).any() or (seeds >= 2**32).any():
-        raise ValueError(f'seed is {seed!r}; expected an integer in [0, 2**32) for each simulation')
-    return seeds
+        return self._simulations

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.environments import arguments
 from trl_suite.environments.vector import Step, VectorEnvironment
 from trl_suite.registry import catalogue
 from trl_suite.sequences.catalogue import FIRST_TEST_SEED, Sequence, train_seeds
@@ -129,7 +130,9 @@ class _Counted(VectorEnvironment):
         super().__init__(id, num_envs, **options)
 
     def step(self, action: np.ndarray, env_ids: np.ndarray | Numbers[int] | None = None) -> Step:
-        count = self.num_envs if env_ids is None else len(self._numbers(env_ids))
+        count = (
+            self.num_envs if env_ids is None else len(arguments.unique_ids(env_ids, self.num_envs))
+        )
         self._stage.spend(self._number, count)
         step = super().step(action, env_ids)
         self._sums += step.reward
@@ -145,7 +148,7 @@ class _Counted(VectorEnvironment):
         seed: int | Numbers[int] | None = None,
     ) -> Any:
         observation = super().reset(env_ids, seed)
-        self._sums[self._numbers(env_ids)] = 0
+        self._sums[arguments.unique_ids(env_ids, self.num_envs)] = 0
         return observation
 
     def seed(
