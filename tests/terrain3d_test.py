@@ -11,8 +11,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 
 from trl_suite import terrain
-from trl_suite.terrain.spatial import generators as spatial
-from trl_suite.terrain.spatial import noise
+from trl_suite.terrain.spatial import features, generators, noise
 from trl_suite.terrain.spatial import windows as spatial_ground
 
 GRIDS = ('checkers3d', 'cliff3d', 'hills3d', 'steps3d', 'trail3d', 'trail3d1', 'trail3d2')
@@ -182,7 +181,7 @@ class ShapeTest(parameterized.TestCase):
         def grid(parameters, rng):
             return terrain.Layout(level=None, grid=terrain.Grid((0, 0), heights))
 
-        self.addCleanup(spatial._generators.pop, 'test_grid3d')
+        self.addCleanup(generators._generators.pop, 'test_grid3d')
         ground = make({'Type': 'test_grid3d'})
         # The common edge runs from the back left (0, 0.2) to the front right corner (0.2, 0).
         self.assertAlmostEqual(ground.height(0.1, 0.1), (1 + 4) / 2)
@@ -202,7 +201,7 @@ class ObstaclesTest(parameterized.TestCase):
         ground = terrain.load(source)
         covered = []
         for seed in range(6):
-            drawn = spatial._Obstacles(ground.parameters(), np.random.default_rng(seed))
+            drawn = features._Obstacles(ground.parameters(), np.random.default_rng(seed))
             begin, end, tops = drawn._tile((0, 0))
             self.assertLen(tops, count)
             self.assertTrue(((begin >= -40) & (begin <= 40)).all())
@@ -246,9 +245,9 @@ class ObstaclesTest(parameterized.TestCase):
             self.assertAlmostEqual(len(ground.layout.boxes(low, low + 80).top), 650, delta=40)
 
     def test_later_rubble_overwrites_earlier(self):
-        drawn = spatial._Obstacles(terrain.load('steps3d').parameters(), np.random.default_rng(0))
+        drawn = features._Obstacles(terrain.load('steps3d').parameters(), np.random.default_rng(0))
         begin, end, tops = drawn._tile((0, 0))
-        grid = spatial._rubble(drawn)
+        grid = features._rubble(drawn)
         i = vertices(5, 9)
         heights = grid(i, i)
         for a, b in ((0, 0), (7, 11), (20, 3), (13, 13)):
@@ -672,9 +671,9 @@ class FileTest(parameterized.TestCase):
 class RegisterTest(parameterized.TestCase):
     def setUp(self):
         super().setUp()
-        before = dict(spatial._generators)
-        self.addCleanup(spatial._generators.update, before)
-        self.addCleanup(spatial._generators.clear)
+        before = dict(generators._generators)
+        self.addCleanup(generators._generators.update, before)
+        self.addCleanup(generators._generators.clear)
 
     def test_new_type(self):
         @terrain.register3d('turned3d', {'YawMin': 0.2, 'YawMax': 0.4})
@@ -933,7 +932,7 @@ class SurroundingsTest(parameterized.TestCase):
             )
             return terrain.Layout(boxes=blocks)
 
-        self.addCleanup(spatial._generators.pop, 'crowd3d')
+        self.addCleanup(generators._generators.pop, 'crowd3d')
         found = around({'Type': 'crowd3d'}, range(2))
         self.assertEqual(found.arrays.bins[0, 3, 5].tolist(), [0, 90])  # they do not fit into bins
         x, y = np.random.default_rng(0).uniform(-15, 15, (2, 2, 500))
