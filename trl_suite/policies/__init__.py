@@ -1,5 +1,6 @@
 """Trained policies as data: small networks in .npz files, evaluated with NumPy only."""
 
+from trl_suite.policies.convolution import Convolution
 from trl_suite.policies.files import (
     SHARED,
     VARIANTS,
@@ -9,7 +10,7 @@ from trl_suite.policies.files import (
     save,
     trained_for,
 )
-from trl_suite.policies.network import ACTIVATIONS, Convolution, Policy, placed
+from trl_suite.policies.network import ACTIVATIONS, Policy, placed
 
 __all__ = [
     'ACTIVATIONS',

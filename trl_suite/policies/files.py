@@ -82,8 +82,9 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.policies.convolution import Convolution
 from trl_suite.policies.mirror import Mirror
-from trl_suite.policies.network import Convolution, Policy
+from trl_suite.policies.network import Policy
 from trl_suite.util import errors, resources
 from trl_suite.util.files import check_path, existing, load_arrays, replacing
 

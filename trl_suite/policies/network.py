@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from trl_suite.policies import checks
+from trl_suite.policies.convolution import Convolution
 from trl_suite.policies.mirror import Mirror
 from trl_suite.util import errors
 
@@ -20,89 +22,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 _FLAT = 'observations'  # key of the flat vector, if an environment returns one
 _LEAST_VARIANCE = 1e-5  # added to the variance in layer normalisation
-_LARGEST = float(np.finfo(np.float32).max)  # bound of sums
 REACH = 1.0  # m; `placed` keeps the positions of nearer places, and the directions of others
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Convolution:
-    """1-D convolutions over a line, the first l inputs of a network, such as ground heights.
-
-    The outputs replace the line, position by position, before the other inputs.
-
-    Attributes:
-      line: number of inputs that form the line, l.
-      strides: strides of each layer, in positions of its input.
-      weights: per layer (width, channels, filters), float32 and read-only, as all arrays; the first
-        has one channel, each other as many channels as the previous layer has filters.
-      biases: per layer (filters,).
-      origin: index of the input that is subtracted from those of the line, such as the root's
-        height, before normalisation; None for none.
-      outputs: number of outputs: positions times filters of the last layer.
-
-    Raises:
-      ValueError: fields are inconsistent; the message names one.
-    """
-
-    line: int
-    strides: tuple[int, ...]
-    weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
-    biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
-    origin: int | None = None
-    outputs: int = dataclasses.field(init=False)
-
-    def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
-        put('line', int(self.line))
-        put('strides', tuple(map(int, self.strides)))
-        layers = len(self.strides)
-        if not layers or len(self.weights) != layers or len(self.biases) != layers:
-            raise ValueError(
-                f'strides: {layers} layers with {len(self.weights)} weights and '
-                f'{len(self.biases)} biases'
-            )
-        weights, biases, positions, channels = [], [], self.line, 1
-        for i, stride in enumerate(self.strides):
-            width, _, filters = (
-                np.shape(self.weights[i]) if np.ndim(self.weights[i]) == 3 else 3 * (0,)
-            )
-            weights.append(_array(f'filter_{i}', self.weights[i], (width, channels, filters)))
-            biases.append(_array(f'filter_bias_{i}', self.biases[i], (filters,)))
-            if stride < 1 or not 1 <= width <= positions or not filters:
-                raise ValueError(
-                    f'filter_{i}: {filters} of width {width} and stride {stride} on {positions} positions'
-                )
-            positions, channels = (positions - width) // stride + 1, filters
-        put('weights', tuple(weights))
-        put('biases', tuple(biases))
-        put('outputs', positions * channels)
-
-    def check(self, inputs: int) -> None:
-        """Raises ValueError unless it fits a network with this number of inputs."""
-        if not self.line <= inputs:
-            raise ValueError(f'line: has {self.line} of {inputs} inputs')
-        if self.origin is not None and not 0 <= self.origin < inputs:
-            raise ValueError(f'origin: is {self.origin}; expected a number of 0 to {inputs - 1}')
-
-    def relative(self, seen: np.ndarray) -> np.ndarray:
-        """Returns inputs (n, c) in which the line is relative to the origin."""
-        if self.origin is None:
-            return seen
-        line = seen[:, : self.line] - seen[:, self.origin, None]
-        return np.concatenate([line, seen[:, self.line :]], axis=1)
-
-    def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Maps normalised inputs (n, c) to outputs and other inputs, (n, outputs + c - l)."""
-        line = x[:, : self.line, None]
-        for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
-            width, channels, filters = weight.shape
-            places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
-            windows = line[:, places].reshape(len(x), len(places), width * channels)
-            # One product per simulation, so that results do not depend on the batch size.
-            line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
-        return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -177,25 +97,25 @@ class Policy:
         k, a = self.observation_size, len(self.actions)
         seen = k
         if self.places is not None:
-            put('places', _columns('places', self.places, 2, k))
+            put('places', checks.columns('places', self.places, 2, k))
             if self.places.shape[1] != 2:
                 raise ValueError(f'places: has shape {self.places.shape}; expected (p, 2)')
             seen += self.places.size
         if self.columns is not None:
-            put('columns', _columns('columns', self.columns, 1, seen))
+            put('columns', checks.columns('columns', self.columns, 1, seen))
             seen = len(self.columns)
-        put('mean', _array('mean', self.mean, (seen,)))
-        put('std', _array('std', self.std, (seen,)))
+        put('mean', checks.array('mean', self.mean, (seen,)))
+        put('std', checks.array('std', self.std, (seen,)))
         if not (self.std > 0).all():
             raise ValueError('std: expected positive numbers')
-        put('log_std', _array('log_std', self.log_std, (a,)))
-        put('clip', float(_array('clip', self.clip, ())))
+        put('log_std', checks.array('log_std', self.log_std, (a,)))
+        put('clip', float(checks.array('clip', self.clip, ())))
         if not self.clip > 0:
             raise ValueError(f'clip: expected a positive number; got {self.clip}')
         last = a
         if self.choices is not None:
             last = len(self.choices)
-            put('choices', _array('choices', self.choices, (last, a)))
+            put('choices', checks.array('choices', self.choices, (last, a)))
             if not last or np.abs(self.choices).max() > 1:
                 raise ValueError('choices: expected at least one action, in [-1, 1]')
             if self.mirror is not None:
@@ -211,8 +131,8 @@ class Policy:
         weights, biases = [], []
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             outputs = last if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
-            weights.append(_array(f'weight_{i}', weight, (inputs, outputs)))
-            biases.append(_array(f'bias_{i}', bias, (outputs,)))
+            weights.append(checks.array(f'weight_{i}', weight, (inputs, outputs)))
+            biases.append(checks.array(f'bias_{i}', bias, (outputs,)))
             inputs = outputs
         put('weights', tuple(weights))
         put('biases', tuple(biases))
@@ -233,13 +153,15 @@ class Policy:
             for i, layer in enumerate(
                 zip(self.convolution.weights, self.convolution.biases, strict=True)
             ):
-                bound = self._hidden(_largest_sum(f'filter_{i}', *layer, bound))
+                bound = self._hidden(checks.largest_sum(f'filter_{i}', *layer, bound))
             bound = max(bound, self.clip)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            bound = _largest_sum(f'weight_{i}', weight, bias, bound)
+            bound = checks.largest_sum(f'weight_{i}', weight, bias, bound)
             if i < len(self.weights) - 1:
                 if self.layer_norm:
-                    _largest_sum(f'weight_{i}', np.full((len(bias), 1), bound), np.zeros(1), bound)
+                    checks.largest_sum(
+                        f'weight_{i}', np.full((len(bias), 1), bound), np.zeros(1), bound
+                    )
                     bound = len(bias) ** 0.5
                 bound = self._hidden(bound)
 
@@ -360,21 +282,6 @@ class Policy:
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
 
 
-def _largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) -> float:
-    """Returns a bound of a layer's sums, given a bound of its inputs.
-
-    Raises:
-      ValueError: larger than float32 can hold; the message has the name.
-    """
-    axes = tuple(range(weight.ndim - 1))
-    most = float((np.abs(weight.astype(float)).sum(axes) * bound + np.abs(bias)).max())
-    if most > _LARGEST:
-        raise ValueError(
-            f'{name}: is too large: sums may reach {most:.3g}; expected at most {_LARGEST:.3g}'
-        )
-    return most
-
-
 def _bounded(x: np.ndarray, bound: float) -> np.ndarray:
     """Returns numbers clipped to [-bound, bound]; for few numbers faster than `numpy.clip`."""
     return np.minimum(np.maximum(x, -bound), bound)
@@ -395,32 +302,6 @@ def placed(observation: np.ndarray, places: np.ndarray) -> np.ndarray:
     near = np.minimum(distance / REACH, 1)
     straight = np.stack([near * np.cos(bearing), near * np.sin(bearing)], axis=-1)
     return np.concatenate([observation, straight.reshape(len(observation), -1)], axis=1)
-
-
-def _columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
-    """Returns a read-only copy of column indices."""
-    array = np.array(value)
-    if array.ndim != axes or array.dtype.kind not in 'iu' or not array.size:
-        raise ValueError(f'{name}: expected integers, at least one')
-    if array.min() < 0 or array.max() >= inputs:
-        raise ValueError(f'{name}: expected numbers of 0 to {inputs - 1}')
-    array.setflags(write=False)
-    return array
-
-
-def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns a read-only copy, float32, of the given shape."""
-    try:
-        with np.errstate(over='ignore'):
-            array = np.array(value, dtype=np.float32, order='C')
-    except (TypeError, ValueError) as error:
-        raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
-    if array.shape != shape:
-        raise ValueError(f'{name}: has shape {array.shape}; expected {shape}')
-    if not np.isfinite(array).all():
-        raise ValueError(f'{name}: has numbers that are not finite')
-    array.setflags(write=False)
-    return array
 
 
 def _words(blocks: Sequence[tuple[str, int]]) -> str:

@@ -1,0 +1,64 @@
+"""Checks of the arrays of a network, which may come from a user's file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+LARGEST = float(np.finfo(np.float32).max)  # bound of sums
+
+
+def array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns a read-only copy of an array, float32.
+
+    Raises:
+      ValueError: not finite numbers of this shape; the message has the name.
+    """
+    try:
+        with np.errstate(over='ignore'):
+            copied = np.array(value, dtype=np.float32, order='C')
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
+    if copied.shape != shape:
+        raise ValueError(f'{name}: has shape {copied.shape}; expected {shape}')
+    if not np.isfinite(copied).all():
+        raise ValueError(f'{name}: has numbers that are not finite')
+    copied.setflags(write=False)
+    return copied
+
+
+def columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
+    """Returns a read-only copy of indices of columns, at least one.
+
+    Args:
+      name: name of the field.
+      value: the indices.
+      axes: number of axes of the array.
+      inputs: number of columns.
+
+    Raises:
+      ValueError: not such indices; the message has the name.
+    """
+    copied = np.array(value)
+    if copied.ndim != axes or copied.dtype.kind not in 'iu' or not copied.size:
+        raise ValueError(f'{name}: expected integers, at least one')
+    if copied.min() < 0 or copied.max() >= inputs:
+        raise ValueError(f'{name}: expected numbers of 0 to {inputs - 1}')
+    copied.setflags(write=False)
+    return copied
+
+
+def largest_sum(name: str, weight: np.ndarray, bias: np.ndarray, bound: float) -> float:
+    """Returns a bound of a layer's sums, given a bound of its inputs.
+
+    Raises:
+      ValueError: larger than float32 can hold; the message has the name.
+    """
+    axes = tuple(range(weight.ndim - 1))
+    most = float((np.abs(weight.astype(float)).sum(axes) * bound + np.abs(bias)).max())
+    if most > LARGEST:
+        raise ValueError(
+            f'{name}: is too large: sums may reach {most:.3g}; expected at most {LARGEST:.3g}'
+        )
+    return most
