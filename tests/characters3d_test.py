@@ -577,7 +577,8 @@ class CollisionTest(parameterized.TestCase):
         """The right side is the lighter one."""
         model, _ = alone(name)
         for right, left in characters.CHARACTERS[name].mirror:
-            light, dark = (model.geom(f'{link}_look').rgba[:3].sum() for link in (right, left))
+            geoms = (model.geom(f'{link}_look') for link in (right, left))
+            light, dark = (model.mat_rgba[geom.matid[0], :3].sum() for geom in geoms)
             self.assertGreater(light, dark + 0.3)
 
 

@@ -192,7 +192,7 @@ class Character(composer.Entity):
         if self.spec.collision_geoms is not None:
             return [self._find('geom', name) for name in self.spec.collision_geoms]
         geoms = [self._find('geom', name) for name in self.spec.links]
-        return [geom for geom in geoms if geom.dclass.dclass != 'group0']
+        return [geom for geom in geoms if geom.contype != 0 or geom.conaffinity != 0]
 
     @property
     def prismatic(self) -> np.ndarray:
