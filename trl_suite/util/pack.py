@@ -27,6 +27,7 @@ from numba.extending import (
 )
 
 _WORD = 8  # bytes; a block consists of words of this size
+_array_types: dict[tuple[np.dtype, int, int], types.Type] = {}  # `typeof` takes longer than all else
 
 
 class Field(NamedTuple):
@@ -78,7 +79,8 @@ def _describe(value: Any, path: str, words: list[bytes]) -> PackType:
         word = len(words) - begin
         found: types.Type
         if isinstance(entry, np.ndarray):
-            found = typeof(entry)
+            kind = entry.dtype, entry.ndim, entry.flags.num
+            found = _array_types.get(kind) or _array_types.setdefault(kind, typeof(entry))
             # No owner and no reference count: the pack keeps the array alive.
             numbers = (
                 0, 0, entry.size, entry.itemsize, entry.ctypes.data, *entry.shape, *entry.strides,
