@@ -12,7 +12,13 @@ import pytest
 from absl.testing import absltest, parameterized
 from dm_control import composer, mjcf
 from dm_env import test_utils
-from helpers import KINDS, advance, assert_goes_on, links_on_ground
+from helpers import (
+    KINDS,
+    advance,
+    assert_goes_on,
+    assert_rows_are_singles,
+    links_on_ground,
+)
 
 from trl_suite import characters, motion, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
@@ -249,6 +255,13 @@ def every_environment(id_):
             actions = random_actions(blocks, 1 if gait else 3 if high else 20)
             for ours, theirs in zip(rollout(blocks, actions), rollout(flat, actions), strict=True):
                 np.testing.assert_array_equal(ours, theirs)
+
+        def test_simulations_of_a_vector_environment_equal_single_ones(self):
+            # gait_test and high_level_test look closer.
+            limit, steps = (1, 4) if gait else (3, 8) if high else (12, 30)
+            scale, one = 0.3 if gait else 1.0, self.made(0, flat=True, step_limit=limit)
+            _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5, one=one)
+            self.assertGreaterEqual(ends, 6)
 
         if id_ in KINDS:  # with other options: in the test of each task
 

@@ -3,7 +3,7 @@
 import helpers
 import numpy as np
 from absl.testing import absltest, parameterized
-from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_singles, body, put
+from helpers import LEFT, RIGHT, advance, assert_goes_on, assert_rows_are_singles, body, made, put
 from helpers import STEP_WEIGHTS as WEIGHTS
 
 from trl_suite import motion, rendering, suite
@@ -17,7 +17,7 @@ ZERO = np.zeros(11)
 
 
 def started(**options):
-    environment = suite.make(ID, {'random': 8, 'step_limit': None, **options})
+    environment = made(ID, seed=8, step_limit=None, **options)
     return environment, environment.reset()
 
 

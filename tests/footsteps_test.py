@@ -16,6 +16,7 @@ from helpers import (
     ground,
     heading_of,
     links_on_ground,
+    made,
     put,
 )
 from helpers import STEP_WEIGHTS as WEIGHTS
@@ -34,7 +35,7 @@ SIDE = {RIGHT: -1, LEFT: 1}
 
 
 def started(id_=GENERAL, **options):
-    environment = suite.make(id_, {'random': 8, 'step_limit': None, **options})
+    environment = made(id_, seed=8, step_limit=None, **options)
     return environment, environment.reset()
 
 

@@ -1,5 +1,6 @@
-"""Shared by test modules: access to simulations, and checks of simulations and saved states."""
+"""Shared by test modules: environments, access to simulations, checks of simulations and states."""
 
+import os
 import pathlib
 import pickle
 import tempfile
@@ -23,6 +24,43 @@ STEP_WEIGHTS = {  # of the reward of footsteps
         ('heading', 0.1),
     )
 }  # fmt: skip
+
+
+# Environments.
+
+MOST_KEPT = 64
+_kept = {}  # arguments -> environment, test that used it last, options (whose objects stay alive)
+
+
+def made(*parts, seed=0, flat=False, **options):
+    """Returns an environment before its first reset, as if newly made.
+
+    It is kept for the next tests of the file, as building takes most of the time of most tests;
+    seeding restores the state of a new one. A test that changes more than the state of the
+    simulation must make its own.
+
+    Args:
+      *parts: id or specification, or character, actuation, terrain and task.
+      seed: seed of the random numbers.
+      flat: whether observations are flat.
+      **options: options of the task.
+    """
+    key, test = repr((parts, flat, sorted(options.items()))), os.environ['PYTEST_CURRENT_TEST']
+    environment, user, _ = _kept.pop(key, (None, None, None))
+    if environment is None or user == test:  # a test that asks twice compares two
+        spec = suite.combine(*parts) if len(parts) > 1 else parts[0]
+        spec = suite.find(spec) if isinstance(spec, str) else spec
+        environment = suite.build_environment(spec, options, {'flat_observation': flat})
+    _kept[key] = environment, test, options
+    while len(_kept) > MOST_KEPT:
+        _kept.pop(next(iter(_kept)))
+    environment.random_state.seed(seed)
+    return environment
+
+
+def let_go():
+    """Forgets the environments of `made`."""
+    _kept.clear()
 
 
 # Values of a simulation, by named access.
@@ -87,7 +125,7 @@ def assert_uniform(values, low, high):
 
 
 def assert_rows_are_singles(
-    id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2
+    id_, n, steps, step_limit, options=None, scale=1.0, seed=3, num_threads=2, one=None
 ):
     """Checks that simulations equal single environments with their seeds, bit for bit.
 
@@ -103,6 +141,7 @@ def assert_rows_are_singles(
       scale: scale of the random actions, a number or one for each simulation, (n, 1).
       seed: seed of the simulations.
       num_threads: number of threads.
+      one: the single environment, with flat observations; None to make one.
 
     Returns:
       What the simulations returned, a list of `Step`, and how many episodes ended.
@@ -116,11 +155,11 @@ def assert_rows_are_singles(
     first, found = environments.reset(), []
     for action in actions:
         found.append(environments.step(action))
-    task_kwargs = {'random': int(environments.seeds[0]), 'step_limit': step_limit, **options}
-    one, ends = suite.make(id_, task_kwargs, {'flat_observation': True}), 0
+    if one is None:
+        one = suite.make(id_, {'step_limit': step_limit, **options}, {'flat_observation': True})
+    ends = 0
     for env_id, own in enumerate(environments.seeds.tolist()):
-        if env_id:
-            one.random_state.seed(own)
+        one.random_state.seed(own)
         where = f'{id_}, simulation {env_id}'
         expected = one.reset().observation['observations']
         np.testing.assert_array_equal(first[env_id], expected, f'{where}, reset')
@@ -135,7 +174,6 @@ def assert_rows_are_singles(
             _assert_same_info(step.info, one.info, env_id, where)
             ends += last
     environments.close()
-    one.close()
     return found, ends
 
 

@@ -22,6 +22,7 @@ from helpers import (
     body,
     ground,
     heading_of,
+    made,
 )
 
 from trl_suite import evaluation, policies, rendering, suite
@@ -45,9 +46,8 @@ def shipped_controller():
 
 def started(id_=FOREST, **options):
     """An environment of few surprises, after a reset."""
-    options = {'random': 8, 'step_limit': None, 'start_phases': (0.0,), **options}
-    spec = id_ if not isinstance(id_, str) else suite.find(id_)
-    environment = suite.build_environment(spec, options, {})
+    options = {'step_limit': None, 'start_phases': (0.0,), **options}
+    environment = made(id_, seed=8, **options)
     return environment, environment.reset()
 
 

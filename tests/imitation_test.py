@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import made
 
 from trl_suite import characters, motion, suite, terrain
 from trl_suite.arenas import PlanarArena
@@ -134,7 +135,7 @@ class Reference:
 
 
 def started(id_, steps=0, **options):
-    environment = suite.make(id_, {'random': 8, 'step_limit': None, **options})
+    environment = made(id_, seed=8, step_limit=None, **options)
     step = environment.reset()
     rng = np.random.default_rng(9)
     for _ in range(steps):
@@ -306,7 +307,7 @@ class RewardTest(parameterized.TestCase):
 
     @parameterized.parameters(*IDS)
     def test_a_start_has_almost_full_reward(self, id_):
-        environment = suite.make(id_, {'random': 21})
+        environment = made(id_, seed=21)
         for _ in range(3):
             environment.reset()
             # No reward is given for a reset.
@@ -351,7 +352,7 @@ class ResetTest(parameterized.TestCase):
 
     @parameterized.parameters(*IDS)
     def test_on_the_ground_and_not_below(self, id_):
-        environment = suite.make(id_, {'random': 31})
+        environment = made(id_, seed=31)
         for _ in range(4):
             environment.reset()
             probe = Probe(environment)
@@ -419,7 +420,7 @@ class ResetTest(parameterized.TestCase):
     @parameterized.parameters(*EXAMPLES)
     def test_seeds(self, id_):
         def episode(seed):
-            environment = suite.make(id_, {'random': seed}, {'flat_observation': True})
+            environment = made(id_, seed=seed, flat=True)
             steps = [environment.reset()] + [
                 environment.step(np.zeros(len(environment.action_map))) for _ in range(20)
             ]
@@ -430,7 +431,7 @@ class ResetTest(parameterized.TestCase):
 
     def test_intended_spawn_is_flat_for_a_metre(self):
         for seed in range(5):
-            environment = suite.make('PD_Dog2D_Slopes_Terrain-v0', {'random': seed})
+            environment = made('PD_Dog2D_Slopes_Terrain-v0', seed=seed)
             environment.reset()
             heights = Probe(environment).ground(np.linspace(-1, 1, 81))
             np.testing.assert_array_equal(heights, 0)

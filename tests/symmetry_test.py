@@ -6,6 +6,7 @@ import tempfile
 
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import made
 
 from trl_suite import policies, suite
 from trl_suite.policies import files
@@ -38,11 +39,9 @@ CASES = (
 
 def build(case, **options):
     character, actuation, terrain, rules, own = case
-    environment = suite.build(
-        character, actuation, terrain, rules,
-        task_kwargs={'random': 3, 'step_limit': None, **own, **options},
-        environment_kwargs={'flat_observation': True},
-    )  # fmt: skip
+    environment = made(
+        character, actuation, terrain, rules, seed=3, flat=True, step_limit=None, **own, **options
+    )
     return environment, environment.reset().observation['observations']
 
 
