@@ -140,7 +140,8 @@ class FunctionTest(parameterized.TestCase):
 
     def test_long_compilations_are_announced_on_a_terminal(self):
         for terminal, seconds, lines in (
-            (True, (0.2,), 1), (True, (0.06, 0.06, 0.2), 1), (True, (0.0, 0.0), 0), (False, (0.2,), 0),
+            (True, (0.2,), 1), (True, (0.2, 0.2), 1), (True, (0.06, 0.06, 0.2), 1),
+            (True, (0.0, 0.0), 0), (False, (0.2,), 0),
         ):  # fmt: skip
             stream, announcer = io.StringIO(), module._Announcer()
             stream.isatty = lambda terminal=terminal: terminal
@@ -149,8 +150,11 @@ class FunctionTest(parameterized.TestCase):
                 contextlib.redirect_stderr(stream),
             ):
                 for each in seconds:
-                    with announcer.compiling():
-                        time.sleep(each)
+                    announcer.begin()
+                    announcer.begin()  # a function that the first one calls
+                    announcer.end()
+                    time.sleep(each)
+                    announcer.end()
             self.assertLen(stream.getvalue().splitlines(), lines)
 
 
@@ -272,6 +276,16 @@ class CacheTest(FolderTest):
         self.write('x * 10.0')
         self.assertEqual(self.ask()[0], ['11.0'])
         self.assertLen(self.folders(), 2)
+
+    def test_only_compiling_is_announced(self):
+        """Loading code from the cache is not, however long it takes."""
+        script = f"""
+            import sys
+            from trl_suite.util import compiled
+            compiled.PATIENCE, sys.stderr.isatty = 0.0, lambda: True
+            {ASK}"""
+        self.assertStartsWith(self.ask(script)[1], 'trl_suite: compiling for this machine, once;')
+        self.assertEqual(self.ask(script), (['11.0'], ''))
 
     def test_all_sources_matter(self):
         """Compiled functions hold constants of modules that have no compiled functions."""

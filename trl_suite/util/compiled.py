@@ -39,7 +39,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from trl_suite.util import interrupts
@@ -118,11 +118,7 @@ class Compiled:
                 numba.config.CACHE_DIR = before
 
     def __call__(self, *args: Any) -> Any:
-        entry = self._made.get(True)
-        if entry is not None:
-            return entry(*args)
-        with _announcer.compiling():  # at the first call
-            return self.entry(*args)
+        return self.entry(*args)
 
 
 def compiled(function: Callable[..., Any]) -> Compiled:
@@ -198,9 +194,22 @@ _setting = threading.Lock()
 def _numba() -> Any:
     """Imports Numba, postpones interrupts while it compiles, and registers the type of `Compiled`."""
     import numba
+    from numba.core import event
     from numba.extending import typeof_impl
 
     interrupts.postpone_while_compiling()
+    announcer = _Announcer()
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            announcer.begin()
+
+        def on_end(self, event: Any) -> None:
+            announcer.end()
+
+    event.register(
+        'numba:compile', Listener()
+    )  # code that is loaded from the cache causes no event
 
     @typeof_impl.register(Compiled)
     def type_of(value: Compiled, _: Any) -> Any:
@@ -272,32 +281,33 @@ class _Announcer:
     """Prints a message, once per process, if compiling takes long and stderr is a terminal."""
 
     def __init__(self) -> None:
-        self.spent, self.told = 0.0, False
-        self._lock = threading.Lock()
+        self._spent, self._begun, self._depth, self._told = 0.0, 0.0, 0, False
+        self._timer: threading.Timer | None = None
 
-    @contextlib.contextmanager
-    def compiling(self) -> Iterator[None]:
-        """Adds up the time spent inside; prints a message when it exceeds `PATIENCE`."""
-        timer = threading.Timer(max(PATIENCE - self.spent, 0.0), self._tell)
-        timer.daemon = True
-        begun = time.monotonic()
-        timer.start()
-        try:
-            yield
-        finally:
-            timer.cancel()
-            self.spent += time.monotonic() - begun
+    def begin(self) -> None:
+        """A function is about to be compiled; calls may be nested."""
+        self._depth += 1
+        if self._depth > 1 or self._told:
+            return
+        self._begun = time.monotonic()
+        self._timer = threading.Timer(max(PATIENCE - self._spent, 0.0), self._tell)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def end(self) -> None:
+        """The function is compiled; its time is added to that of earlier ones."""
+        self._depth = max(self._depth - 1, 0)  # an interrupt may have come before `begin` counted
+        if self._depth == 0 and self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+            self._spent += time.monotonic() - self._begun
 
     def _tell(self) -> None:
-        with self._lock:
-            told, self.told = self.told, True
-        if not told and sys.stderr.isatty():
+        self._told = True
+        if sys.stderr.isatty():
             print(
                 'trl_suite: compiling for this machine, once; the first steps of each kind of '
                 'environment take some seconds',
                 file=sys.stderr,
                 flush=True,
             )
-
-
-_announcer = _Announcer()
