@@ -152,7 +152,7 @@ def _sees_ground(id_: str) -> bool:
 
 
 def table(found: dict[str, Any]) -> str:
-    """Returns the results as Markdown: a row for each disturbance, a column for each environment."""
+    """Returns the results as Markdown: a table of each family with a row for each disturbance."""
     ids = [id_ for id_ in IDS if any(id_ in rows for rows in found['seeds'].values())]
     limit, seeds = found['step_limit'], ', '.join(found['seeds'])
     length = (
@@ -172,21 +172,32 @@ def table(found: dict[str, Any]) -> str:
         f'each of the seeds {seeds}{partly}{length}; a cell has the same terrains and starts as the others of its '
         'column. A dash: the ground is not observed. Steps of `FSM` environments are gait cycles, those of '
         '`HLC` footsteps, and so are their delays.',
-        '',
+    ]
+    families: dict[str, list[str]] = {}
+    for id_ in ids:
+        families.setdefault(catalogue.find(id_).domain, []).append(id_)
+    for family, of_family in families.items():
+        lines += ['', f'### Shipped policies: {family}', '', *family_table(found, of_family)]
+    return '\n'.join(lines)
+
+
+def family_table(found: dict[str, Any], ids: list[str]) -> list[str]:
+    """Returns the lines of one table: a row for each disturbance, a column for each environment."""
+    lines = [
         '| disturbance | strengths | ' + ' | '.join(f'`{id_}`' for id_ in ids) + ' |',
         '|---' * (2 + len(ids)) + '|',
     ]
     for name, unit, _, strengths in DISTURBANCES:
+        shares = [[share(found, id_, f'{name}: {text}') for text, _ in strengths] for id_ in ids]
+        if all(set(each) == {'–'} for each in shares):
+            continue
         texts = ', '.join(text for text, _ in strengths)
-        entries = []
-        for id_ in ids:
-            shares = [share(found, id_, f'{name}: {text}') for text, _ in strengths]
-            entries.append('–' if set(shares) == {'–'} else ' '.join(shares))
+        entries = ['–' if set(each) == {'–'} else ' '.join(each) for each in shares]
         lines.append(f'| {name} | {f"{texts} {unit}".strip()} | ' + ' | '.join(entries) + ' |')
     none = [pooled(found, id_, 'none') or (math.nan, math.nan) for id_ in ids]
-    cells_ = ' | '.join(f'{mean:.0f} ± {interval:.1f}' for mean, interval in none)
-    lines.append(f'| none: the return itself | 95 % confidence | {cells_} |')
-    return '\n'.join(lines)
+    returns = ' | '.join(f'{mean:.0f} ± {interval:.1f}' for mean, interval in none)
+    lines.append(f'| none: the return itself | 95 % confidence | {returns} |')
+    return lines
 
 
 def main() -> None:
