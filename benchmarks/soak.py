@@ -6,7 +6,8 @@
 Environments of all ids are run one after the other, in an order that a seed decides, each with actions
 of four kinds: uniform noise, extremes that change in every step, extremes that are held for up to 50
 steps, and numbers of up to 1e300, which are clipped. Observations, rewards and the states of the
-physics are tested for NaN and infinity after every step. The resident memory is noted after each
+physics are tested for NaN and infinity after every step. Control steps are those of 1/30 s, in gaits of
+1/600 s: a gait cycle or a footstep has many of them. The resident memory is noted after each
 environment is closed.
 
 The figures of all runs are accumulated in one file, written after each environment: a later run
@@ -76,11 +77,15 @@ def soak(spec, seconds, num_envs, threads, seed):
     environments = VectorEnvironment(spec, num_envs, threads, seed=seed)
     world = environments.task.world
     random = np.random.default_rng(seed)
-    found = {'steps': 0, 'episodes': 0, 'diverged': 0, 'not_finite': 0, 'largest': 0.0}
+    found = {'steps': 0, 'control_steps': 0, 'episodes': 0, 'diverged': 0, 'not_finite': 0, 'largest': 0.0}
     environments.reset()
+    control = world.engine.timestep * environments.task.steps_per_call  # s
     chosen, end = actions(random, (num_envs, len(environments.action_map))), None
     while end is None or time.monotonic() < end:
+        before = world.time[:num_envs].copy()
         step = environments.step(next(chosen))
+        passed = world.time[:num_envs] - before
+        passed[passed < 0] = 0.0  # a reset
         end = end or time.monotonic() + seconds  # the first step may have to compile
         observation = step.observation
         good = np.isfinite(observation).all(1) & np.isfinite(step.reward)
@@ -88,6 +93,7 @@ def soak(spec, seconds, num_envs, threads, seed):
             # The state of a simulation that diverged is replaced at its next reset.
             good &= np.isfinite(state[:num_envs]).all(1) | step.info['diverged']
         found['steps'] += num_envs
+        found['control_steps'] += round(passed.sum() / control)
         found['episodes'] += int((step.terminated | step.truncated).sum())
         found['diverged'] += int((step.info['diverged'] & step.terminated).sum())
         found['not_finite'] += int((~good).sum())
@@ -115,11 +121,13 @@ def show(figures):
     for name in names:
         found = figures['task_types'][name]
         print(
-            f'{name:20} {found["steps"]:>12,} steps {found["episodes"]:>10,} episodes '
+            f'{name:20} {found["control_steps"]:>12,} control steps {found["episodes"]:>10,} episodes '
             f'{found["diverged"]:>6} diverged {found["not_finite"]:>4} not finite, largest '
             f'{found["largest"]:.3g}'
         )
-    print(f'all: {sum(figures["task_types"][name]["steps"] for name in names):,} steps')
+    for unit in ('control_steps', 'steps'):
+        total = sum(figures['task_types'][name][unit] for name in names)
+        print(f'all: {total:,} {unit.replace("_", " ")}')
     for run in figures['runs']:
         memory = [mb for _, _, mb in run['memory']] or [0.0]
         print(
@@ -151,7 +159,7 @@ def main():
         'seed': seed, 'date': time.strftime('%Y-%m-%d', time.gmtime(begin)), 'seconds': 0.0,
         'environments': 0, 'num_envs': arguments.num_envs, 'threads': arguments.threads,
         'versions': {name: importlib.metadata.version(name) for name in ('trl_suite', 'mujoco')},
-        'memory': [],  # environments closed, steps, and MB
+        'memory': [],  # environments closed, control steps, and MB
     }  # fmt: skip
     figures['runs'].append(run)
     steps, bar = 0, tqdm(total=round(arguments.seconds), unit='s', mininterval=10)
@@ -162,14 +170,14 @@ def main():
             figures['not_finite'].append({'id': spec.id, 'seed': own, 'run': seed, **found})
         types = figures['task_types']
         types[spec.task_type] = merged(types.get(spec.task_type), found)
-        steps += found['steps']
+        steps += found['control_steps']
         run['seconds'], run['environments'] = (
             round(time.time() - begin, 1),
             run['environments'] + 1,
         )
         run['memory'].append([run['environments'], steps, round(resident_mb(), 1)])
         files.write_json(figures, arguments.file)
-        bar.set_postfix_str(f'{steps / 1e6:.2f} M steps, {run["memory"][-1][2]} MB')
+        bar.set_postfix_str(f'{steps / 1e6:.2f} M control steps, {run["memory"][-1][2]} MB')
         bar.update(min(round(run['seconds']), bar.total) - bar.n)
         if time.time() >= begin + arguments.seconds:
             break

@@ -18,7 +18,9 @@ from trl_suite.registry.task_types import TASK_TYPES
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'benchmarks'))
 import soak
 
-FIGURES = {'steps': 10, 'episodes': 2, 'diverged': 1, 'not_finite': 0, 'largest': 3.0}
+FIGURES = {
+    'steps': 10, 'control_steps': 100, 'episodes': 2, 'diverged': 1, 'not_finite': 0, 'largest': 3.0,
+}  # fmt: skip
 
 
 class SoakTest(FolderTest):
@@ -49,11 +51,25 @@ class SoakTest(FolderTest):
 
         found = soak.soak(spec, 0.0, 3, 1, 0)
         self.assertEqual((found['steps'], found['not_finite']), (3, 0))
+        self.assertEqual(found['control_steps'], 3)
         self.assertBetween(found['largest'], 0.1, 1e3)
         with mock.patch.object(soak.VectorEnvironment, 'step', broken):
             found = soak.soak(spec, 0.0, 3, 1, 0)
         self.assertEqual((found['steps'], found['not_finite']), (3, 1))
         self.assertTrue(np.isfinite(found['largest']))
+
+    def test_control_steps_of_gaits_are_those_within_cycles(self):
+        durations, step = [], soak.VectorEnvironment.step
+
+        def timed(environments, action):
+            found = step(environments, action)
+            durations.append(found.info['duration'].copy())
+            return found
+
+        with mock.patch.object(soak.VectorEnvironment, 'step', timed):
+            found = soak.soak(suite.find('FSM_Dog2D_Terrain_Mixed-v0'), 0.0, 3, 1, 0)
+        self.assertEqual(found['control_steps'], round(600 * np.sum(durations)))
+        self.assertGreater(found['control_steps'], 100)
 
     def run_soak(self, *arguments, **figures):
         seen = []
@@ -83,6 +99,7 @@ class SoakTest(FolderTest):
         self.assertEqual(max(each['largest'] for each in total), 5.0)
         (bad,) = figures['not_finite']
         self.assertEqual((bad['id'], bad['seed'], bad['run']), (*second[0], 1))
+        self.assertIn('all: 200 control steps', out)
         self.assertIn('all: 20 steps', out)
         self.assertIn(f"NOT FINITE: {{'id': '{second[0][0]}'", out)
         # A run with the same seed does the same.
