@@ -10,6 +10,10 @@ import pytest
 
 
 def pytest_configure():
+    if hasattr(libc := ctypes.CDLL(None), 'mallopt'):  # glibc
+        # Large arrays are returned to the system when they are released, and threads share a heap.
+        libc.mallopt(-3, 1 << 17)  # M_MMAP_THRESHOLD, which would rise to 32 MB by itself
+        libc.mallopt(-8, 1)  # M_ARENA_MAX
     # Background jobs of shell scripts ignore SIGINT, and so would the processes that tests start.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

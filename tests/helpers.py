@@ -28,7 +28,7 @@ STEP_WEIGHTS = {  # of the reward of footsteps
 
 # Environments.
 
-MOST_KEPT = 64
+MOST_KEPT = 24  # 10 to 20 MB each
 _kept = {}  # arguments -> environment, test that used it last, options (whose objects stay alive)
 
 
