@@ -3,7 +3,8 @@
     python examples/share_gaits.py FSM_Dog2D_Terrain_Mixed-v0 FSM_Dog2D_Terrain_Gaps-v0
 
 Observation and action are the same on all terrains. The other environments get the policy of the first
-id if its mean distance is above the 95 % interval of their shipped policy, or else of the default gait.
+id if its mean distance is above the 95 % interval of their shipped policy. One without a policy gets it if
+its mean distance is not below the interval of the default gait.
 Writes `trained/shared.json`, which `trl_suite.policies.reference` reads: ID -> `policy`, the id of the
 environment in which it was trained; `evaluation`, its results; and `before`, the results of the shipped
 policy or the default gait that it replaces.
@@ -57,8 +58,8 @@ def main() -> None:
     path = resources.directory('trained') / policies.SHARED
     for id_ in arguments.ids:
         options = arguments.episodes, train_all.SEED, arguments.threads
-        before = stored(id_, arguments.episodes)
-        if before is None and id_ in policies.available():
+        before, has_policy = stored(id_, arguments.episodes), id_ in policies.available()
+        if before is None and has_policy:
             before = evaluation.evaluate(id_, policies.reference(id_), *options)
         elif before is None:
             before = evaluation.evaluate(id_, evaluation.zero, *options, factory=True)
@@ -68,7 +69,8 @@ def main() -> None:
             f'before: {before["distance"]:.1f} m, median {before["median_distance"]:.1f} m',
             flush=True,
         )
-        if found['distance'] <= before['distance_interval'][1]:
+        low, high = before['distance_interval']
+        if found['distance'] <= (high if has_policy else low):
             continue
         shared = json.loads(path.read_text()) if path.exists() else {}
         shared[id_] = {'policy': arguments.policy, 'evaluation': found, 'before': before}
