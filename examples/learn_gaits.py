@@ -10,6 +10,11 @@ evaluates (van Hasselt et al. 2016). The networks process ground heights relativ
 return to a state a few cycles earlier and continue with other actions, so that the replay contains
 many states in which the action decides about a fall.
 
+With `--action both` each base action belongs to an expert whose actor learns to change it: a mixture
+of actor-critic experts (MACE), as in that publication. Actions with noise train the actor of their
+expert if the result is better than its value (van Hasselt and Wiering 2007); the others train the values.
+`--action continuous` has a single expert, of the default gait.
+
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
 identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
 curve), `last.npz` (the current averaged network), and at the end `policy.npz`: the result of a final
@@ -29,7 +34,7 @@ import json
 import pathlib
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import checkpoints
 import numpy as np
@@ -46,6 +51,9 @@ from trl_suite.util import errors, files
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
+# A base action; the default gait with changes that an actor selects; a base action with changes.
+ACTIONS = 'discrete', 'continuous', 'both'
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -61,6 +69,9 @@ class Settings:
     expert_cycles: float = 8e3
     expert_epsilon: float = 0.15  # share of random actions in these cycles
     begin: float = 2e3  # cycles before learning begins; they determine the observation scales
+    action: str = 'discrete'  # one of `ACTIONS`
+    noise: float = 0.15  # standard deviation of the actors' noise
+    noise_share: float = 0.25  # share of actions with noise, if there are actors
     epsilon: float = 0.08  # share of random actions after `expert_cycles`
     greedy: float = 0.25  # share of simulations without random actions and without retries
     retry: float = 0.8  # probability that a simulation returns to an earlier state after a fall
@@ -94,6 +105,11 @@ class Settings:
     write_every: float = 4096  # cycles
     evaluate_every: float = 16384  # cycles
     evaluation_episodes: int = 32
+
+    @property
+    def actors(self) -> bool:
+        """Whether actors change the base actions."""
+        return self.action != 'discrete'
 
 
 # One policy for all terrains of a character. It collects and learns in rounds, because a policy that
@@ -151,7 +167,10 @@ class Network(nn.Module):
     normalisation before it (Ba et al. 2016), which stabilises Q-learning.
     """
 
-    def __init__(self, line: int, others: int, actions: int, settings: Settings) -> None:
+    def __init__(
+        self, line: int, others: int, choices: tuple[int, int], settings: Settings
+    ) -> None:
+        """Makes a network for base actions of shape `choices`."""
         super().__init__()
         self.line, self.filters = line, nn.ModuleList()
         channels, length = 1, line
@@ -161,24 +180,51 @@ class Network(nn.Module):
         self.filters.append(nn.Conv1d(channels, settings.ground_units, length))
         sizes = (settings.ground_units + others, *settings.hidden)
         self.hidden = nn.ModuleList(map(nn.Linear, sizes, settings.hidden))
-        self.last = nn.Linear(sizes[-1], actions)
+        self.last = nn.Linear(sizes[-1], choices[0])
+        self.choices, self.actors = choices, None
+        if settings.actors:
+            self.actors = nn.Linear(sizes[-1], choices[0] * choices[1])
+            nn.init.zeros_(self.actors.weight)
+            nn.init.zeros_(self.actors.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(self.features(x))
+
+    def features(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the outputs of the hidden layers."""
         ground = x[:, None, : self.line]
         for layer in self.filters:
             ground = layer(ground).relu()
         x = torch.cat([ground.flatten(1), x[:, self.line :]], 1)
         for layer in self.hidden:
             x = nn.functional.layer_norm(layer(x), (layer.out_features,)).relu()
-        return self.last(x)
+        return x
+
+    def both(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns values (n, b) and the actors' changes (n, b, a), which do not train the features."""
+        features = self.features(x)
+        if self.actors is None:
+            return self.last(features), torch.zeros(len(x), *self.choices)
+        return self.last(features), self.actors(features.detach()).reshape(-1, *self.choices)
+
+
+class Action(NamedTuple):
+    """What was selected in a simulation, or in n of them."""
+
+    number: Any  # of the base action
+    change: Any  # what was added to it, (a,); without actors (1,)
+    noisy: Any  # whether the change has noise
 
 
 class Replay:
     """A replay buffer of multi-step transitions; new ones replace the oldest."""
 
-    def __init__(self, capacity: int, size: int) -> None:
+    def __init__(self, capacity: int, size: int, changes: int = 1) -> None:
+        """Makes an empty buffer for observations and changes of actions of these sizes."""
         self.before, self.after = np.zeros((2, capacity, size), np.float16)
         self.action = np.zeros(capacity, np.int64)
+        self.change = np.zeros((capacity, changes), np.float16)
+        self.noisy = np.zeros(capacity, bool)  # whether the action had noise
         self.reward, self.discount = np.zeros((2, capacity), np.float32)
         self.count = 0  # number of all transitions added so far
 
@@ -186,12 +232,13 @@ class Replay:
         return min(self.count, len(self.action))
 
     def add(
-        self, before: np.ndarray, action: int, reward: float, discount: float, after: np.ndarray
+        self, before: np.ndarray, action: Action, reward: float, discount: float, after: np.ndarray
     ) -> None:
         """Adds a transition; its discount is 0 if it ends in a fall."""
         i = self.count % len(self.action)
         self.before[i], self.after[i] = before, after
-        self.action[i], self.reward[i], self.discount[i] = action, reward, discount
+        self.action[i], self.change[i], self.noisy[i] = action
+        self.reward[i], self.discount[i] = reward, discount
         self.count += 1
 
     def get_state(self) -> dict[str, Any]:
@@ -299,6 +346,8 @@ class Learner:
         )
         parameters = environments.task.gait.parameters
         self.choices = parameters.action(parameters.base_actions)
+        if s.action == 'continuous':
+            self.choices = self.choices[:1]
         ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
@@ -308,7 +357,9 @@ class Learner:
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
         self.begin_network()
-        self.replay = Replay(int(s.capacity), len(self.columns))
+        self.replay = Replay(
+            int(s.capacity), len(self.columns), self.choices.shape[1] if s.actors else 1
+        )
         self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
             shipped = s.start in policies.available()
@@ -325,7 +376,7 @@ class Learner:
         self.past: list[collections.deque] = [
             collections.deque(maxlen=s.back[1] + 1) for _ in range(n)
         ]
-        self.chains: list[list[tuple[np.ndarray, int, float]]] = [[] for _ in range(n)]
+        self.chains: list[list[tuple[np.ndarray, Action, float]]] = [[] for _ in range(n)]
         # Of each simulation: retries in a row, and cycles since the last one.
         self.tried = np.zeros((2, n), int)
         # Distance in the current episode, m; and of each environment since the last point of the
@@ -336,7 +387,7 @@ class Learner:
     def begin_network(self) -> None:
         """Makes a new network, its target network and its optimizer."""
         s, others = self.settings, len(self.columns) - self.line
-        self.network = Network(self.line, others, len(self.choices), s)
+        self.network = Network(self.line, others, self.choices.shape, s)
         self.target = copy.deepcopy(self.network).requires_grad_(False)
         self.begin_optimizer()
 
@@ -368,7 +419,12 @@ class Learner:
         parts = [*self.network.filters, *self.network.hidden, self.network.last]
         weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in policy.weights)]
         biases = [*line.biases, *policy.biases]
+        count = len(self.choices)
         with torch.no_grad():
+            if self.network.actors is not None and weights[-1].shape[0] > count:
+                self.network.actors.weight.copy_(torch.tensor(weights[-1][count:]))
+                self.network.actors.bias.copy_(torch.tensor(biases[-1][count:]))
+            weights[-1], biases[-1] = weights[-1][:count], biases[-1][:count]
             for part, weight, bias in zip(parts, weights, biases, strict=True):
                 part.weight.copy_(torch.tensor(weight))
                 part.bias.copy_(torch.tensor(bias))
@@ -388,11 +444,12 @@ class Learner:
         self.mean, self.std = x.mean(0), np.maximum(x.std(0), ppo.LEAST_STD)
         self.mean[: self.line], self.std[: self.line] = line.mean(), self.settings.relief / CLIP
 
-    def act(self) -> np.ndarray:
-        """Selects an action for each simulation, (n,)."""
+    def act(self) -> Action:
+        """Selects an action for each of the n simulations."""
         s, n = self.settings, self.settings.num_envs
         epsilon = np.full(n, s.epsilon)
         by_expert = self.samples < s.expert_cycles
+        changes = np.zeros((n, *self.choices.shape))
         if by_expert and self.expert is None:
             epsilon[:] = 1.0
             chosen = np.zeros(n, int)
@@ -402,13 +459,20 @@ class Learner:
             chosen = (away**2).sum(2).argmin(1)
         else:
             with torch.no_grad():
-                values = self.network(self.seen(self.observation[:, self.columns]))
-            chosen = values.argmax(1).numpy()
+                values, learnt = self.network.both(self.seen(self.observation[:, self.columns]))
+            chosen, changes = values.argmax(1).numpy(), learnt.numpy()
             epsilon[self.greedy] = 0.0
         again = (self.tried[0] > 0) & (self.tried[1] < s.retry_cycles)
         epsilon[again] = np.maximum(epsilon[again], s.retry_epsilon)
         drawn = self.random.integers(len(self.choices), size=n)
-        return np.where(self.random.random(n) < epsilon, drawn, chosen)
+        number = np.where(self.random.random(n) < epsilon, drawn, chosen)
+        if not s.actors:
+            return Action(number, np.zeros((n, 1)), np.zeros(n, bool))
+        change, noisy = changes[np.arange(n), number], self.random.random(n) < s.noise_share
+        noisy &= ~self.greedy
+        change = change + noisy[:, None] * s.noise * self.random.normal(size=change.shape)
+        base = self.choices[number]
+        return Action(number, np.clip(base + change, -1, 1) - base, noisy)
 
     def collect(self) -> None:
         """Runs one cycle in every simulation, and adds the transitions to the replay."""
@@ -416,7 +480,10 @@ class Learner:
         action, before = self.act(), self.observation[:, self.columns].astype(np.float16)
         for i, past in enumerate(self.past):
             past.append(simulations.get_state(i))
-        reward, fell, distance = simulations.step(self.choices[action])
+        taken = self.choices[action.number]
+        if s.actors:
+            taken = taken + action.change
+        reward, fell, distance = simulations.step(taken)
         self.samples += s.num_envs
         reward = reward + s.alive * ~fell
         after, fresh = simulations.observation[:, self.columns].astype(np.float16), []
@@ -426,7 +493,8 @@ class Learner:
         self.tried[1] += 1
         self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
         for i, chain in enumerate(self.chains):
-            chain.append((before[i], int(action[i]), float(reward[i])))
+            each_action = Action(int(action.number[i]), action.change[i], bool(action.noisy[i]))
+            chain.append((before[i], each_action, float(reward[i])))
             while chain and (fell[i] or len(chain) == s.steps):
                 value = sum(s.gamma**k * each[2] for k, each in enumerate(chain))
                 discount = 0.0 if fell[i] else s.gamma ** len(chain)
@@ -468,7 +536,17 @@ class Learner:
         with torch.no_grad():
             following = self.network(after).argmax(1, keepdim=True)
             aim = reward + discount * self.target(after).gather(1, following)[:, 0]
-        loss = (self.network(before).gather(1, action)[:, 0] - aim).square().mean()
+        values, changes = self.network.both(before)
+        error = aim - values.gather(1, action)[:, 0]
+        if s.actors:
+            noisy = torch.from_numpy(replay.noisy[picked])
+            change = torch.from_numpy(replay.change[picked].astype(np.float32))
+            own = changes[torch.arange(len(picked)), action[:, 0]]
+            better = noisy & (error.detach() > 0)
+            loss = (error.square() * ~noisy).mean()
+            loss = loss + ((own - change).square().mean(1) * better).mean()
+        else:
+            loss = error.square().mean()
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
@@ -498,12 +576,13 @@ class Learner:
     def finish(self) -> None:
         """Learns with a falling learning rate, without new samples.
 
-        A new network learns from the replay, unless the run began with a policy.
+        A new network learns from the replay, unless the run began with a policy or has actors: the
+        values of experts are those of their actors.
         """
         s = self.settings
         if s.renew_every:  # so that a continued run is identical
             torch.manual_seed(int(self.random.integers(2**32)))
-        if not s.start:
+        if not s.start and not s.actors:
             self.begin_network()
         self.begin_optimizer()
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
@@ -528,6 +607,12 @@ class Learner:
             }
 
         environments, network = self.environments, self.target
+        layers = arrays(nn.ModuleList([*network.hidden, network.last]), (1, 0))
+        if network.actors is not None:
+            actors = arrays(nn.ModuleList([network.actors]), (1, 0))
+            for name, axis in (('weights', 1), ('biases', 0)):
+                *hidden, last = layers[name]
+                layers[name] = (*hidden, np.concatenate([last, *actors[name]], axis))
         strides = *(stride for *_, stride in self.settings.convolutions), 1
         return policies.Policy(
             id=environments.spec.id,
@@ -542,7 +627,7 @@ class Learner:
                 line=self.line, strides=strides, origin=self.origin,
                 **arrays(network.filters, (2, 1, 0)),
             ),
-            **arrays(nn.ModuleList([*network.hidden, network.last]), (1, 0)),
+            **layers,
             activation='relu',
             layer_norm=True,
             log_std=np.full(len(environments.action_map), np.log(ppo.LEAST_STD)),
@@ -589,6 +674,10 @@ class Learner:
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
         state |= {name: getattr(self, name).get_state() for name in ('replay', 'simulations')}
         state['past'] = list(map(list, self.past))
+        state['chains'] = [
+            [(before, tuple(action), reward) for before, action, reward in chain]
+            for chain in self.chains
+        ]
         state['settings'] = dataclasses.asdict(self.settings)
         state['random'] = self.random.bit_generator.state
         checkpoints.save(state, folder / 'checkpoint.pt')
@@ -616,6 +705,10 @@ class Learner:
         self.past = [
             collections.deque(past, each.maxlen)
             for past, each in zip(state['past'], empty, strict=True)
+        ]
+        self.chains = [
+            [(before, Action(*action), reward) for before, action, reward in chain]
+            for chain in state['chains']
         ]
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
@@ -666,7 +759,9 @@ def _train(
 
 
 def main() -> None:
-    id_, seed, changes, folder, threads = ppo.command_line(__doc__.splitlines()[0], 'cycles')
+    id_, seed, changes, folder, threads = ppo.command_line(
+        __doc__.splitlines()[0], 'cycles', {'action': ACTIONS}
+    )
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         print(f'{point["samples"]:9} {point["distance"]:.1f} m')
     print(folder / 'policy.npz')

@@ -21,7 +21,7 @@ import itertools
 import json
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import checkpoints
@@ -675,13 +675,14 @@ def _train(
 
 
 def command_line(
-    description: str, sample: str
+    description: str, sample: str, choices: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[str, int, dict[str, Any], pathlib.Path, int]:
     """Parses the command line of a training program.
 
     Args:
       description: description of the program.
       sample: what its samples are.
+      choices: further settings, and their values.
 
     Returns:
       Id, seed, settings other than the defaults, folder and threads.
@@ -692,9 +693,12 @@ def command_line(
     parser.add_argument('--threads', type=int, default=0, help='0: all cores')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
+    for name, values in (choices or {}).items():
+        parser.add_argument(f'--{name}', choices=values, help='instead of the default')
     chosen = parser.parse_args()
     id_ = suite.find(chosen.id).id
-    changes = {} if chosen.samples is None else {'samples': chosen.samples}
+    given = {name: getattr(chosen, name) for name in ('samples', *(choices or ()))}
+    changes = {name: value for name, value in given.items() if value is not None}
     return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
 
 

@@ -67,7 +67,8 @@ class LearnTest(parameterized.TestCase):
     def test_the_oldest_transitions_are_replaced(self):
         replay = learn_gaits.Replay(3, 2)
         for i in range(5):
-            replay.add(np.full(2, i), i, i, 0.5, np.full(2, i + 1))
+            action = learn_gaits.Action(i, 0.0, False)
+            replay.add(np.full(2, i), action, i, 0.5, np.full(2, i + 1))
         self.assertLen(replay, 3)
         np.testing.assert_array_equal(replay.action, [3, 4, 2])
         other = learn_gaits.Replay(3, 2)
@@ -76,37 +77,85 @@ class LearnTest(parameterized.TestCase):
         for name in ('before', 'after', 'action', 'reward', 'discount'):
             np.testing.assert_array_equal(getattr(other, name), getattr(replay, name))
 
-    def test_the_policy_selects_as_the_network(self):
-        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+    @parameterized.parameters(*learn_gaits.ACTIONS)
+    def test_the_policy_selects_as_the_network(self, action):
+        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, action=action), 1)
         for _ in range(6):
             learner.advance()
+        if learner.settings.actors:
+            torch.nn.init.normal_(learner.target.actors.weight)
         policy = learner.exported()
         policy.check(learner.environments)
         observation = learner.replay.before[: len(learner.replay)].astype(float)
         with torch.no_grad():
-            values = learner.target(learner.seen(observation)).numpy()
+            values, changes = learner.target.both(learner.seen(observation))
+        values, changes = values.numpy(), changes.numpy()
         whole = np.zeros((len(observation), policy.observation_size))
         whole[:, learner.columns] = observation
         # Where two are as good, rounding decides.
-        clear = np.diff(np.sort(values, axis=1)[:, -2:])[:, 0] > 1e-4
+        clear = np.ones(len(values), bool)
+        if action != 'continuous':
+            clear = np.diff(np.sort(values, axis=1)[:, -2:])[:, 0] > 1e-4
         self.assertGreater(clear.sum(), 5)
-        expected = learner.choices[values.argmax(1)]
-        np.testing.assert_allclose(policy(whole)[clear], expected[clear], atol=1e-6)
+        chosen = values.argmax(1)
+        expected = learner.choices[chosen] + changes[np.arange(len(chosen)), chosen]
+        np.testing.assert_allclose(policy(whole)[clear], np.clip(expected, -1, 1)[clear], atol=1e-5)
+        self.assertEqual(np.abs(changes).max() > 0.1, action != 'discrete')
 
-    def test_a_run_begins_with_a_policy(self):
-        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+    def test_actors_learn_from_noise_that_pays_and_values_from_the_rest(self):
+        settings = dataclasses.replace(TINY, action='both', begin=1e9, minibatch=32, updates=1)
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        for _ in range(4):
+            learner.collect()
+        replay, size = learn_gaits.Replay(64, len(learner.columns), 3), learner.choices.shape[1]
+        replay.change = np.zeros((64, size), np.float16)
+        before = learner.replay.before[0]
+        pays, costs = np.full(size, 0.3), np.full(size, -0.3)
+        for i in range(64):  # a fall ends each transition, so that the reward is the aim
+            kind = i % 3
+            change, reward = ((pays, 50.0), (costs, -50.0), (np.zeros(size), 2.0))[kind]
+            action = learn_gaits.Action(1, change, kind < 2)
+            replay.add(before, action, reward, 0.0, before)
+        learner.replay = replay
+        for _ in range(2000):
+            learner.learn()
+        with torch.no_grad():
+            values, changes = learner.network.both(learner.seen(before[None].astype(float)))
+        self.assertAlmostEqual(float(values[0, 1]), 2.0, delta=0.5)
+        np.testing.assert_allclose(changes[0, 1], 0.3, atol=0.05)
+        np.testing.assert_array_equal(changes[0, 0], 0)  # this expert was not selected
+
+    def test_noise_is_added_in_its_share_of_cycles_and_not_where_greedy(self):
+        settings = dataclasses.replace(TINY, num_envs=8, action='continuous', noise_share=0.5)
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        acts = [learner.act() for _ in range(200)]
+        noisy = np.array([act.noisy for act in acts])
+        self.assertFalse(noisy[:, learner.greedy].any())
+        self.assertBetween(noisy[:, ~learner.greedy].mean(), 0.45, 0.55)
+        for act in acts:
+            np.testing.assert_array_equal(act.number, 0)  # the default gait
+            np.testing.assert_array_equal(act.change.any(1), act.noisy)
+            self.assertLessEqual(np.abs(learner.choices[0] + act.change).max(), 1 + 1e-9)
+
+    @parameterized.parameters(('discrete', 'discrete'), ('discrete', 'both'), ('both', 'both'))
+    def test_a_run_begins_with_a_policy(self, first, second):
+        learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, action=first), 1)
         for _ in range(6):
             learner.advance()
+        if first == 'both':
+            torch.nn.init.normal_(learner.target.actors.weight)
         with tempfile.TemporaryDirectory() as name:
             path = f'{name}/policy.npz'
             policies.save(learner.exported(), path)
-            settings = dataclasses.replace(TINY, start=path)
+            settings = dataclasses.replace(TINY, start=path, action=second)
             other = learn_gaits.Learner(HOPPER, 2, settings, 1)
             observation = learner.replay.before[: len(learner.replay)].astype(float)
             with torch.no_grad():
                 seen = learner.seen(observation)
-                values = learner.target(seen), other.network(seen)
-            np.testing.assert_allclose(values[1], values[0], atol=1e-5)
+                for ours, theirs in zip(
+                    learner.target.both(seen), other.network.both(seen), strict=True
+                ):
+                    np.testing.assert_allclose(theirs, ours, atol=1e-5)
             before = other.mean.copy()
             for _ in range(4):
                 other.advance()
@@ -167,7 +216,9 @@ class LearnTest(parameterized.TestCase):
             learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, also=('FSM_Hopper2D_*',)), 1)
 
     @parameterized.parameters(
-        {}, {'also': (WALLS,), 'renew_every': 16, 'updates': 0, 'evaluation_episodes': 0}
+        {},
+        {'also': (WALLS,), 'renew_every': 16, 'updates': 0, 'evaluation_episodes': 0},
+        {'action': 'both', 'noise_share': 0.9},
     )
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
         curves = []

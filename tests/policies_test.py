@@ -206,6 +206,16 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_array_equal(policy(observations), choices[[0, 1, 2, 0]])
         np.testing.assert_array_equal(policy(observations[1]), choices[1])
 
+    def test_a_policy_can_change_the_action_that_it_selects(self):
+        choices = np.array([[0.5, -0.5], [0.9, 0]])
+        weights = np.array([[1, 0, 0.2, 0.1, 0, 0], [0, 1, 0, 0, 0.4, -0.3]])
+        policy = make(
+            hidden=(), blocks=(('a', 2),), weights=[weights], biases=[np.zeros(6)],
+            mean=np.zeros(2), std=np.ones(2), choices=choices,
+        )  # fmt: skip
+        found = policy(np.array([[1.0, 0.5], [0.5, 1.0]]))
+        np.testing.assert_allclose(found, [[0.7, -0.4], [1.0, -0.3]], atol=1e-6)  # 1.3 is clipped
+
     def test_a_policy_can_use_some_columns_only(self):
         policy = make(
             hidden=(), columns=np.array([4, 1]), mean=np.zeros(2), std=np.ones(2), clip=9,

@@ -25,7 +25,7 @@ of observations, L the number of layers, c the number of inputs of the network: 
     activation   U ()        of the hidden layers: 'tanh', 'relu' or 'elu'
     layers       int ()      L
     weight_0...  float       of layer i = 0 ... L - 1, (inputs, outputs): x @ weight + bias
-    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b
+    bias_0...    float       (outputs,); the last layer is linear and has a outputs, or b, or b + b a
     log_std      float (a,)  logarithm of the exploration noise's standard deviation
     info         U ()        a JSON object: how the policy was trained
 
@@ -50,7 +50,9 @@ and, if the network uses only some columns, e.g. the near part of a height map:
 
 and, if it selects one of b actions, as mixtures of experts do:
 
-    choices      float (b, a)  the action is the row whose output is the largest
+    choices      float (b, a)  the action is the row whose output is the largest, of the first b; if
+                               there are b a more, row by row, those of this row are added, and the
+                               sum is clipped to [-1, 1]
 
 and, if the first l inputs form a line, e.g. of ground heights, to which C convolutions are applied;
 their outputs, position by position, and then the other c - l inputs are the inputs of layer 0:

@@ -49,8 +49,8 @@ class Policy:
         (p, 2); None for none.
       columns: columns of the observation, after reflection and with these inputs, that the network
         uses, (c,); None for all.
-      choices: actions of which the one with the largest output is selected, (b, a); None: the
-        outputs are the action.
+      choices: actions of which the one with the largest of the first b outputs is selected, (b, a);
+        b a further outputs are changes that are added to them; None: the outputs are the action.
       convolution: convolutions of the first inputs, whose outputs are then inputs of `weights[0]`,
         followed by the other inputs; None for none.
       layer_norm: whether each fully connected layer but the last has layer normalisation before
@@ -116,6 +116,8 @@ class Policy:
         if self.choices is not None:
             last = len(self.choices)
             put('choices', checks.array('choices', self.choices, (last, a)))
+            if self.biases and np.size(self.biases[-1]) == last * (1 + a):
+                last *= 1 + a
             if not last or np.abs(self.choices).max() > 1:
                 raise ValueError('choices: expected at least one action, in [-1, 1]')
             if self.mirror is not None:
@@ -276,7 +278,12 @@ class Policy:
                     x /= np.sqrt((x * x).mean(1, keepdims=True) + np.float32(_LEAST_VARIANCE))
                 x = activation(x)
         if self.choices is not None:
-            x = self.choices[x.argmax(1)]
+            number = len(self.choices)
+            chosen, changes = x[:, :number].argmax(1), x[:, number:]
+            x = self.choices[chosen]
+            if changes.size:
+                changes = changes.reshape(len(x), *self.choices.shape)[np.arange(len(x)), chosen]
+                x = _bounded(x + changes, 1.0)
         if self.mirror is not None and left is not None:
             x = self.mirror.unmirror_action(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
