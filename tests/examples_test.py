@@ -13,6 +13,7 @@ from unittest import mock
 
 import numpy as np
 from absl.testing import absltest, parameterized
+from helpers import FolderTest
 
 from trl_suite import characters, policies
 from trl_suite.registry import catalogue
@@ -21,6 +22,7 @@ from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import checkpoints
+import compare_actions
 import compare_transfer
 import evaluate_plans
 import expert
@@ -29,6 +31,59 @@ import ppo_settings
 import share_gaits
 import train_all
 import train_randomized
+
+
+class CompareActionsTest(FolderTest):
+    def run_program(self, *arguments):
+        trained = []
+
+        def train(id_, action, seed, cycles, runs):
+            trained.append((action, seed))
+            return {'distance': 100.0 * seed + len(action), 'speed': 3.0}
+
+        path = self.folder / 'found.json'
+        argv = ['compare_actions.py', '--json', str(path), *arguments]
+        with (
+            mock.patch.object(compare_actions, 'train', train),
+            mock.patch.object(sys, 'argv', argv),
+            contextlib.redirect_stdout(io.StringIO()) as out,
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            compare_actions.main()
+        return trained, out.getvalue()
+
+    def test_finished_runs_are_kept_and_shown(self):
+        first, out = self.run_program()
+        self.assertEqual(first, [(action, 1) for action in ('discrete', 'continuous', 'both')])
+        self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
+        second, out = self.run_program('--seeds', '1', '2')
+        self.assertEqual(second, [(action, 2) for action, _ in first])
+        self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
+        with self.assertRaisesRegex(ValueError, '32768 cycles; give another --json'):
+            self.run_program('--cycles', '100')
+
+    def test_a_run_has_the_settings_of_its_action(self):
+        asked = []
+
+        def train(id_, seed, settings, folder, threads):
+            asked.append((settings, folder))
+            folder.mkdir(parents=True)
+            policies.save(policies.reference(id_), folder / 'policy.npz')
+            return [{'samples': 8, 'distance': 3.0}]
+
+        with (
+            mock.patch.object(compare_actions, 'EPISODES', 1),
+            mock.patch.object(compare_actions.learn_gaits, 'train', train),
+        ):
+            found = compare_actions.train(
+                'FSM_Hopper2D_Terrain_Gaps-v0', 'both', 3, 64, self.folder
+            )
+        ((settings, _),) = asked
+        self.assertEqual(
+            (settings.action, settings.samples, settings.expert_cycles), ('both', 64, 0)
+        )
+        self.assertEqual(found['curve'], [[8, 3.0]])
+        self.assertGreater(found['distance'], 2.0)
 
 
 class JobsTest(parameterized.TestCase):

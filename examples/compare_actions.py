@@ -1,0 +1,104 @@
+"""Compares base actions of a gait, continuous changes of the default gait, and both (MACE).
+
+    python examples/compare_actions.py                     # one seed
+    python examples/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json
+    python examples/compare_actions.py --json benchmarks/gait_actions.json --page docs/findings.md
+
+Every result is a run of `learn_gaits.py` with its default settings, random first actions instead of
+those of a shipped policy, and the same number of cycles. The policy is then evaluated in episodes
+without a limit of distance. Finished runs are kept in the JSON file and not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from typing import Any
+
+import learn_gaits
+import numpy as np
+import tqdm
+
+from trl_suite import evaluation, policies
+from trl_suite.util import files
+from trl_suite.util.program import begin_script
+
+ID = 'FSM_Dog2D_Terrain_Mixed-v0'
+EPISODES, SEED = 100, 0
+NAMES = {  # of actions
+    'discrete': 'one of the base actions', 'continuous': 'default gait with changes',
+    'both': 'base action with changes (MACE)',
+}  # fmt: skip
+_MARK, _END = '<!-- actions, written by examples/compare_actions.py -->', '<!-- /actions -->'
+
+
+def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -> dict[str, Any]:
+    """Trains and evaluates one policy."""
+    settings = learn_gaits.Settings(
+        action=action, samples=cycles, expert_cycles=0, evaluate_every=cycles / 4,
+        evaluation_episodes=0,
+    )  # fmt: skip
+    folder = runs / f'{id_}_{action}_{cycles:g}' / f'seed_{seed}'
+    curve = learn_gaits.train(id_, seed, settings, folder, 1)
+    found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), EPISODES, SEED, 1)
+    keys = 'distance', 'distance_interval', 'median_distance', 'speed'
+    return {
+        **{key: found[key] for key in keys},
+        'curve': [[point['samples'], point['distance']] for point in curve],
+    }
+
+
+def table(found: dict[str, Any]) -> str:
+    """Returns the results as Markdown."""
+    results = found['results']
+    seeds = sorted({int(key.rsplit('/', 1)[1]) for key in results})
+    lines = [
+        f'Distance to the first fall in `{found["id"]}` after {found["cycles"]:g} cycles, mean of {EPISODES} '
+        f'episodes, m; seeds {", ".join(map(str, seeds))}:',
+        '',
+        '| action | ' + ' | '.join(f'seed {seed}' for seed in seeds) + ' | mean | speed, m/s |',
+        '| --- ' * (3 + len(seeds)) + '|',
+    ]
+    for action, name in NAMES.items():
+        of_seeds = [results.get(f'{action}/{seed}') for seed in seeds]
+        done = [each for each in of_seeds if each is not None]
+        if not done:
+            continue
+        cells = [f'{each["distance"]:.0f}' if each else '–' for each in of_seeds]
+        for key, digits in (('distance', 0), ('speed', 1)):
+            cells.append(f'{np.mean([each[key] for each in done]):.{digits}f}')
+        lines.append(f'| {name} | ' + ' | '.join(cells) + ' |')
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seeds', type=int, nargs='+', default=[1])
+    parser.add_argument('--cycles', type=float, default=32768)
+    parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/actions'))
+    parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/actions.json'))
+    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
+    arguments = parser.parse_args()
+    found: dict[str, Any] = {'id': ID, 'cycles': arguments.cycles, 'results': {}}
+    if arguments.json.exists():
+        found = json.loads(arguments.json.read_text())
+        if found['cycles'] != arguments.cycles:
+            raise ValueError(
+                f'{arguments.json} has {found["cycles"]:g} cycles; give another --json'
+            )
+    jobs = [(action, seed) for seed in arguments.seeds for action in learn_gaits.ACTIONS]
+    for action, seed in tqdm.tqdm(jobs, unit='run'):
+        if (key := f'{action}/{seed}') in found['results']:
+            continue
+        found['results'][key] = train(ID, action, seed, arguments.cycles, arguments.runs)
+        files.write_json(found, arguments.json)
+    text = table(found)
+    print(text)
+    if arguments.page is not None:
+        files.replace_between(arguments.page, _MARK, _END, text)
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()
