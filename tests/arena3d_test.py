@@ -1,5 +1,6 @@
 """Tests of the three-dimensional arena: the collision geometry is the ground, and it moves."""
 
+import dataclasses
 import pickle
 
 import mujoco
@@ -349,6 +350,30 @@ class DynamicsTest(parameterized.TestCase):
         self.assertGreater(outside.max(), 0.05)
         self.assertLess(fastest, 2.2 * speed + 0.05)  # pushed, not shot off
         self.assertGreater(fastest, 0.5 * speed)
+
+    def test_moving_boxes_yield_to_what_is_caught_between_them(self):
+        stage = Stage('dynamic_obstacles3d', (5,), load=CUBE)
+        ground = terrain.SpatialGround(stage.arena.terrain, 5)
+        end = np.array([[2.0, 0], [-2, 0]])
+        movers = type(ground.layout.movers)(
+            start=-end, end=end, half_size=np.full((2, 2), 0.4), height=np.ones(2),
+            speed=np.full(2, 1.3), phase=np.zeros(2), direction=np.ones(2),
+        )  # fmt: skip
+        ground.layout = dataclasses.replace(ground.layout, movers=movers)
+        stage.arena.begin_episode(0, ground)
+        stage.put((0, 0, 0.1))  # it is reached after 1.15 s, from both sides
+        gaps, speeds = [], []
+        for _ in range(90):
+            stage.run(1 / 30)
+            centres, dof = stage.arena.surroundings.centres()[0, :2, 0], stage.arena._dof[:2]
+            gaps.append(centres[1] - centres[0] - 0.8)
+            speeds.append(np.abs(stage.world.qvel[0, dof]).max())
+        self.assertGreater(min(gaps), 0.2 - 0.06)  # the cube has 0.2 m
+        self.assertLess(max(speeds[60:]), 0.2)  # they would pass through each other at 1.3
+        np.testing.assert_allclose(stage.position[0], (0, 0, 0.1), atol=0.05)
+        stage.put((0, 4, 0.1))
+        stage.run(2.0)
+        np.testing.assert_allclose(stage.world.qvel[0, dof], 1.3, atol=0.01)
 
     def test_boxes_keep_their_speed_and_path(self):
         stage = Stage('dynamic_obstacles3d', (7,))

@@ -27,8 +27,9 @@ TERRAIN = {
     'conveyor3d': _BELTS,
     'conveyor3d_wide': _BELTS,
     'dynamic_obstacles3d': (
-        'moving boxes have an armature of 10^6 kg: they push and carry other bodies, which cannot stop '
-        'them; in the original they are kinematic, and have a mass of 1 kg in contacts'
+        'moving boxes have an armature of 2000 kg and push with up to 2000 N in the long run: they push '
+        'and carry other bodies, and yield to what is caught between two of them; in the original they '
+        'are kinematic, and have a mass of 1 kg in contacts'
     ),
     'mixed_humanoid': 'the terrain is inferred: slopes_mixed_humanoid without slopes',
     'obstacles3d': _OVERLAPS,

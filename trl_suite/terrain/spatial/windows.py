@@ -24,7 +24,8 @@ ROOM = 8  # entries of `bin_boxes` per bin and box
 SAMPLES = 32  # of a map, along each axis
 AHEAD = (-1.0, 10.0)  # m; extent of a map along the heading
 ASIDE = 5.5  # m; extent to each side
-SPEED_ERROR = 0.005  # m/s; deviation above which the speed of moving boxes is reset
+SPEED_ERROR = 0.005  # m/s; deviation above which the speed of moving boxes is restored
+REGAINED = 1 / 30  # m/s; at most so much near the character, in each control step
 
 _FORWARD = np.linspace(*AHEAD, SAMPLES)
 _RIGHT = np.linspace(-ASIDE, ASIDE, SAMPLES)
@@ -241,7 +242,10 @@ def see_movers(i: int, qpos: np.ndarray, ground: SpatialWindows) -> None:
 def keep_moving(
     i: int, x: float, y: float, qpos: np.ndarray, qvel: np.ndarray, ground: SpatialWindows
 ) -> bool:
-    """Reverses moving boxes, and resets the speeds of all of them if one deviates.
+    """Reverses moving boxes, and restores the speeds of all of them if one deviates.
+
+    Near the character a box regains its speed slowly: if it could not be stopped, two of them would
+    squeeze a leg between them with any force.
 
     Args:
       i: number of the simulation.
@@ -261,6 +265,11 @@ def keep_moving(
     if wrong:
         for k in range(ground.mover_top.shape[1]):
             speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
+            middle_x, middle_y = _mover_middle(i, k, ground)
+            away_x, away_y = middle_x - x, middle_y - y
+            if away_x * away_x + away_y * away_y <= _FAR_AWAY:  # else it may just have reversed
+                now = qvel[i, ground.mover_dof[k]]
+                speed = min(max(speed, now - REGAINED), now + REGAINED)
             qvel[i, ground.mover_dof[k]] = speed
     return wrong
 
