@@ -77,7 +77,14 @@ def soak(spec, seconds, num_envs, threads, seed):
     environments = VectorEnvironment(spec, num_envs, threads, seed=seed)
     world = environments.task.world
     random = np.random.default_rng(seed)
-    found = {'steps': 0, 'control_steps': 0, 'episodes': 0, 'diverged': 0, 'not_finite': 0, 'largest': 0.0}
+    found = {
+        'steps': 0,
+        'control_steps': 0,
+        'episodes': 0,
+        'diverged': 0,
+        'not_finite': 0,
+        'largest': 0.0,
+    }
     environments.reset()
     control = world.engine.timestep * environments.task.steps_per_call  # s
     chosen, end = actions(random, (num_envs, len(environments.action_map))), None
