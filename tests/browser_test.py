@@ -19,13 +19,14 @@ from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
 from trl_suite import rendering, suite
-from trl_suite.arenas import scene
+from trl_suite.arenas import PlanarArena, scene
 from trl_suite.rendering import overlays, replays, web_meshes, web_scene, web_server
 from trl_suite.viewing import browser, session
 
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 HILLS, SOCCER = 'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Soccer-v0'
 BELTS = 'PD_Biped3D_HLC_Conveyors-v0'
+FOREST = 'PD_Biped3D_HLC_Forest-v0'
 FRAME = 1 / 30  # s
 CHROMIUM = next(
     filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), ''
@@ -197,39 +198,72 @@ class SceneTest(parameterized.TestCase):
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
 
-    def test_former_ground_stays_while_clients_load_the_new_one(self):
+    @parameterized.parameters(DOG, HILLS, SOCCER, FOREST)
+    def test_squares_cover_the_ground(self, id_):
+        environment = suite.make(id_, {'random': 4})
+        environment.reset()
+        arena = environment.task.arena
+        if isinstance(arena, PlanarArena):
+            meshes = {(0, 'boxes'): web_meshes.planar_mesh(arena.ground)}
+        else:
+            model, data = environment.physics.model.ptr, environment.physics.data.ptr
+            is_ground = np.asarray(model.body_weldid[model.geom_bodyid] == 0)
+            meshes = web_meshes.ground_meshes(model, data, is_ground, web_scene.FAR_BELOW)
+        for (_, kind), mesh in meshes.items():
+            if kind == 'far':
+                continue
+            parts = web_meshes.squares(mesh)
+            np.testing.assert_allclose(sum(part.area for part in parts), mesh.area, rtol=1e-4)
+            low, high = zip(*(part.bounds for part in parts), strict=True)
+            np.testing.assert_allclose((np.min(low, 0), np.max(high, 0)), mesh.bounds, atol=1e-4)
+            for shade, part in enumerate(parts):
+                top = part.face_normals[:, 2] > 0.1
+                self.assertGreater(top.sum(), 5)
+                corners = part.triangles[top, :, :2]
+                squares = np.floor(corners.mean(1) / web_meshes.TILE)
+                np.testing.assert_array_equal(squares.sum(1) % 2, shade)
+                inside = corners / web_meshes.TILE - squares[:, None]
+                self.assertBetween(inside.min(), -1e-4, inside.max())
+                self.assertLess(inside.max(), 1 + 1e-4)
+
+    def test_changed_ground_keeps_its_handles(self):
+        """Clients would show nothing until they have added a new one."""
         environment = suite.make(HILLS, {'random': 4})
         environment.reset()
         server = web_server.start_server('127.0.0.1', 0)
         self.addCleanup(web_server.stop_server, server)
-        shown, removed = {}, []
         scene = web_scene.WebScene(server, environment)
-        add = server.scene.add_batched_meshes_trimesh
-
-        def adding(name, *arguments, **options):
-            self.assertNotIn(name, shown)
-            handle = shown[name] = add(name, *arguments, **options)
-            remove = handle.remove
-            handle.__dict__['remove'] = lambda: (removed.append(name), shown.pop(name), remove())
-            return handle
-
+        scene.update()
+        handles = dict(scene._ground_handles)
+        before = {key: handle.vertices.copy() for key, handle in handles.items()}
         heights = environment.physics.model.hfield_data
-        with mock.patch.object(server.scene, 'add_batched_meshes_trimesh', adding):
-            scene.update()
-            for _ in range(2 * web_scene.HELD):  # new ground in each frame
-                heights[0] = 0.5 * (1 - heights[0])
-                scene.update()
-            self.assertLen(shown, web_scene.HELD + 1)
-            scene.update()
-            self.assertLen(shown, web_scene.HELD)
-            for _ in range(web_scene.HELD):
-                scene.update()
-            self.assertLen(shown, 1)
-            (former,) = shown
-            heights[0] = 0.5 * (1 - heights[0])
+        for jump in (False, True):
+            heights[:] = 0.5 * (1 - heights)
+            scene.update(jump=jump)
+            self.assertEqual(scene._ground_handles, handles)
+            for key, handle in handles.items():
+                self.assertTrue(handle.visible)
+                self.assertNotEqual(handle.vertices[:, 2].min(), before[key][:, 2].min())
+                self.assertLess(handle.faces.max(), len(handle.vertices))
+
+    def test_a_plane_moves_with_the_view(self):
+        """By multiples of two squares; its meshes stay as they are."""
+        environment = suite.make(SOCCER, {'random': 4})
+        environment.reset()
+        server = web_server.start_server('127.0.0.1', 0)
+        self.addCleanup(web_server.stop_server, server)
+        scene = web_scene.WebScene(server, environment)
+        scene.update()
+        with mock.patch.object(scene, '_lay_ground') as lay:
+            root = environment.task.figure.pose_qpos[:3]
+            environment.physics.data.qpos[root] = (51.2, -7.3, 1.0)
+            environment.physics.forward()
             scene.update(jump=True)
-            self.assertLen(shown, 1)
-            self.assertNotIn(former, shown)
+        lay.assert_not_called()
+        for handle in scene._ground_handles.values():
+            place = handle.batched_positions[0] + scene._focus
+            np.testing.assert_allclose(place / (2 * web_meshes.TILE) % 1, 0, atol=1e-5)
+            self.assertLess(np.abs(place - scene._focus)[:2].max(), web_meshes.TILE + 1e-5)
 
     @parameterized.parameters(DOG, SOCCER)
     def test_the_sky_is_that_of_the_model(self, id_):

@@ -17,6 +17,8 @@ SECTIONS = 24  # number of faces around a cylinder or cone
 TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
 SHADES = (1.0, 0.88)  # brightness of the squares
 PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
+CHECKERED = 24.0  # m; half side of its part that has squares
+TOLERANCE = 1e-6  # m; parts of triangles that are smaller are not cut off
 DEPTH = 1.0  # m; thickness of planar ground below its lowest point
 STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
 NEAR = 8.0  # m; distance from the centre of a height field within which all vertices are drawn
@@ -54,41 +56,55 @@ def _shape(name: str) -> trimesh.Trimesh:
 
 
 def ground_meshes(
-    model: Any, data: Any, is_ground: np.ndarray, middle: np.ndarray, lowest: float
-) -> dict[int, trimesh.Trimesh]:
-    """Returns the geoms of the ground in world coordinates, one mesh per material, by its id.
+    model: Any, data: Any, is_ground: np.ndarray, lowest: float
+) -> dict[tuple[int, str], trimesh.Trimesh]:
+    """Returns the geoms of the ground as one mesh per material and kind.
+
+    Kinds are 'boxes' and 'field', in world coordinates, and 'plane' and 'far', the inner and outer
+    part of infinite planes, around x = y = 0.
 
     Args:
       model: the model.
       data: its state.
       is_ground: which geoms are the ground, (geoms,) bool.
-      middle: point around which an infinite plane is drawn, m.
       lowest: height below which geoms are left out, m.
     """
-    parts: dict[int, list[trimesh.Trimesh]] = {}
+    parts: dict[tuple[int, str], list[trimesh.Trimesh]] = {}
     for geom in np.flatnonzero(is_ground):
-        kind, place = model.geom_type[geom], data.geom_xpos[geom]
+        shape, place = model.geom_type[geom], data.geom_xpos[geom]
         if place[2] < lowest:
             continue
-        if kind == mujoco.mjtGeom.mjGEOM_PLANE:
-            corners = PLANE * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
-            corners = corners + np.array([middle[0], middle[1], place[2]])
-            mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-        elif kind == mujoco.mjtGeom.mjGEOM_HFIELD:
-            mesh = height_field_mesh(model, data, int(geom))
-        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            axes = data.geom_xmat[geom].reshape(3, 3)
-            box = _shape('box')
-            # Faces share no corners, so that shading is flat.
-            corners = (box.vertices * model.geom_size[geom])[box.faces.ravel()] @ axes.T + place
-            mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-        else:
-            continue
-        parts.setdefault(int(model.geom_matid[geom]), []).append(mesh)
+        found = {}
+        if shape == mujoco.mjtGeom.mjGEOM_PLANE:
+            found = {'plane': _square(CHECKERED, place[2]), 'far': _frame(place[2])}
+        elif shape == mujoco.mjtGeom.mjGEOM_HFIELD:
+            found['field'] = height_field_mesh(model, data, int(geom))
+        elif shape == mujoco.mjtGeom.mjGEOM_BOX:
+            axes, box = data.geom_xmat[geom].reshape(3, 3), _shape('box')
+            corners = (box.vertices * model.geom_size[geom]) @ axes.T + place
+            found['boxes'] = trimesh.Trimesh(corners, box.faces, process=False)
+        for kind, mesh in found.items():
+            parts.setdefault((int(model.geom_matid[geom]), kind), []).append(mesh)
     return {
-        material: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
-        for material, meshes in parts.items()
+        key: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
+        for key, meshes in parts.items()
     }
+
+
+def _square(half: float, height: float) -> trimesh.Trimesh:
+    corners = half * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) + (0, 0, height)
+    return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
+
+
+def _frame(height: float) -> trimesh.Trimesh:
+    """Returns the part of a plane between the squares and the border."""
+    corners = np.concatenate([_square(half, height).vertices for half in (PLANE, CHECKERED)])
+    faces = [
+        face
+        for i, k in ((0, 1), (1, 2), (2, 3), (3, 0))
+        for face in ((i, k, k + 4), (i, k + 4, i + 4))
+    ]
+    return trimesh.Trimesh(corners, faces, process=False)
 
 
 def planar_mesh(ground: PlanarWindows) -> trimesh.Trimesh:
@@ -112,7 +128,6 @@ def planar_mesh(ground: PlanarWindows) -> trimesh.Trimesh:
     for (y_right, z_right), (y_left, z_left) in strips:
         right = np.stack([x, np.full(len(x), y_right), z_right], 1)
         left = np.stack([x, np.full(len(x), y_left), z_left], 1)
-        # Two triangles for each piece, which share no corners, so that shading is flat.
         corners.append(
             np.stack([right[:-1], right[1:], left[1:], right[:-1], left[1:], left[:-1]], 1)
         )
@@ -176,17 +191,52 @@ def _cells(kept: np.ndarray, size: int, columns: int) -> np.ndarray:
     )
 
 
-def tiled(mesh: trimesh.Trimesh, colour: np.ndarray) -> trimesh.Trimesh:
-    """Textures the ground with squares along the world's x and y; sides get stripes."""
-    from PIL import Image
+def squares(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
+    """Cuts a mesh into squares along the world's x and y; returns those of each of the `SHADES`.
 
-    shades = np.array(SHADES)[np.array([[0, 1], [1, 0]])]
-    pixels = np.kron(shades[..., None] * colour[:3], np.ones((32, 32, 1)))
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(to_bytes(pixels)), metallicFactor=0.0, roughnessFactor=1.0
-    )
-    mesh.visual = trimesh.visual.TextureVisuals(mesh.vertices[:, :2] / (2 * TILE), material)
-    return mesh
+    Clients load a texture in the background; without one, they draw changed ground at once.
+    """
+    triangles = mesh.triangles
+    for axis in (0, 1):
+        done = []
+        while len(triangles):
+            at = triangles[:, :, axis]
+            first = np.floor((at.min(1) + TOLERANCE) / TILE)
+            last = np.ceil((at.max(1) - TOLERANCE) / TILE)
+            is_cut = last - first > 1
+            done.append(triangles[~is_cut])
+            line = TILE * np.ceil(0.5 * (first + last))[is_cut]
+            triangles = _cut(triangles[is_cut], axis, line)
+        triangles = np.concatenate(done)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    sizes = np.linalg.norm(normals, axis=1)
+    triangles, normals, sizes = (part[sizes > 0] for part in (triangles, normals, sizes))
+    # A side between two squares is of the square behind it.
+    inside = triangles.mean(1) - 1e-3 * normals / sizes[:, None]
+    shade = np.floor(inside[:, :2] / TILE).sum(1) % 2
+    found = []
+    for each in range(len(SHADES)):
+        corners = triangles[shade == each].reshape(-1, 3).astype(np.float32)
+        vertices, faces = np.unique(corners, axis=0, return_inverse=True)
+        found.append(trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False))
+    return tuple(found)
+
+
+def _cut(triangles: np.ndarray, axis: int, line: np.ndarray) -> np.ndarray:
+    """Cuts each triangle where the coordinate `axis` is `line`; both sides must have corners."""
+    beyond = triangles[:, :, axis] > line[:, None]
+    # The corner that is alone on its side comes first.
+    alone = np.where(beyond.sum(1) == 1, beyond.argmax(1), beyond.argmin(1))
+    order = (alone[:, None] + np.arange(3)) % 3
+    first, second, third = np.moveaxis(triangles[np.arange(len(order))[:, None], order], 1, 0)
+    cuts = []
+    for other in (second, third):
+        share = (line - first[:, axis]) / (other[:, axis] - first[:, axis])
+        point = first + share[:, None] * (other - first)
+        point[:, axis] = line
+        cuts.append(point)
+    pieces = (first, *cuts), (cuts[0], second, third), (cuts[0], third, cuts[1])
+    return np.concatenate([np.stack(piece, 1) for piece in pieces])
 
 
 def to_bytes(colours: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ episode here, and the first body that moves need not be the character.
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -19,18 +18,18 @@ from trl_suite.arenas import PlanarArena
 from trl_suite.arenas.scene import PARKED
 from trl_suite.rendering.overlays import Overlay
 from trl_suite.rendering.web_meshes import (
+    SHADES,
     TILE,
     ground_meshes,
     planar_mesh,
     shape_mesh,
-    tiled,
+    squares,
     to_bytes,
 )
 
 LIFT = 0.1  # fraction of a height difference by which the view moves per frame
 ROOM = 2000  # largest number of geoms of overlays and decoration
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
-HELD = 10  # frames for which former ground stays, while clients load the new one
 AMBIENT = 0.5  # intensity of ambient light; 1 would bleach pale ground
 GAMMA = 2.2  # viser expects linear colours of batched meshes; MuJoCo's are gamma-encoded
 SHAFT, TIP = 0.8, 0.2  # fractions of the length of an arrow
@@ -70,9 +69,7 @@ class WebScene:
         self._focus = np.full(3, np.nan)  # the point that the view follows
         self._handles: dict[str, Any] = {}
         self._laid: list[np.ndarray] = []  # data from which the meshes of the ground were made
-        self._ground_handles: list[Any] = []
-        self._former_ground: collections.deque[tuple[int, list[Any]]] = collections.deque()
-        self._frame = self._builds = 0
+        self._ground_handles: dict[tuple[int, str, int], Any] = {}
         with server.atomic():
             server.scene.reset()
             server.scene.set_up_direction('+z')
@@ -112,7 +109,7 @@ class WebScene:
         offset = -self._focus if self.follow else np.zeros(3)
         with self._server.atomic():
             self._draw_shapes(offset)
-            self._draw_ground(offset, jump)
+            self._draw_ground(offset)
             if samples is not None:
                 self._draw_samples(samples + offset)
             elif 'samples' in self._handles:
@@ -152,48 +149,54 @@ class WebScene:
             if name not in batches and name != 'samples':
                 handle.visible = False
 
-    def _draw_ground(self, offset: np.ndarray, jump: bool) -> None:
-        """Moves the ground; builds its meshes again if the ground has changed.
-
-        Clients load a mesh with a texture in the background. Without the former ground, there would
-        be none until then.
-        """
-        model, data = self._model, self._physics.data.ptr
-        # Of an infinite plane, a finite part is drawn, which moves by multiples of two squares.
-        middle = np.round(self._focus / (2 * TILE)) * 2 * TILE
-        ground = self._is_ground
-        planes = (model.geom_type[ground] == mujoco.mjtGeom.mjGEOM_PLANE).any()
+    def _draw_ground(self, offset: np.ndarray) -> None:
+        """Moves the ground; builds its meshes again if the ground has changed."""
+        model, data, ground = self._model, self._physics.data.ptr, self._is_ground
         sources = [
             data.geom_xpos[ground], data.geom_xmat[ground], model.geom_size[ground],
-            model.hfield_data, middle[:2] if planes else np.zeros(2),
+            model.hfield_data,
         ]  # fmt: skip
         if not self._laid or not all(map(np.array_equal, sources, self._laid)):
             self._laid = [source.copy() for source in sources]
+            self._lay_ground()
+        # Of an infinite plane, a finite part is drawn, which moves by multiples of two squares.
+        middle = np.round(self._focus / (2 * TILE)) * 2 * TILE * (1, 1, 0)
+        for (_, kind, _), handle in self._ground_handles.items():
+            place = offset + middle if kind in ('plane', 'far') else offset
+            handle.batched_positions = place[None]
+
+    def _lay_ground(self) -> None:
+        """Changes meshes in place: clients show the former ones until the new ones are ready."""
+        if self._profile is None:
             lowest = self._focus[2] + FAR_BELOW
-            if self._profile is None:
-                meshes = ground_meshes(model, data, ground, middle, lowest)
-            else:  # one surface instead of overlapping boxes
-                meshes = {int(model.geom_matid[ground][0]): planar_mesh(self._profile)}
-            self._former_ground.append((self._frame + HELD, self._ground_handles))
-            self._builds += 1
-            number = self._builds % (HELD + 2)  # no mesh that is still shown has this name
-            self._ground_handles = [
-                self._server.scene.add_batched_meshes_trimesh(
-                    f'/ground_{material}_{number}', tiled(mesh, self._colours[material]),
-                    batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), lod='off', cast_shadow=False,
-                    batched_positions=offset[None],
-                )
-                for material, mesh in meshes.items()
-            ]  # fmt: skip
-        # Where an episode starts, the former ground would be seen beside or in the new one.
-        while self._former_ground and (jump or self._former_ground[0][0] <= self._frame):
-            for handle in self._former_ground.popleft()[1]:
-                handle.remove()
-        for handle in (
-            *self._ground_handles, *(each for _, handles in self._former_ground for each in handles)
-        ):  # fmt: skip
-            handle.batched_positions = offset[None]
-        self._frame += 1
+            meshes = ground_meshes(self._model, self._physics.data.ptr, self._is_ground, lowest)
+        else:  # one surface instead of overlapping boxes
+            material = int(self._model.geom_matid[self._is_ground][0])
+            meshes = {(material, 'boxes'): planar_mesh(self._profile)}
+        parts = {
+            (material, kind, number): part
+            for (material, kind), mesh in meshes.items()
+            for number, part in enumerate([mesh] if kind == 'far' else squares(mesh))
+            if len(part.faces)
+        }
+        for key, part in parts.items():
+            if key in self._ground_handles:
+                _assign(
+                    self._ground_handles[key], vertices=part.vertices, faces=part.faces,
+                    visible=True,
+                )  # fmt: skip
+                continue
+            material, kind, number = key
+            shade = np.mean(SHADES) if kind == 'far' else SHADES[number]
+            self._ground_handles[key] = self._server.scene.add_batched_meshes_simple(
+                f'/ground_{material}_{kind}_{number}', part.vertices, part.faces,
+                batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), batched_positions=np.zeros((1, 3)),
+                batched_colors=to_bytes((shade * self._colours[material][:3]) ** GAMMA)[None],
+                flat_shading=kind != 'field', lod='off', cast_shadow=False,
+            )  # fmt: skip
+        for key, handle in self._ground_handles.items():
+            if key not in parts:
+                handle.visible = False
 
     def _draw_samples(self, points: np.ndarray) -> None:
         points = points.astype(np.float32)
