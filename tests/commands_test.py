@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import pathlib
+import re
 from unittest import mock
 
 import cli_test
@@ -18,6 +19,7 @@ from trl_suite.registry import catalogue
 from trl_suite.viewing import gallery
 
 GAPS = cli_test.GAPS
+SETUP = pathlib.Path(__file__).resolve().parents[1] / 'setup.py'
 CommandTest, run = cli_test.CommandTest, cli_test.run
 
 
@@ -77,6 +79,16 @@ class DoctorTest(CommandTest):
         self.assertIn('no-such-thing is missing', found[2].text)
         # All required packages are installed.
         self.assertEqual({finding.state for finding in doctor.versions()}, {doctor.OK})
+
+    def test_every_extra_of_a_user_is_named(self):
+        """Those of developers are not, nor that of the policies, which have their own line."""
+        text = SETUP.read_text().partition('extras_require')[2]
+        declared = re.findall(r"^        '(\w+)': \[", text, re.MULTILINE)
+        expected = set(declared) - {'policies', 'test', 'dev', 'docs', 'notebooks'}
+        self.assertContainsSubset({'viewer', 'cluster'}, expected)
+        self.assertEqual(set(doctor.EXTRAS), expected)
+        named = re.findall(r"extra '(\w+)'", ' '.join(found.text for found in doctor.extras()))
+        self.assertEqual(set(named), expected)
 
     def test_a_failed_process_reports_its_error(self):
         # At exit, a partly loaded library may print long messages.

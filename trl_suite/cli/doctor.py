@@ -29,9 +29,10 @@ OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
 TIMEOUT = 120.0  # s, for every process that is started
 # Packages of the extras, by the name under which they are imported.
 EXTRAS = {
-    'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'gymnasium': ('gymnasium',),
-    'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',), 'rllib': ('ray',), 'shimmy': ('shimmy',),
-    'train': ('torch',), 'clips': ('pybvh',),
+    'video': ('imageio', 'imageio_ffmpeg', 'matplotlib'), 'viewer': ('viser',),
+    'gymnasium': ('gymnasium',), 'sb3': ('stable_baselines3',), 'torchrl': ('torchrl',),
+    'rllib': ('ray',), 'cluster': ('ray', 'fsspec'), 'shimmy': ('shimmy',), 'train': ('torch',),
+    'tune': ('cma',), 'clips': ('pybvh',),
 }  # fmt: skip
 LIBRARIES = {
     'egl': 'libegl1 (Debian, Ubuntu: apt install libegl1) or a graphics driver',
