@@ -26,7 +26,8 @@ from trl_suite.viewing import browser, session
 DOG, GOAT = 'PD_Dog2D_Slopes_Mixed_Terrain-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0'
 HILLS, SOCCER = 'PD_Biped3D_Imitate-Hills_Terrain-v0', 'PD_Biped3D_HLC_Soccer-v0'
 BELTS = 'PD_Biped3D_HLC_Conveyors-v0'
-FOREST = 'PD_Biped3D_HLC_Forest-v0'
+FOREST, RAMP = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_Imitate-Ramp-v0'
+STAIRS = 'PD_Biped3D_Imitate-Stairs-v0'
 FRAME = 1 / 30  # s
 CHROMIUM = next(
     filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), ''
@@ -198,7 +199,7 @@ class SceneTest(parameterized.TestCase):
         if 'tube' in expected:
             self.assertLen(scene._handles['tube'].batched_positions, capsules)
 
-    @parameterized.parameters(DOG, HILLS, SOCCER, FOREST)
+    @parameterized.parameters(DOG, HILLS, SOCCER, FOREST, RAMP)
     def test_squares_cover_the_ground(self, id_):
         environment = suite.make(id_, {'random': 4})
         environment.reset()
@@ -209,17 +210,21 @@ class SceneTest(parameterized.TestCase):
             model, data = environment.physics.model.ptr, environment.physics.data.ptr
             is_ground = np.asarray(model.body_weldid[model.geom_bodyid] == 0)
             meshes = web_meshes.ground_meshes(model, data, is_ground, web_scene.FAR_BELOW)
-        for (_, kind), mesh in meshes.items():
-            if kind == 'far':
-                continue
-            parts = web_meshes.squares(mesh)
-            np.testing.assert_allclose(sum(part.area for part in parts), mesh.area, rtol=1e-4)
-            low, high = zip(*(part.bounds for part in parts), strict=True)
-            np.testing.assert_allclose((np.min(low, 0), np.max(high, 0)), mesh.bounds, atol=1e-4)
-            for shade, part in enumerate(parts):
-                top = part.face_normals[:, 2] > 0.1
-                self.assertGreater(top.sum(), 5)
-                corners = part.triangles[top, :, :2]
+        for mesh in meshes.values():
+            middle = np.array([8.0, 0.0, 0.0])
+            *near, far = parts = web_meshes.squares(mesh, middle, 24.0)
+            area = mesh.area_faces[mesh.face_normals[:, 2] > -1e-6].sum()
+            np.testing.assert_allclose(sum(part.area for part in parts), area, rtol=1e-4)
+            bounds = np.array([part.bounds for part in parts if len(part.faces)])
+            found = bounds[:, 0].min(0), bounds[:, 1].max(0)
+            np.testing.assert_allclose(np.array(found).T[:2], mesh.bounds.T[:2], atol=1e-4)
+            self.assertAlmostEqual(found[1][2], mesh.bounds[1, 2], places=4)
+            far_tops = far.triangles_center[far.face_normals[:, 2] > 0.1]
+            self.assertTrue((np.abs(far_tops - middle)[:, :2].max(1) > 24).all())
+            for shade, part in enumerate(near):
+                self.assertTrue((part.face_normals[:, 2] > 0.09).all())
+                self.assertGreater(len(part.faces), 5)
+                corners = part.triangles[:, :, :2]
                 squares = np.floor(corners.mean(1) / web_meshes.TILE)
                 np.testing.assert_array_equal(squares.sum(1) % 2, shade)
                 inside = corners / web_meshes.TILE - squares[:, None]
@@ -264,6 +269,22 @@ class SceneTest(parameterized.TestCase):
             place = handle.batched_positions[0] + scene._focus
             np.testing.assert_allclose(place / (2 * web_meshes.TILE) % 1, 0, atol=1e-5)
             self.assertLess(np.abs(place - scene._focus)[:2].max(), web_meshes.TILE + 1e-5)
+
+    def test_squares_of_large_boxes_follow(self):
+        """A ramp is a kilometre long."""
+        environment = suite.make(RAMP, {'random': 4})
+        environment.reset()
+        server = web_server.start_server('127.0.0.1', 0)
+        self.addCleanup(web_server.stop_server, server)
+        scene = web_scene.WebScene(server, environment)
+        for x in (100.0, 200.0):
+            environment.physics.data.qpos[environment.task.figure.pose_qpos[0]] = x
+            environment.physics.forward()
+            scene.update(jump=True)
+            light = next(handle for key, handle in scene._ground_handles.items() if key[-1] == 0)
+            self.assertAlmostEqual(light.vertices[:, 0].min(), x - web_scene.NEAR_REACH, delta=5)
+            self.assertAlmostEqual(light.vertices[:, 0].max(), x + web_scene.NEAR_REACH, delta=5)
+            self.assertLess(len(light.vertices), 10_000)
 
     @parameterized.parameters(DOG, SOCCER)
     def test_the_sky_is_that_of_the_model(self, id_):
@@ -359,7 +380,7 @@ class BrowserTest(parameterized.TestCase):
 
 class ReplayTest(FolderTest):
     @parameterized.parameters(
-        (DOG, 0.2), (GOAT, 0.2), (HILLS, 1.0), (SOCCER, 0.2), (BELTS, 0.2)
+        (DOG, 0.2), (GOAT, 0.2), (HILLS, 1.0), (SOCCER, 0.2), (BELTS, 0.2), (STAIRS, 0.2),
     )  # fmt: skip
     def test_ten_seconds_take_no_more_than_3_mb(self, id_, largest):
         """On hills with falls every second, each of which lays another height field."""

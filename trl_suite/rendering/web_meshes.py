@@ -15,9 +15,9 @@ from trl_suite.terrain.planar.windows import PlanarWindows
 
 SECTIONS = 24  # number of faces around a cylinder or cone
 TILE = 1.0  # m; edge of the squares on the ground, which make motion visible
-SHADES = (1.0, 0.88)  # brightness of the squares
+SHADES = (1.0, 0.88, 0.94)  # brightness of the squares, and of ground without squares
+STEEP = 0.1  # vertical part of the normal below which a side has no squares
 PLANE = 60.0  # m; half side of the part of an infinite plane that is drawn
-CHECKERED = 24.0  # m; half side of its part that has squares
 TOLERANCE = 1e-6  # m; parts of triangles that are smaller are not cut off
 DEPTH = 1.0  # m; thickness of planar ground below its lowest point
 STEP = 2.0**-9  # m; heights of height fields are multiples of it, which compresses better
@@ -60,8 +60,7 @@ def ground_meshes(
 ) -> dict[tuple[int, str], trimesh.Trimesh]:
     """Returns the geoms of the ground as one mesh per material and kind.
 
-    Kinds are 'boxes' and 'field', in world coordinates, and 'plane' and 'far', the inner and outer
-    part of infinite planes, around x = y = 0.
+    Kinds are 'boxes' and 'field', in world coordinates, and 'plane', around x = y = 0.
 
     Args:
       model: the model.
@@ -74,37 +73,23 @@ def ground_meshes(
         shape, place = model.geom_type[geom], data.geom_xpos[geom]
         if place[2] < lowest:
             continue
-        found = {}
         if shape == mujoco.mjtGeom.mjGEOM_PLANE:
-            found = {'plane': _square(CHECKERED, place[2]), 'far': _frame(place[2])}
+            corners = PLANE * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+            corners[:, 2] = place[2]
+            kind, mesh = 'plane', trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
         elif shape == mujoco.mjtGeom.mjGEOM_HFIELD:
-            found['field'] = height_field_mesh(model, data, int(geom))
+            kind, mesh = 'field', height_field_mesh(model, data, int(geom))
         elif shape == mujoco.mjtGeom.mjGEOM_BOX:
             axes, box = data.geom_xmat[geom].reshape(3, 3), _shape('box')
             corners = (box.vertices * model.geom_size[geom]) @ axes.T + place
-            found['boxes'] = trimesh.Trimesh(corners, box.faces, process=False)
-        for kind, mesh in found.items():
-            parts.setdefault((int(model.geom_matid[geom]), kind), []).append(mesh)
+            kind, mesh = 'boxes', trimesh.Trimesh(corners, box.faces, process=False)
+        else:
+            continue
+        parts.setdefault((int(model.geom_matid[geom]), kind), []).append(mesh)
     return {
         key: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
         for key, meshes in parts.items()
     }
-
-
-def _square(half: float, height: float) -> trimesh.Trimesh:
-    corners = half * np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) + (0, 0, height)
-    return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-
-
-def _frame(height: float) -> trimesh.Trimesh:
-    """Returns the part of a plane between the squares and the border."""
-    corners = np.concatenate([_square(half, height).vertices for half in (PLANE, CHECKERED)])
-    faces = [
-        face
-        for i, k in ((0, 1), (1, 2), (2, 3), (3, 0))
-        for face in ((i, k, k + 4), (i, k + 4, i + 4))
-    ]
-    return trimesh.Trimesh(corners, faces, process=False)
 
 
 def planar_mesh(ground: PlanarWindows) -> trimesh.Trimesh:
@@ -191,52 +176,85 @@ def _cells(kept: np.ndarray, size: int, columns: int) -> np.ndarray:
     )
 
 
-def squares(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
-    """Cuts a mesh into squares along the world's x and y; returns those of each of the `SHADES`.
+def squares(mesh: trimesh.Trimesh, middle: np.ndarray, reach: float) -> tuple[trimesh.Trimesh, ...]:
+    """Cuts a mesh into squares along the world's x and y.
+
+    Returns the parts of each of the `SHADES`: two kinds of squares, and the rest.
 
     Clients load a texture in the background; without one, they draw changed ground at once.
+
+    Args:
+      mesh: the ground.
+      middle: point, a multiple of `TILE`, around which the ground is cut.
+      reach: distance along x and y within which it is, a multiple of `TILE`.
     """
-    triangles = mesh.triangles
+    upward = mesh.face_normals[:, 2]
+    # Sides, if they are seen from above.
+    outside = [mesh.triangles[(upward > -TOLERANCE) & (upward < STEEP)]]
+    triangles = mesh.triangles[upward >= STEEP]
+    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        line = np.full(len(triangles), middle[axis] + sign * reach)
+        outside.append(_clip(triangles, axis, line, sign)[0])
+        triangles, _ = _clip(triangles, axis, line, -sign)
     for axis in (0, 1):
-        done = []
-        while len(triangles):
-            at = triangles[:, :, axis]
-            first = np.floor((at.min(1) + TOLERANCE) / TILE)
-            last = np.ceil((at.max(1) - TOLERANCE) / TILE)
-            is_cut = last - first > 1
-            done.append(triangles[~is_cut])
-            line = TILE * np.ceil(0.5 * (first + last))[is_cut]
-            triangles = _cut(triangles[is_cut], axis, line)
-        triangles = np.concatenate(done)
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    sizes = np.linalg.norm(normals, axis=1)
-    triangles, normals, sizes = (part[sizes > 0] for part in (triangles, normals, sizes))
-    # A side between two squares is of the square behind it.
-    inside = triangles.mean(1) - 1e-3 * normals / sizes[:, None]
-    shade = np.floor(inside[:, :2] / TILE).sum(1) % 2
+        triangles = _strips(triangles, axis)
+    shade = np.floor(triangles.mean(1)[:, :2] / TILE).sum(1) % 2
     found = []
-    for each in range(len(SHADES)):
-        corners = triangles[shade == each].reshape(-1, 3).astype(np.float32)
+    for part in (triangles[shade == 0], triangles[shade == 1], np.concatenate(outside)):
+        corners = part.reshape(-1, 3).astype(np.float32)
         vertices, faces = np.unique(corners, axis=0, return_inverse=True)
         found.append(trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False))
     return tuple(found)
 
 
-def _cut(triangles: np.ndarray, axis: int, line: np.ndarray) -> np.ndarray:
-    """Cuts each triangle where the coordinate `axis` is `line`; both sides must have corners."""
-    beyond = triangles[:, :, axis] > line[:, None]
-    # The corner that is alone on its side comes first.
-    alone = np.where(beyond.sum(1) == 1, beyond.argmax(1), beyond.argmin(1))
-    order = (alone[:, None] + np.arange(3)) % 3
-    first, second, third = np.moveaxis(triangles[np.arange(len(order))[:, None], order], 1, 0)
-    cuts = []
-    for other in (second, third):
-        share = (line - first[:, axis]) / (other[:, axis] - first[:, axis])
-        point = first + share[:, None] * (other - first)
-        point[:, axis] = line
-        cuts.append(point)
-    pieces = (first, *cuts), (cuts[0], second, third), (cuts[0], third, cuts[1])
-    return np.concatenate([np.stack(piece, 1) for piece in pieces])
+def _strips(triangles: np.ndarray, axis: int) -> np.ndarray:
+    """Cuts triangles wherever the coordinate `axis` is a multiple of `TILE`."""
+    at = triangles[:, :, axis]
+    first = np.floor((at.min(1) + TOLERANCE) / TILE).astype(int)
+    last = np.ceil((at.max(1) - TOLERANCE) / TILE).astype(int)
+    counts = np.maximum(last - first, 1)
+    source = np.repeat(np.arange(len(counts)), counts)
+    low = TILE * (first + counts - np.cumsum(counts))[source] + TILE * np.arange(len(source))
+    triangles, kept = _clip(triangles[source], axis, low, 1)
+    return _clip(triangles, axis, low[kept] + TILE, -1)[0]
+
+
+def _clip(
+    triangles: np.ndarray, axis: int, line: np.ndarray, sign: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the parts of triangles beyond a line, and to which triangle each belongs.
+
+    Args:
+      triangles: (n, 3, 3) m.
+      axis: a coordinate.
+      line: its value on the line of each triangle, (n,) m.
+      sign: 1 for parts above, -1 for parts below the line.
+    """
+    distance = sign * (triangles[:, :, axis] - line[:, None])
+    beyond = distance > TOLERANCE
+    count = beyond.sum(1)
+    # A triangle on the line itself is above it.
+    is_whole = (distance >= -TOLERANCE).all(1) & ((count > 0) | (sign > 0))
+    parts, sources = [triangles[is_whole]], [np.flatnonzero(is_whole)]
+    for number in (1, 2):  # of the corners beyond the line
+        source = np.flatnonzero((count == number) & ~is_whole)
+        # The corner that is alone on its side comes first.
+        alone = (beyond if number == 1 else ~beyond)[source].argmax(1)
+        order = (alone[:, None] + np.arange(3)) % 3
+        first, *others = np.moveaxis(triangles[source[:, None], order], 1, 0)
+        cuts = []
+        for other in others:
+            share = (line[source] - first[:, axis]) / (other[:, axis] - first[:, axis])
+            point = first + share[:, None] * (other - first)
+            point[:, axis] = line[source]
+            cuts.append(point)
+        second, third = others
+        pieces = [(first, *cuts)]
+        if number == 2:
+            pieces = [(cuts[0], second, third), (cuts[0], third, cuts[1])]
+        parts += [np.stack(piece, 1) for piece in pieces]
+        sources += [source] * len(pieces)
+    return np.concatenate(parts), np.concatenate(sources)
 
 
 def to_bytes(colours: np.ndarray) -> np.ndarray:

@@ -27,6 +27,9 @@ from trl_suite.rendering.web_meshes import (
     to_bytes,
 )
 
+REACH = 24.0  # m; distance along x and y within which the ground has squares
+NEAR_REACH = 12.0  # m; the same for large boxes, as there may be many, like those of stairs
+STRIDE = 8.0  # m; distance by which the part of large boxes that has squares moves
 LIFT = 0.1  # fraction of a height difference by which the view moves per frame
 ROOM = 2000  # largest number of geoms of overlays and decoration
 FAR_BELOW = 0.5 * PARKED  # m; geoms so far below the character are unused
@@ -152,20 +155,22 @@ class WebScene:
     def _draw_ground(self, offset: np.ndarray) -> None:
         """Moves the ground; builds its meshes again if the ground has changed."""
         model, data, ground = self._model, self._physics.data.ptr, self._is_ground
+        boxes = ground & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+        is_wide = self._profile is None and (model.geom_size[boxes] > REACH).any()
+        middle = STRIDE * np.round(self._focus / STRIDE)  # of the squares
         sources = [
             data.geom_xpos[ground], data.geom_xmat[ground], model.geom_size[ground],
-            model.hfield_data,
+            model.hfield_data, middle[:2] * is_wide,
         ]  # fmt: skip
         if not self._laid or not all(map(np.array_equal, sources, self._laid)):
             self._laid = [source.copy() for source in sources]
-            self._lay_ground()
+            self._lay_ground(middle, NEAR_REACH if is_wide else REACH)
         # Of an infinite plane, a finite part is drawn, which moves by multiples of two squares.
-        middle = np.round(self._focus / (2 * TILE)) * 2 * TILE * (1, 1, 0)
+        moved = np.round(self._focus / (2 * TILE)) * 2 * TILE * (1, 1, 0)
         for (_, kind, _), handle in self._ground_handles.items():
-            place = offset + middle if kind in ('plane', 'far') else offset
-            handle.batched_positions = place[None]
+            handle.batched_positions = (offset + moved if kind == 'plane' else offset)[None]
 
-    def _lay_ground(self) -> None:
+    def _lay_ground(self, middle: np.ndarray, reach: float) -> None:
         """Changes meshes in place: clients show the former ones until the new ones are ready."""
         if self._profile is None:
             lowest = self._focus[2] + FAR_BELOW
@@ -176,7 +181,9 @@ class WebScene:
         parts = {
             (material, kind, number): part
             for (material, kind), mesh in meshes.items()
-            for number, part in enumerate([mesh] if kind == 'far' else squares(mesh))
+            for number, part in enumerate(
+                squares(mesh, np.zeros(3) if kind == 'plane' else middle, reach)
+            )
             if len(part.faces)
         }
         for key, part in parts.items():
@@ -187,11 +194,11 @@ class WebScene:
                 )  # fmt: skip
                 continue
             material, kind, number = key
-            shade = np.mean(SHADES) if kind == 'far' else SHADES[number]
+            colour = SHADES[number] * self._colours[material][:3]
             self._ground_handles[key] = self._server.scene.add_batched_meshes_simple(
                 f'/ground_{material}_{kind}_{number}', part.vertices, part.faces,
                 batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]), batched_positions=np.zeros((1, 3)),
-                batched_colors=to_bytes((shade * self._colours[material][:3]) ** GAMMA)[None],
+                batched_colors=to_bytes(colour**GAMMA)[None],
                 flat_shading=kind != 'field', lod='off', cast_shadow=False,
             )  # fmt: skip
         for key, handle in self._ground_handles.items():
