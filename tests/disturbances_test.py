@@ -663,6 +663,7 @@ class RefusalTest(parameterized.TestCase):
         ({'slope': 0.1, 'slope_direction': 1.0}, 'three-dimensional'),
         ({'com_offset': 5}, 'com_offset is 5; .* m'),
         ({'friction': 'much'}, 'friction is .much.; expected a number'),
+        ({'friction': ''}, 'friction is ..; expected a number'),
         ({'push': {}}, 'neither force and speed'),
         ({'push': {'force': 1, 'speed': 1}}, 'both force and speed'),
         ({'push': 150}, "push is 150; expected a mapping such as {'force': 150}"),

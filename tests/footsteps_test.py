@@ -819,6 +819,7 @@ class HelperTest(parameterized.TestCase):
     @parameterized.parameters(
         ({'plans': {'length': (0.6, 0.5)}}, r'length is \(0.6, 0.5\)'),
         ({'plans': {'length': 0.5}}, 'length is 0.5'),
+        ({'plans': np.zeros((2, 2))}, r'plans is array\(\[\[0'),
         ({'plans': {'width': (-0.1, 0.2)}}, 'width is'),
         ({'plans': {'width': (0.1, np.inf)}}, 'width is'),
         ({'plans': {'change': 1.5}}, 'change is 1.5'), ({'plans': {'sharp': -0.1}}, 'sharp is -0.1'),

@@ -271,11 +271,11 @@ class Calls(stateful.RuleBasedStateMachine):
 
     @stateful.rule(i=which)
     def break_down(self, i):
-        for data, k in (
-            (self.environments.task.world.qvel, i),
-            (self.singles[i].physics.data.qvel, ...),
-        ):
-            data[k] = np.nan
+        for world, k in (
+            (self.environments.task.world, i), (self.singles[i].task.world, 0),
+        ):  # fmt: skip
+            world.qvel[k] = np.nan
+            world.forward(np.array([k]))  # what was written is part of the state only then
 
     @stateful.invariant()
     def same(self):

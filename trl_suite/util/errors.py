@@ -106,8 +106,11 @@ def _fits(value: object, hint: object) -> bool:
         return hint is bool or not isinstance(value, bool)
     if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
         (inner,) = typing.get_args(hint)
-        # Bytes and mappings are iterable as well, but their elements are not the intended values.
+        # Bytes and mappings are iterable as well, but their elements are not the intended values; nor
+        # are those of a text, which is a sequence of texts only.
         if not isinstance(value, Iterable) or isinstance(value, (bytes, Mapping)):
+            return False
+        if isinstance(value, str) and inner is not str:
             return False
         return all(_fits(each, inner) for each in value)
     return True

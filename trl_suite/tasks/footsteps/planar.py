@@ -265,7 +265,9 @@ class PlanarFootstepsConfig(PlanarConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set('plans', plans_from(StraightPlans, 'plans', self.plans or {}))
+        self._set(
+            'plans', plans_from(StraightPlans, 'plans', {} if self.plans is None else self.plans)
+        )
 
 
 class PlanarFootsteps(PlanarImitation):

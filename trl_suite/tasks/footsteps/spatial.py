@@ -87,7 +87,7 @@ class SpatialFootstepsConfig(MirroredConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set('plans', options(Plans, 'plans', self.plans or {}))
+        self._set('plans', options(Plans, 'plans', {} if self.plans is None else self.plans))
         if self.pushes is not None:
             self._set('pushes', options(Pushes, 'pushes', self.pushes))
         if self.hidden_plan and self.mirrored:
