@@ -353,7 +353,7 @@ class InfoTest(CommandTest):
             'from motion capture, 4.4 m/s': 'run',
             'a goal is redrawn': 'goal',
             'placed later counts': 'blocks',
-            'armature of 10^6 kg': 'moving',
+            'armature of 2000 kg': 'moving',
             'belt is one box': 'belts',
             'treads': 'stairs',
             'whole footstep': 'high',

@@ -20,7 +20,7 @@ from helpers import (
     links_on_ground,
 )
 
-from trl_suite import characters, motion, rendering, suite, terrain
+from trl_suite import characters, motion, policies, rendering, suite, terrain
 from trl_suite.arenas import PlanarArena
 from trl_suite.environments.environment import Environment
 from trl_suite.tasks.imitation.planar import PlanarImitation
@@ -262,6 +262,15 @@ def every_environment(id_):
             scale, one = 0.3 if gait else 1.0, self.made(0, flat=True, step_limit=limit)
             _, ends = assert_rows_are_singles(id_, 3, steps, limit, scale=scale, seed=5, one=one)
             self.assertGreaterEqual(ends, 6)
+
+        if id_ in policies.available():
+
+            def test_the_shipped_policy_fits(self):
+                environment, policy = self.made(0), policies.reference(id_)
+                policy.check(environment)
+                action = policy(environment.reset().observation)
+                self.assertEqual(action.shape, environment.action_spec().shape)
+                self.assertTrue(np.isfinite(action).all())
 
         if id_ in KINDS:  # with other options: in the test of each task
 

@@ -631,17 +631,11 @@ class ReferenceTest(FolderTest):
 
 
 class ShippedTest(parameterized.TestCase):
-    @parameterized.parameters(*((id_,) for id_ in policies.available() or (None,)))
-    def test_fits_its_environment(self, id_):
-        if id_ is None:
-            self.skipTest('no policy is shipped')
-        path = resources.directory('trained') / f'{id_}.npz'
-        if path.exists():  # or else it is another environment's
-            self.assertLess(path.stat().st_size, MAX_BYTES)
-        policy = policies.reference(id_)
-        task = suite.build_task(catalogue.BY_ID[id_])
-        policy.check(task)
-        self.assertEqual(policy(np.zeros((3, policy.observation_size))).shape[0], 3)
+    """`environment_test.py` checks that each fits its environment."""
+
+    def test_files_are_small(self):
+        for path in resources.directory('trained').glob('*.npz'):
+            self.assertLess(path.stat().st_size, MAX_BYTES, path.name)
 
     def test_no_file_is_of_an_unknown_environment(self):
         folder = resources.directory('trained')
