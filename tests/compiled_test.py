@@ -286,6 +286,10 @@ class CacheTest(FolderTest):
             {ASK}"""
         self.assertStartsWith(self.ask(script)[1], 'trl_suite: compiling for this machine, once;')
         self.assertEqual(self.ask(script), (['11.0'], ''))
+        other = """
+            import numba
+            print(numba.njit(lambda x: x + 1.0)(1.0))"""
+        self.assertEqual(self.ask(script + other), (['11.0', '2.0'], ''))
 
     def test_all_sources_matter(self):
         """Compiled functions hold constants of modules that have no compiled functions."""

@@ -200,16 +200,19 @@ def _numba() -> Any:
     interrupts.postpone_while_compiling()
     announcer = _Announcer()
 
+    def is_own(event: Any) -> bool:  # or else it is of another user of Numba in this process
+        return event.data['dispatcher'].py_func.__module__.startswith('trl_suite.')
+
     class Listener(event.Listener):
         def on_start(self, event: Any) -> None:
-            announcer.begin()
+            if is_own(event):
+                announcer.begin()
 
         def on_end(self, event: Any) -> None:
-            announcer.end()
+            if is_own(event):
+                announcer.end()
 
-    event.register(
-        'numba:compile', Listener()
-    )  # code that is loaded from the cache causes no event
+    event.register('numba:compile', Listener())  # none for code that is loaded from the cache
 
     @typeof_impl.register(Compiled)
     def type_of(value: Compiled, _: Any) -> Any:
