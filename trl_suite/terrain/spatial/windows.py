@@ -213,6 +213,14 @@ def has_left(i: int, x: float, y: float, ground: SpatialWindows) -> bool:
     return abs(x - ground.centre[i, 0]) > SHIFT or abs(y - ground.centre[i, 1]) > SHIFT
 
 
+@compiled_inline
+def _is_far(i: int, k: int, x: float, y: float, ground: SpatialWindows) -> bool:
+    """Whether moving box k is so far from the character at (x, y) that it may reverse."""
+    middle_x, middle_y = _mover_middle(i, k, ground)
+    away_x, away_y = middle_x - x, middle_y - y
+    return away_x * away_x + away_y * away_y > _FAR_AWAY
+
+
 @compiled
 def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
     """Reverses moving boxes that are at an end of their path and far from the character at (x, y).
@@ -220,9 +228,7 @@ def turn_movers(i: int, x: float, y: float, ground: SpatialWindows) -> None:
     Within 5 m of the character they continue straight on, even beyond the end of their path.
     """
     for k in range(ground.mover_top.shape[1]):
-        middle_x, middle_y = _mover_middle(i, k, ground)
-        away_x, away_y = middle_x - x, middle_y - y
-        if away_x * away_x + away_y * away_y > _FAR_AWAY:
+        if _is_far(i, k, x, y, ground):
             distance = ground.mover_distance[i, k]
             if distance >= ground.mover_length[i, k]:
                 ground.mover_direction[i, k] = -1.0
@@ -265,9 +271,7 @@ def keep_moving(
     if wrong:
         for k in range(ground.mover_top.shape[1]):
             speed = ground.mover_direction[i, k] * ground.mover_speed[i, k]
-            middle_x, middle_y = _mover_middle(i, k, ground)
-            away_x, away_y = middle_x - x, middle_y - y
-            if away_x * away_x + away_y * away_y <= _FAR_AWAY:  # else it may just have reversed
+            if not _is_far(i, k, x, y, ground):  # else it may just have reversed
                 now = qvel[i, ground.mover_dof[k]]
                 speed = min(max(speed, now - REGAINED), now + REGAINED)
             qvel[i, ground.mover_dof[k]] = speed
