@@ -24,8 +24,8 @@ ELEVATION = 40.0  # m; largest difference of heights of a grid within a window
 BASE = 1.0  # m; thickness of height fields below their lowest point
 FOOT = 0.5  # m; depth to which boxes extend below a plane
 THICKNESS = 2.0  # m; of boxes without a plane under them
-# kg; inertia of moving boxes along their path. With `windows.REGAINED` they push with up to 2000 N in
-# the long run, which no character stops, and yield if a leg is caught between two of them.
+# kg; inertia of moving boxes along their path. With `windows.REGAINED` they push with up to 2000 N in the
+# long run, and yield if a leg is caught between two of them.
 DRIVE = 2000.0
 SIZE = 0.1  # m; half sides of unused boxes
 SHADES = np.array(
