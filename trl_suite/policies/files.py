@@ -77,6 +77,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import json
 import os
 import pathlib
@@ -278,8 +279,12 @@ def _folder(variant: str) -> pathlib.Path:
 def _shared() -> dict[str, str]:
     """Returns the environments that use the policy of another one, and its id."""
     path = resources.directory('trained') / SHARED
-    if not path.exists():
-        return {}
+    return _read_shared(path, path.stat().st_mtime_ns) if path.exists() else {}
+
+
+@functools.lru_cache(maxsize=1)
+def _read_shared(path: pathlib.Path, changed: int) -> dict[str, str]:
+    """Reads the file of shared policies; `changed` is its modification time, ns."""
     return {id_: entry['policy'] for id_, entry in json.loads(path.read_text()).items()}
 
 
