@@ -135,28 +135,6 @@ class ListTest(CommandTest):
 
 
 class InfoTest(CommandTest):
-    @parameterized.parameters(*catalogue.BY_ID)
-    def test_describes_every_environment(self, id_):
-        out = info(id_)
-        self.assertStartsWith(out, f'{id_}\n')
-        self.assertNotRegex(out, r'\bnan\b|\binf\b|None|<')
-        rules = suite.find(id_).task_type
-        gait, steps, high = (
-            rules == 'gait',
-            rules == 'spatial_footsteps',
-            rules in ('goal_navigation', 'soccer'),
-        )
-        for title in ('Character', 'Links', 'Observation', 'Action', 'Terrain', 'Reward',
-                      'Termination', 'Time', 'Differences'):  # fmt: skip
-            self.assertIn(f'\n{title}', out)
-        for title, shown in (
-            ('Clip', not gait and not steps and not high), ('Gait', gait), ('Parameters', gait),
-            ('Steps', steps), ('Plans', steps or rules == 'planar_footsteps'),
-        ):  # fmt: skip
-            self.assertEqual(f'\n{title}:' in out, shown, title)
-        self.assertEqual('\nFootstep controller\n' in out, high)
-        self.assertEqual('reward weight' in out, not gait and not high)
-
     def test_sizes_and_limits_are_those_of_the_original(self):
         # Sizes from the original's registry, limits from its character file.
         out = info(GAPS)
@@ -942,10 +920,12 @@ class ReadmeTest(CommandTest):
         for name in ('README.md', 'docs/guide.md')
     )
 
-    @parameterized.parameters(*re.findall(r'```python\n(.*?)```', text, re.DOTALL))
-    def test_code_runs(self, code):
+    def test_code_runs(self):
+        blocks = re.findall(r'```python\n(.*?)```', self.text, re.DOTALL)
+        self.assertLen(blocks, 6)
+        code = ''.join(f'exec({block!r}, {{}})\n' for block in blocks)
         done = subprocess.run(
-            [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=False
+            [sys.executable, '-c', code], capture_output=True, text=True, timeout=120, check=False
         )
         self.assertEqual((done.returncode, done.stderr), (0, ''))
 

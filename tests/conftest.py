@@ -3,9 +3,11 @@
 import collections
 import ctypes
 import gc
+import re
 import signal
 
 import helpers
+import mujoco
 import pytest
 
 
@@ -20,18 +22,32 @@ def pytest_configure():
 
 
 # Files that run first, so that two workers end at the same time. One compiles nearly all functions in
-# the first file; the other one meanwhile runs what needs few of them, and begins with the largest
-# meshes, while its memory is small. Last come short files.
+# the first file; the other one meanwhile runs what needs few of them, and then the largest meshes,
+# while its memory is small. Last come short files.
 FIRST = (
-    'environment', 'foreign', 'characters3d', 'characters', 'muscles', 'terrain', 'motion', 'clips3d',
-    'package', 'browser', 'cli', 'vector', 'faults', 'commands', 'compiled', 'suite', 'gait', 'disturbances',
+    'environment', 'characters3d', 'characters', 'muscles', 'terrain', 'motion', 'clips3d', 'package',
+    'compiled', 'foreign', 'browser', 'cli', 'vector', 'faults', 'commands', 'suite', 'gait',
+    'disturbances',
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
     rank = {f'{name}_test.py': number for number, name in enumerate(FIRST)}
     sizes = collections.Counter(item.path for item in items)
-    items.sort(key=lambda item: (rank.get(item.path.name, len(rank)), -sizes[item.path]))
+
+    def place(item):
+        # Tests of a file with the same parameter follow one another, to share its environment.
+        parameter = re.search(r'\d*$', item.originalname)[0]
+        together = parameter and 'setUpClass' not in vars(item.cls)
+        path = item.path
+        return (
+            rank.get(path.name, len(rank)),
+            -sizes[path],
+            path,
+            int(parameter) if together else -1,
+        )
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -57,5 +73,6 @@ def _memory():
     yield
     helpers.let_go()
     gc.collect()
+    mujoco.mj_clearCache(mujoco.mj_getCache())  # meshes of foreign files
     if hasattr(libc := ctypes.CDLL(None), 'malloc_trim'):  # glibc
         libc.malloc_trim(0)
