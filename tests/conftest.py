@@ -16,6 +16,7 @@ def pytest_configure():
         # Large arrays are returned to the system when they are released, and threads share a heap.
         libc.mallopt(-3, 1 << 17)  # M_MMAP_THRESHOLD, which would rise to 32 MB by itself
         libc.mallopt(-8, 1)  # M_ARENA_MAX
+    mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)  # meshes of foreign files, 0.2 GB
     # Background jobs of shell scripts ignore SIGINT, and so would the processes that tests start.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -68,11 +69,5 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True, scope='module')
 def _memory():
-    # Environments are full of cycles, and their models are not counted by the collector; the C
-    # library keeps freed memory unless told otherwise: a worker would grow to 3 GB.
     yield
-    helpers.let_go()
-    gc.collect()
-    mujoco.mj_clearCache(mujoco.mj_getCache())  # meshes of foreign files
-    if hasattr(libc := ctypes.CDLL(None), 'malloc_trim'):  # glibc
-        libc.malloc_trim(0)
+    helpers.let_go()  # a worker would grow to 3 GB

@@ -4,6 +4,7 @@ import importlib.util
 import itertools
 import pathlib
 
+import helpers
 import mujoco
 import numpy as np
 from absl.testing import absltest, parameterized
@@ -81,22 +82,25 @@ def colliding(model, bodies):
 class ForeignFileTest(parameterized.TestCase):
     """Files that were written for other programs."""
 
+    def tearDown(self):
+        super().tearDown()
+        helpers.let_go()  # the meshes of a dog take half a gigabyte
+
     @parameterized.parameters(*FILES)
     def test_the_same_geoms_collide_as_in_the_file(self, path):
-        made = read(self, path)
         spec = mujoco.MjSpec.from_file(str(file(self, path)))
+        made = read(self, path)
         root = next(body for body in spec.bodies if body.name == made.links[0])
         if not root.joints:
             root.add_freejoint()  # or all that hangs on it is welded to the world
         theirs = spec.compile()
+        expected = colliding(theirs, np.flatnonzero(theirs.body_rootid == root.id))
+        del spec, theirs, root  # a dog takes much memory
         environment = suite.build(made, task='walk')
         ours = environment.physics.model
         own = [i for i in range(ours.nbody) if ours.id2name(i, 'body').startswith(f'{made.name}/')]
         own = own[1:]  # without the frame to which it is attached
-        self.assertEqual(
-            colliding(ours.ptr, own),
-            colliding(theirs, np.flatnonzero(theirs.body_rootid == root.id)),
-        )
+        self.assertEqual(colliding(ours.ptr, own), expected)
 
     @parameterized.parameters(*FILES)
     def test_it_stands_for_a_second(self, path):
