@@ -585,6 +585,20 @@ class DivergenceTest(parameterized.TestCase):
             np.testing.assert_array_equal(value, kept[name])
         self.recovers(environment, actions)
 
+    @parameterized.parameters(*EXAMPLES)
+    def test_a_position_outside_the_world_is_divergence(self, id_):
+        environment = suite.make(id_, {'random': 6})
+        environment.reset()
+        actions = random_actions(environment, 4)
+        environment.physics.data.qpos[:2] = 2e18
+        environment.physics.forward()
+        step = environment.step(actions[0])
+        self.assertEqual((step.reward, step.discount), (0.0, 0.0))
+        self.assertTrue(environment.info['diverged'])
+        for value in step.observation.values():
+            self.assertTrue(np.isfinite(value).all())
+        self.recovers(environment, actions)
+
     def test_nan_is_divergence(self):
         environment = suite.make(GAPS, {'random': 6})
         environment.reset()

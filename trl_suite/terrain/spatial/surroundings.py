@@ -24,6 +24,7 @@ from trl_suite.terrain.spatial.windows import (
 from trl_suite.util.compiled import compiled
 
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
+FARTHEST = 1e10  # m; largest position that the engine accepts
 SPARE = 1.3  # factor applied to the largest number of boxes in these grounds
 
 EnvIds = slice | np.ndarray
@@ -151,14 +152,15 @@ class Surroundings:
           env_ids: sorted numbers of simulations; None for all.
 
         Returns:
-          The simulations whose windows were refilled.
+          The simulations whose windows were refilled. Those of a character beyond `FARTHEST` stay
+          where they are: the engine ends its episode in the next step.
         """
         if not self.windowed:
             return []
         moved = np.abs(xy - (self.centre if env_ids is None else self.centre[env_ids]))
         if not moved.max(initial=0.0) > SHIFT:
             return []
-        far = np.flatnonzero(moved.max(1) > SHIFT)
+        far = np.flatnonzero((moved.max(1) > SHIFT) & (np.abs(xy).max(1) < FARTHEST))
         leaving = (far if env_ids is None else env_ids[far]).tolist()
         for env_id, centre in zip(leaving, np.round(xy[far] / SHIFT) * SHIFT, strict=True):
             self._lay(env_id, centre)
