@@ -366,6 +366,8 @@ class CharacterTest(Folder):
         ('copies', '<geom type="capsule"', '<replicate count="100"><replicate count="100"><geom size="1"/></replicate></replicate><geom type="capsule"', 'line [0-9]+: bodies, joints, geoms and sites are more than 10000'),
         ('grid', '<geom type="capsule"', '<composite type="particle" count="99 99 99" spacing="1"/><geom type="capsule"', 'geoms and sites are more than 10000'),
         ('many', '<geom type="capsule"', 10_001 * '<geom size="1"/>' + '<geom type="capsule"', 'geoms and sites are more than 10000'),
+        ('far', 'name="trunk" pos="0 0 1"', 'name="trunk" pos="1e300 0 1"', 'line 1: pos="1e300 0 1" of .trunk.* up to 1e.30'),
+        ('line_break', 'name="right_shin"', 'name="right&#10;shin"', r"'right.nshin' has a slash, a line break"),
         ('slash', 'name="right_shin"', 'name="right/shin"', "'right/shin' has a slash"),
     )  # fmt: skip
     def test_invalid_files_are_rejected(self, before, after, message):

@@ -16,6 +16,7 @@ from lxml import etree
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
+LARGEST = 1e30  # number; squares of larger ones may overflow
 MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
 _PARTS = (
     'body', 'joint', 'freejoint', 'geom', 'site', 'link', 'collision', 'composite', 'flexcomp',
@@ -51,8 +52,11 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
         for i, item in enumerate(getattr(spec, kind)):
             _name(item, f'unnamed_{kind}_{i}', taken[kind])
     for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
-        if '/' in item.name:
-            raise problem(file, f'the name {item.name!r} has a slash; expected a name without one')
+        if '/' in item.name or not item.name.isprintable():
+            raise problem(
+                file, f'the name {item.name!r} has a slash, a line break or another character that is '
+                'not printable; expected a name without them',
+            )  # fmt: skip
     return spec
 
 
@@ -68,7 +72,7 @@ def _name(item: Any, wanted: str, taken: set[str]) -> None:
 
 
 def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
-    """Raises an error for NaN, which MuJoCo treats as a missing value, and for infinity.
+    """Raises an error for NaN, which MuJoCo treats as a missing value, and for huge numbers.
 
     Refuses models that load themselves, too, which would crash the process, and those with so many
     parts that MuJoCo would take all memory.
@@ -87,11 +91,11 @@ def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> N
     names = {element.get(key) for element in elements for key in ('name', 'class')}
     for element in elements:
         for key, text in element.items():
-            if text not in names and key not in ('name', 'class') and not _finite(text):
+            if text not in names and key not in ('name', 'class') and _is_huge(text):
                 of = f' of {element.get("name")!r}' if element.get('name') else ''
                 raise problem(
                     file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
-                    'finite numbers',
+                    f'finite numbers up to {LARGEST:g}',
                 )  # fmt: skip
     above = (*above, file.resolve())
     for element in elements:
@@ -130,12 +134,12 @@ def _count(element: etree._Element) -> int:
     return math.prod(int(number) for number in numbers.split() if number.isdecimal())
 
 
-def _finite(text: str) -> bool:
-    """Whether a text is a list of finite numbers, or not a list of numbers."""
+def _is_huge(text: str) -> bool:
+    """Whether a text is a list of numbers of which some are not finite, or above `LARGEST`."""
     try:
-        return bool(np.isfinite([float(number) for number in text.split()]).all())
+        return not all(abs(float(number)) <= LARGEST for number in text.split())
     except ValueError:
-        return True
+        return False
 
 
 def _in_package(file: pathlib.Path, name: str) -> str:
