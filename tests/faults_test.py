@@ -5,6 +5,7 @@ fast tests interrupt two programs once; the slow ones (`-m slow`) all of them by
 rounds, at times drawn from a seed that is printed.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -132,6 +133,8 @@ def serve():
         begin, child = time.monotonic(), os.fork()
         if not child:
             work(task)
+        with contextlib.suppress(OSError):  # it has ended
+            os.setpgid(child, child)
         number, after = task['signal'], begin + task['after']
         status = None
         while status is None:
@@ -150,7 +153,6 @@ def serve():
 
 def work(task):
     """Runs a program, and ends this process."""
-    os.setpgid(0, 0)
     os.chdir(task['folder'])
     log = os.open(task['log'], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):

@@ -13,7 +13,7 @@ from dm_env import specs
 
 from trl_suite.environments import arguments
 from trl_suite.tasks.task import Task
-from trl_suite.util import errors
+from trl_suite.util import errors, interrupts
 
 FLAT_OBSERVATION_KEY = 'observations'  # dm_control's name of the flat vector
 _SUBSTEP_HOOKS = ('before_substep', 'after_substep')
@@ -165,7 +165,8 @@ class Environment(composer.Environment):
 
     def close(self) -> None:
         """Frees the simulation and the task. A second call does nothing."""
-        with self.one_thread:
+        # An interrupt halfway would leave a rendering context that is freed twice.
+        with self.one_thread, interrupts.postponed():
             if self._physics is not None:
                 super().close()
                 # These refer to arrays of the model and its data, and would keep them in memory.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.util import program
+from trl_suite.util import interrupts
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
 
@@ -101,7 +101,7 @@ class Video:
         ]  # fmt: skip
         # An interrupt between the start and the return would leave an encoder that nobody ends, and
         # that creates the file after it was removed.
-        with program.signals_delayed():
+        with interrupts.postponed():
             self._encoder = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
                 start_new_session=True,  # an interrupt from the keyboard is for this process alone

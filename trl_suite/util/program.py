@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import pathlib
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 
 # Exceptions that users can cause. Any other one is a defect, and its traceback is printed.
@@ -30,9 +31,11 @@ def terminable() -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGTERM, _terminate)
+    hook, sys.unraisablehook = sys.unraisablehook, _sending_again(sys.unraisablehook)
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, before)
 
 
@@ -41,25 +44,28 @@ def _terminate(number: int, frame: object) -> None:
     raise Terminated
 
 
-@contextlib.contextmanager
-def signals_delayed() -> Iterator[None]:
-    """Delays SIGINT and SIGTERM to the end of the context; only in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    # Blocking them would not suffice: another thread may receive them for the main thread.
-    received: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, frame: received.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for one in received:
-            signal.raise_signal(one)
+def _sending_again(
+    hook: Callable[[sys.UnraisableHookArgs], object],
+) -> Callable[[sys.UnraisableHookArgs], None]:
+    """Returns a hook that sends a signal again if its exception was ignored.
+
+    Python ignores exceptions in destructors and in callbacks of weak references: without this, a
+    signal that arrives there would not end the program.
+    """
+
+    def handle(ignored: sys.UnraisableHookArgs) -> None:
+        if not issubclass(ignored.exc_type, KeyboardInterrupt):
+            hook(ignored)
+            return
+        number = signal.SIGINT
+        if issubclass(ignored.exc_type, Terminated):
+            number = signal.SIGTERM
+            signal.signal(number, _terminate)
+        timer = threading.Timer(0.01, os.kill, (os.getpid(), number))  # after this callback
+        timer.daemon = True
+        timer.start()
+
+    return handle
 
 
 def begin_script() -> None:
@@ -72,6 +78,7 @@ def begin_script() -> None:
     name = pathlib.Path(sys.argv[0]).name
     sys.excepthook = lambda *raised: _report(name, *raised)
     signal.signal(signal.SIGTERM, _terminate)
+    sys.unraisablehook = _sending_again(sys.unraisablehook)
 
 
 def _report(
