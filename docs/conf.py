@@ -1,7 +1,8 @@
 """Configures Sphinx: `pip install -e '.[docs]' && sphinx-build -W docs site`.
 
 The pages are Markdown that reads as well on GitHub. What only the site needs is added here: the
-navigation of generated pages, pages from outside docs/, and moving pictures, if there are any.
+navigation of generated pages, pages from outside docs/, and moving pictures of the environments:
+`-D moving_pictures='*'`, or another pattern of ids, renders those that are missing.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 
 import trl_suite
 from trl_suite.registry import catalogue
+from trl_suite.viewing import gallery
 
 DOCS = pathlib.Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -129,6 +131,16 @@ def is_code(block: str) -> bool:
     return False
 
 
+def render(app: Any) -> None:
+    """Renders moving pictures that are missing, or that show a policy that has been replaced."""
+    if app.config.moving_pictures:
+        _, failed = gallery.make(DOCS, app.config.moving_pictures, moves=True)
+        for path, error in failed.items():
+            raise RuntimeError(f'{path}: {error}') from error
+
+
 def setup(app: Any) -> None:
+    app.add_config_value('moving_pictures', '', 'env', str)
+    app.connect('builder-inited', render)
     app.connect('source-read', read)
     app.connect('autodoc-process-docstring', mark_code)
