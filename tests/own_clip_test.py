@@ -326,6 +326,7 @@ class ReadingTest(FolderTest):
         ('OFFSET 0.000000 0.000000 0.000000\nCHANNELS 3 Zrotation', 'OFFSET 0 0 0\nCHANNELS 0 Zrotation',
          'line .* without channels are not supported; expected'),
         ('MOTION', 'MOTON', 'no line MOTION'),
+        ('Frame Time: ', 'Frame Time: 1e-320 ', 'a number is too large, or Frame Time is too small'),
         ('Frame Time: ', 'Frame Time: -', 'frame_time must be >= 0'),
     )  # fmt: skip
     def test_bad_bvh(self, before, after, message):

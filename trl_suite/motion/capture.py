@@ -86,6 +86,8 @@ def read_bvh(
             found = pybvh.read_bvh_file(copy, world_up='+y', warn_on_world_up_disagreement=False)
         except (ValueError, IndexError) as error:
             raise ValueError(f'{path}: {error}'.replace(str(copy), path.name)) from None
+        except OverflowError:
+            raise ValueError(f'{path}: a number is too large, or Frame Time is too small') from None
     values = np.concatenate(
         [found.root_pos, found.joint_angles.reshape(len(found.root_pos), -1)], axis=1
     )
