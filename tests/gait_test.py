@@ -218,6 +218,13 @@ class StartTest(parameterized.TestCase):
         flat = np.linspace(-0.5, 10, 200) < 0.95  # the ground up to 1 m ahead
         np.testing.assert_allclose(observation['terrain'][flat], 0, atol=1e-12)
 
+    def test_the_largest_noise_stays_finite(self):
+        environment = make(DOG, start_noise=1.0)
+        for _ in range(20):
+            for step in (environment.reset(), environment.step(idle(environment))):
+                for value in step.observation.values():
+                    self.assertTrue(np.isfinite(value).all())
+
     def test_noise(self):
         clean, noisy = make(DOG), make(DOG, start_noise=0.05)
         found = []
@@ -605,7 +612,7 @@ class OptionTest(parameterized.TestCase):
         ({'base_actions': 'own'}, "unknown base_actions 'own'.*original"),
         ({'substeps': 0}, 'substeps is 0'), ({'substeps': 1.5}, 'substeps is 1.5'),
         ({'start_noise': -0.1}, 'start_noise is -0.1'), ({'start_noise': np.nan}, 'start_noise is nan'),
-        ({'start_noise': np.inf}, 'start_noise is inf'), ({'spawn': 'here'}, "'here'"),
+        ({'start_noise': np.inf}, 'start_noise is inf'), ({'start_noise': 1e300}, 'at most 1, in rad'), ({'spawn': 'here'}, "'here'"),
         ({'terrain_observation': 3}, 'unknown option'), ({'start_phase': 0.5}, 'unknown option'),
     )  # fmt: skip
     def test_options(self, options, message):

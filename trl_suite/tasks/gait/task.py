@@ -89,7 +89,7 @@ class GaitConfig(Config):
         0.0,
         'standard deviation of the noise on joint angles at the start; that on joint rates (rad/s) and '
         'forward speed (m/s) is ten times as large',
-        unit='rad', at_least=0,
+        unit='rad', at_least=0, at_most=1,
     )  # fmt: skip
 
 
