@@ -47,7 +47,8 @@ def made(*parts, seed=0, flat=False, **options):
       flat: whether observations are flat.
       **options: options of the task.
     """
-    key, test = repr((parts, flat, sorted(options.items()))), os.environ['PYTEST_CURRENT_TEST']
+    key = repr((parts, flat, sorted(options.items())))
+    test = os.environ.get('PYTEST_CURRENT_TEST')  # with unittest, which lacks it, each is new
     environment, user, _ = _kept.pop(key, (None, None, None))
     if environment is None or user == test:  # a test that asks twice compares two
         spec = suite.combine(*parts) if len(parts) > 1 else parts[0]

@@ -60,16 +60,18 @@ class DiscoveryTest(absltest.TestCase):
     """Python's own runner finds the tests."""
 
     def test_unittest_runs_what_is_not_slow(self):
-        fast, slow = (
+        fast, shared, slow = (
             'test_versions_of_the_engine_are_pinned',
+            'imitation_test.ResetTest.test_seeds0',  # takes its environment from `helpers.made`
             'test_long_random_rollout_is_finite_with_rewards_in_0_to_1',
         )
         done = subprocess.run(
-            [sys.executable, '-m', 'unittest', '-v', '-k', fast, '-k', slow],
+            [sys.executable, '-m', 'unittest', '-v', '-k', fast, '-k', shared, '-k', slow],
             capture_output=True, text=True, cwd=CHECKOUT, timeout=300,
         )  # fmt: skip
         self.assertEqual(done.returncode, 0, done.stderr)
         self.assertIn(f'{fast} (tests.package_test.PinTest', done.stderr)
+        self.assertIn(shared.rpartition('.')[2], done.stderr)
         self.assertNotIn(slow, done.stderr)
 
 
