@@ -169,7 +169,7 @@ class TorchRLTest(parameterized.TestCase):
 
     def test_code_of_the_page_runs(self):
         names = run_page('torchrl')
-        self.assertEqual(names['simulations'].batch_size, (16,))
+        self.assertEqual(names['many'].batch_size, (16,))
         self.assertEqual(names['one'].batch_size, ())
 
     @pytest.mark.slow
