@@ -275,7 +275,16 @@ class ConstructionTest(parameterized.TestCase):
     @parameterized.named_parameters(
         ('one_frame', {'times': [0], 'poses': np.zeros((1, 5))}, 'times: at least 2'),
         ('late_start', {'times': np.linspace(0.1, 1, 9)}, 'times: must start at 0'),
-        ('standing_time', {'times': [0, 0, *range(1, 8)]}, 'times: .* increase strictly'),
+        (
+            'standing_time',
+            {'times': [0, 0, *range(1, 8)]},
+            'times: .* increase by at least 1e-06 s',
+        ),
+        (
+            'tiny_times',
+            {'times': [0, 1e-320, *range(1, 8)]},
+            'times: .* increase by at least 1e-06 s',
+        ),
         ('infinite_time', {'times': [*range(8), np.inf]}, r'times: not finite at \[8\]'),
         ('too_few_columns', {'poses': np.zeros((9, 4))}, r'poses: shape is \(9, 4\).*\(9, 5\)'),
         ('no_table', {'poses': np.zeros(9)}, 'poses: shape'),
@@ -672,7 +681,7 @@ class ReaderTest(parameterized.TestCase):
         (
             'tiny',
             {'Frames': [GOOD, (1e-30, *GOOD[1:]), GOOD]},
-            'frame 1, duration: 1e-30 s; that is',
+            'frame 1, duration: 1e-30 s; expected at least 1e-06 s',
         ),
         ('backwards', {'Frames': [(-0.1, *GOOD[1:]), GOOD]}, 'frame 0, duration: -0.1 s'),
         (

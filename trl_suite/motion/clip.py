@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trl_suite.motion import quaternion
-from trl_suite.motion.layout import LARGEST, Layout, Mirror
+from trl_suite.motion.layout import LARGEST, SHORTEST, Layout, Mirror
 from trl_suite.util import archive, errors, resources
 
 VELOCITY_STEP = 1 / 60  # s between the two poses of a finite difference
@@ -104,8 +104,8 @@ class Clip:
             if bad.size:
                 what = 'too large' if np.isfinite(values[tuple(bad[0])]) else 'not finite'
                 raise self._error(field, f'{what} at {bad[0].tolist()}')
-        if self.times[0] != 0 or np.any(np.diff(self.times) <= 0):
-            raise self._error('times', 'must start at 0 and increase strictly')
+        if self.times[0] != 0 or np.any(np.diff(self.times) < SHORTEST):
+            raise self._error('times', f'must start at 0 and increase by at least {SHORTEST:g} s')
         for q, _ in self.layout.rotations:
             norms = np.linalg.norm(self.poses[:, q : q + 4], axis=1)
             bad = np.argwhere(np.abs(norms - 1) > _UNIT_TOLERANCE)

@@ -12,6 +12,7 @@ from trl_suite.util import errors
 
 ROOT_SIZES = {'planar': 3, 'free': 7}  # columns of a pose: x, z, pitch; x, y, z, quaternion
 LARGEST = 1e6  # m, rad or s; larger values in a motion are errors, and their squares may overflow
+SHORTEST = 1e-6  # s; least time between two frames, by which differences are divided
 JOINT_SIZES = (1, 4)  # hinge angle; ball-joint quaternion
 _REFLECTED_QUATERNION = (1, -1, 1, -1)
 _REFLECTED_POSITION = (1, -1, 1)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from trl_suite.motion.clip import Clip
-from trl_suite.motion.layout import JOINT_SIZES, LARGEST
+from trl_suite.motion.layout import JOINT_SIZES, LARGEST, SHORTEST
 from trl_suite.util.files import read_json, replacing
 
 _HEADER = 8  # numbers of a frame before the joints: duration, root position, root quaternion
@@ -179,7 +179,7 @@ def _parse(path: pathlib.Path) -> dict[str, Any]:
 
 
 def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
-    """Returns the frames as an array, (n, length), every number finite and every duration > 0."""
+    """Returns the frames as an array, (n, length), every number finite, no duration below `SHORTEST`."""
     frames = motion.get('Frames')
     if not isinstance(frames, list):
         raise ValueError(f'{path}: Frames: an array of frames is needed')
@@ -202,8 +202,10 @@ def _frames(path: pathlib.Path, motion: Mapping[str, Any]) -> np.ndarray:
     if len(frames[0]) < _HEADER:
         raise ValueError(f'{path}: frame 0 has {len(frames[0])} numbers, at least 8 are needed')
     array = np.array(frames, dtype=float)
-    for bad in np.flatnonzero(array[:-1, 0] <= 0):
-        raise ValueError(f'{path}: frame {bad}, duration: {array[bad, 0]:g} s is not positive')
+    for bad in np.flatnonzero(array[:-1, 0] < SHORTEST):
+        raise ValueError(
+            f'{path}: frame {bad}, duration: {array[bad, 0]:g} s; expected at least {SHORTEST:g} s'
+        )
     return array
 
 
@@ -263,11 +265,6 @@ def _clip(
             raise ValueError(f'{path}: frame {i}, {field}: the quaternion is zero')
         frames[:, here] /= norms[:, None]
     times = np.concatenate([[0], np.cumsum(frames[:-1, 0])])
-    for i in np.flatnonzero(np.diff(times) <= 0):
-        raise ValueError(
-            f'{path}: frame {i}, duration: {frames[i, 0]:g} s; that is lost beside the {times[i]:g} s '
-            'before it'
-        )
     balls = list(_balls(sizes))
     for column in balls:
         frames[:, column : column + 4] = _lying(frames[:, column : column + 4])
