@@ -63,13 +63,14 @@ GAITS = (  # gait environments that are trained by default
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
     'FSM_Biped2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'FSM_Hopper2D_Terrain_Mixed_Easy-v0',
     'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
-    'FSM_Hopper2D_Terrain_Mixed-v0',
+    'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
 )  # fmt: skip
 
 
 LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.py
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed_Easy-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0',
+    'FSM_Goat2D_Terrain_Cliffs-v0',
     # Policies for all terrains of a character.
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
