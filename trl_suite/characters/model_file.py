@@ -16,7 +16,7 @@ from lxml import etree
 from trl_suite.util import errors
 from trl_suite.util.files import check_size
 
-LARGEST = 1e30  # number; squares of larger ones may overflow
+LARGEST = 1e30  # number in a file; squares of larger ones may overflow
 MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
 _PARTS = (
     'body', 'joint', 'freejoint', 'geom', 'site', 'link', 'collision', 'composite', 'flexcomp',

@@ -24,8 +24,8 @@ from trl_suite.terrain.spatial.windows import (
 from trl_suite.util.compiled import compiled
 
 PROBES = 6  # random grounds from which the number of boxes of a window is estimated
-FARTHEST = 1e10  # m; largest position that the engine accepts
 SPARE = 1.3  # factor applied to the largest number of boxes in these grounds
+FARTHEST = 1e10  # m; largest position that the engine accepts
 
 EnvIds = slice | np.ndarray
 ALL = slice(None)
