@@ -15,6 +15,8 @@ import re
 import textwrap
 from typing import Any
 
+from sphinx.errors import ConfigError
+
 import trl_suite
 from trl_suite.registry import catalogue
 from trl_suite.viewing import gallery
@@ -133,10 +135,14 @@ def is_code(block: str) -> bool:
 
 def render(app: Any) -> None:
     """Renders moving pictures that are missing, or that show a policy that has been replaced."""
-    if app.config.moving_pictures:
+    if not app.config.moving_pictures:
+        return
+    try:
         _, failed = gallery.make(DOCS, app.config.moving_pictures, moves=True)
-        for path, error in failed.items():
-            raise RuntimeError(f'{path}: {error}') from error
+    except ValueError as error:
+        raise ConfigError(f'moving_pictures: {error}') from None
+    for path, error in failed.items():
+        raise ConfigError(f'{path}: {error}') from error
 
 
 def setup(app: Any) -> None:
