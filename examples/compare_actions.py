@@ -1,12 +1,12 @@
-"""Compares base actions of a gait, continuous changes of the default gait, and both (MACE).
+"""Compares base actions of a gait, changes of the default gait, and both (MACE), with Q-learning and PPO.
 
     python examples/compare_actions.py                     # one seed
     python examples/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json
     python examples/compare_actions.py --json benchmarks/gait_actions.json --page docs/findings.md
 
-Every result is a run of `learn_gaits.py` with its default settings, random first actions instead of
-those of a shipped policy, and the same number of cycles. The policy is then evaluated in episodes
-without a limit of distance. Finished runs are kept in the JSON file and not repeated.
+Every result is a run with the same number of cycles: of `learn_gaits.py` with its default settings and
+random first actions instead of those of a shipped policy, or of `ppo.py`. The policy is then evaluated
+in episodes without a limit of distance. Finished runs are kept in the JSON file and not repeated.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any
 
 import learn_gaits
 import numpy as np
+import ppo
+import ppo_settings
 import tqdm
 
 from trl_suite import evaluation, policies
@@ -26,21 +28,26 @@ from trl_suite.util.program import begin_script
 
 ID = 'FSM_Dog2D_Terrain_Mixed-v0'
 EPISODES, SEED = 100, 0
-NAMES = {  # of actions
+PPO = 'ppo'
+NAMES = {
     'discrete': 'one of the base actions', 'continuous': 'default gait with changes',
-    'both': 'base action with changes (MACE)',
+    'both': 'base action with changes (MACE)', PPO: 'default gait with changes, PPO',
 }  # fmt: skip
 _MARK, _END = '<!-- actions, written by examples/compare_actions.py -->', '<!-- /actions -->'
 
 
 def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -> dict[str, Any]:
     """Trains and evaluates one policy."""
-    settings = learn_gaits.Settings(
-        action=action, samples=cycles, expert_cycles=0, evaluate_every=cycles / 4,
-        evaluation_episodes=0,
-    )  # fmt: skip
     folder = runs / f'{id_}_{action}_{cycles:g}' / f'seed_{seed}'
-    curve = learn_gaits.train(id_, seed, settings, folder, 1)
+    common: dict[str, Any] = {'samples': cycles, 'evaluate_every': cycles / 4}
+    if action == PPO:
+        settings = ppo_settings.settings_for(id_, **common)
+        curve = ppo.train(id_, seed, settings, folder, 1)
+    else:
+        settings = learn_gaits.Settings(
+            action=action, expert_cycles=0, evaluation_episodes=0, **common
+        )
+        curve = learn_gaits.train(id_, seed, settings, folder, 1)
     found = evaluation.evaluate(id_, policies.load(folder / 'policy.npz'), EPISODES, SEED, 1)
     keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     return {
@@ -87,7 +94,7 @@ def main() -> None:
             raise ValueError(
                 f'{arguments.json} has {found["cycles"]:g} cycles; give another --json'
             )
-    jobs = [(action, seed) for seed in arguments.seeds for action in learn_gaits.ACTIONS]
+    jobs = [(action, seed) for seed in arguments.seeds for action in NAMES]
     for action, seed in tqdm.tqdm(jobs, unit='run'):
         if (key := f'{action}/{seed}') in found['results']:
             continue

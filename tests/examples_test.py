@@ -54,7 +54,9 @@ class CompareActionsTest(FolderTest):
 
     def test_finished_runs_are_kept_and_shown(self):
         first, out = self.run_program()
-        self.assertEqual(first, [(action, 1) for action in ('discrete', 'continuous', 'both')])
+        self.assertEqual(
+            first, [(action, 1) for action in ('discrete', 'continuous', 'both', 'ppo')]
+        )
         self.assertIn('| base action with changes (MACE) | 104 | 104 | 3.0 |', out)
         second, out = self.run_program('--seeds', '1', '2')
         self.assertEqual(second, [(action, 2) for action, _ in first])
@@ -62,7 +64,11 @@ class CompareActionsTest(FolderTest):
         with self.assertRaisesRegex(ValueError, '32768 cycles; give another --json'):
             self.run_program('--cycles', '100')
 
-    def test_a_run_has_the_settings_of_its_action(self):
+    @parameterized.parameters(
+        (compare_actions.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
+        (compare_actions.ppo, 'ppo', {'horizon': 16, 'gamma': 0.9}),
+    )
+    def test_a_run_has_the_settings_of_its_action(self, trainer, action, expected):
         asked = []
 
         def train(id_, seed, settings, folder, threads):
@@ -73,15 +79,14 @@ class CompareActionsTest(FolderTest):
 
         with (
             mock.patch.object(compare_actions, 'EPISODES', 1),
-            mock.patch.object(compare_actions.learn_gaits, 'train', train),
+            mock.patch.object(trainer, 'train', train),
         ):
             found = compare_actions.train(
-                'FSM_Hopper2D_Terrain_Gaps-v0', 'both', 3, 64, self.folder
+                'FSM_Hopper2D_Terrain_Gaps-v0', action, 3, 64, self.folder
             )
         ((settings, _),) = asked
-        self.assertEqual(
-            (settings.action, settings.samples, settings.expert_cycles), ('both', 64, 0)
-        )
+        expected = {**expected, 'samples': 64, 'evaluate_every': 16}
+        self.assertEqual({name: getattr(settings, name) for name in expected}, expected)
         self.assertEqual(found['curve'], [[8, 3.0]])
         self.assertGreater(found['distance'], 2.0)
 
