@@ -222,7 +222,11 @@ def given(id_: str) -> dict[str, bytes]:
     used = {other: policies.trained_for(other) for other in (*needed(id_), id_) if other in shipped}
     trained = resources.directory('trained')
     found = {f'{other}.npz': (trained / f'{other}.npz').read_bytes() for other in used.values()}
-    shared = {id_: {'policy': other} for id_, other in used.items() if id_ != other}
+    shared = {
+        id_: {'policy': other, 'preference': policies.preference_for(id_)}
+        for id_, other in used.items()
+        if id_ != other
+    }
     return {**found, policies.SHARED: json.dumps(shared).encode()}
 
 

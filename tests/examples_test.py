@@ -193,6 +193,22 @@ class JobsTest(parameterized.TestCase):
             )
         self.assertCountEqual([path.stem for path in folder.iterdir()], 'abd')
 
+    def test_the_best_preference_is_selected(self):
+        id_ = 'FSM_Raptor2D_Terrain_Mixed-v0'
+        policy = policies.reference(id_)
+
+        def evaluate(id_, candidate, *options):
+            added = float((candidate.biases[-1] - policy.biases[-1]).max())
+            return {'distance': -abs(added - 1.25)}
+
+        with (
+            mock.patch.object(share_gaits.evaluation, 'evaluate', evaluate),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            preference, best = share_gaits.preferring(id_, policy, [0, 1, 3], 1, 1)
+        self.assertEqual(preference, 1)
+        np.testing.assert_array_equal(best.biases[-1], policy.with_preference(1).biases[-1])
+
     def test_initial_policies_control_the_same_joints(self):
         """They drive the same joints in the same way; the limbs may differ in length."""
         for id_ in catalogue.BY_ID:

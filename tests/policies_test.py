@@ -206,6 +206,21 @@ class ActTest(parameterized.TestCase):
         np.testing.assert_array_equal(policy(observations), choices[[0, 1, 2, 0]])
         np.testing.assert_array_equal(policy(observations[1]), choices[1])
 
+    def test_a_preferred_default_action(self):
+        choices = np.array([[0.5, -0.5], [0, 0], [-1, 0.25]])
+        policy = make(
+            blocks=(('x', 3),), weights=[np.eye(3)], biases=[np.zeros(3)],
+            mean=np.zeros(3), std=np.ones(3), choices=choices,
+        )  # fmt: skip
+        near, far = [1, 0.5, 0], [2, 0, 0]
+        np.testing.assert_array_equal(policy([near, far]), choices[[0, 0]])
+        prefers = policy.with_preference(0.75)
+        np.testing.assert_array_equal(prefers([near, far]), choices[[1, 0]])
+        np.testing.assert_array_equal(policy([near, far]), choices[[0, 0]])
+        for without in (make(), dataclasses.replace(policy, choices=choices[[0, 2, 2]])):
+            with self.assertRaisesRegex(ValueError, 'expected one action of zeros'):
+                without.with_preference(1.0)
+
     def test_a_policy_can_change_the_action_that_it_selects(self):
         choices = np.array([[0.5, -0.5], [0.9, 0]])
         weights = np.array([[1, 0, 0.2, 0.1, 0, 0], [0, 1, 0, 0, 0.4, -0.3]])
@@ -601,6 +616,15 @@ class ReferenceTest(FolderTest):
         self.assertEqual((own.id, other.id), (dog, steps))
         self.assertEqual([policies.trained_for(id_) for id_ in (dog, steps)], [dog, dog])
         np.testing.assert_array_equal(own.weights[0], other.weights[0])
+
+    def test_a_policy_that_prefers_the_default_gait(self):
+        raptor, slopes = 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes-v0'
+        policies.save(make(id=raptor, choices=[[0.5, 0], [0, 0]]), self.folder / f'{raptor}.npz')
+        shared = {slopes: {'policy': raptor, 'preference': 1.5, 'evaluation': {}}}
+        (self.folder / policies.SHARED).write_text(json.dumps(shared))
+        self.assertEqual(list(map(policies.preference_for, (raptor, slopes))), [0.0, 1.5])
+        own, other = map(policies.reference, (raptor, slopes))
+        np.testing.assert_allclose(other.biases[-1], own.biases[-1] + [0, 1.5], rtol=1e-6)
 
     def test_a_variant_is_in_a_folder_of_its_own(self):
         dog = 'PD_Dog2D_Gaps_Terrain-v0'

@@ -250,11 +250,13 @@ def reference(id: str, variant: str = '') -> Policy:
             f'no {f"{variant} " if variant else ""}policy is shipped for {id!r}; '
             + (f'the closest ids with a policy: {", ".join(near)}' if near else 'none is installed')
         )
-    other = id if variant else trained_for(id)
+    other, preference = (id, 0.0) if variant else _source(id)
     path = _folder(variant) / f'{other}.npz'
     policy = load(path)
     if policy.id != other:
         raise ValueError(f"{path}: field 'id': is {policy.id!r}; expected {other!r}")
+    if preference:
+        policy = policy.with_preference(preference)
     return policy if id == other else dataclasses.replace(policy, id=id)
 
 
@@ -266,7 +268,17 @@ def available(variant: str = '') -> tuple[str, ...]:
 
 def trained_for(id: str) -> str:
     """Returns the id of the environment in which the shipped policy of an environment was trained."""
-    return _shared().get(id, id)
+    return _source(id)[0]
+
+
+def preference_for(id: str) -> float:
+    """Returns the preference of the default gait with which an environment's policy is shipped."""
+    return _source(id)[1]
+
+
+def _source(id: str) -> tuple[str, float]:
+    """Returns the environment whose policy an environment uses, and the preference."""
+    return _shared().get(id, (id, 0.0))
 
 
 def _folder(variant: str) -> pathlib.Path:
@@ -276,16 +288,19 @@ def _folder(variant: str) -> pathlib.Path:
     return resources.directory('trained') / variant
 
 
-def _shared() -> dict[str, str]:
-    """Returns the environments that use the policy of another one, and its id."""
+def _shared() -> dict[str, tuple[str, float]]:
+    """Returns the environments that use the policy of another one, its id, and the preference."""
     path = resources.directory('trained') / SHARED
     return _read_shared(path, path.stat().st_mtime_ns) if path.exists() else {}
 
 
 @functools.lru_cache(maxsize=1)
-def _read_shared(path: pathlib.Path, changed: int) -> dict[str, str]:
+def _read_shared(path: pathlib.Path, changed: int) -> dict[str, tuple[str, float]]:
     """Reads the file of shared policies; `changed` is its modification time, ns."""
-    return {id_: entry['policy'] for id_, entry in json.loads(path.read_text()).items()}
+    return {
+        id_: (entry['policy'], entry.get('preference', 0.0))
+        for id_, entry in json.loads(path.read_text()).items()
+    }
 
 
 def _small(value: Any) -> Any:

@@ -200,6 +200,24 @@ class Policy:
         noise = random.standard_normal(output.shape)
         return np.clip(output + np.exp(self.log_std.astype(float)) * noise, -1, 1)
 
+    def with_preference(self, preference: float) -> Policy:
+        """Returns the policy that selects its action of zeros, the default gait, more often.
+
+        Where actions differ little, errors of their estimated values decide which one is selected.
+
+        Args:
+          preference: number that is added to the value of the action of zeros.
+
+        Raises:
+          ValueError: the policy does not select one of several actions, or none is of zeros.
+        """
+        zeros = () if self.choices is None else np.flatnonzero(~self.choices.any(1))
+        if len(zeros) != 1:
+            raise ValueError('choices: expected one action of zeros, which can be preferred')
+        last = self.biases[-1].copy()
+        last[zeros] += preference
+        return dataclasses.replace(self, biases=(*self.biases[:-1], last))
+
     def check(self, environment: Any) -> None:
         """Checks that an environment has the policy's observations and actions.
 

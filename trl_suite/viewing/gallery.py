@@ -118,7 +118,10 @@ def moving_items() -> Iterator[Item]:
 
 def _policy_digest(id: str) -> str:
     """Returns a digest of the policy that is shipped for an environment, '' if none is."""
-    return _digest(f'{policies.trained_for(id)}.npz') if id in policies.available() else ''
+    if id not in policies.available():
+        return ''
+    digest, preference = _digest(f'{policies.trained_for(id)}.npz'), policies.preference_for(id)
+    return f'{digest} {preference:g}' if preference else digest
 
 
 def moving_path(id: str) -> str:
