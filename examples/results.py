@@ -146,8 +146,9 @@ def shared_rows() -> list[list[str]]:
     for id_, entry in (json.loads(path.read_text()) if path.exists() else {}).items():
         own, before = entry['evaluation'], entry['before']
         low, high = own['distance_interval']
+        preference = f'{entry["preference"]:g}' if 'preference' in entry else '–'
         rows.append([
-            f'`{id_}`', f'`{entry["policy"]}`', f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
+            f'`{id_}`', f'`{entry["policy"]}`', preference, f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
             f'{own["median_distance"]:.0f}', f'{own["speed"]:.2f}', f'{before["distance"]:.0f}',
             str(own['episodes']),
         ])  # fmt: skip
@@ -290,11 +291,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         parts += [
             '## Gaits on other terrains',
             'Policies on terrains on which they were not trained, by `examples/share_gaits.py`. *Before*: '
-            'the mean of the policy that was replaced, or else of the default gait, in the same episodes.',
+            'the mean of the policy that was replaced, or else of the default gait, in the same episodes. '
+            '*Preference*: number that is added to the value of the default gait.',
             table(
                 (
                     'environment',
                     'policy of',
+                    'preference',
                     'mean, 95 %',
                     'median',
                     'speed',
