@@ -27,6 +27,7 @@ from helpers import (
 
 from trl_suite import evaluation, policies, rendering, suite
 from trl_suite.controllers import footstep_controller
+from trl_suite.policies import files as policy_files
 from trl_suite.tasks.navigation import hierarchical_rules, scripted
 from trl_suite.vector import VectorEnvironment
 
@@ -812,8 +813,13 @@ class ControllerTest(FolderTest):
     def test_unknown_names_suggest_the_closest(self):
         with self.assertRaisesRegex(ValueError, f"did you mean '{hierarchical_rules.CONTROLLER}'"):
             started(PLANE, controller='PD_Biped3D_LLC_Genral_Step-v0')
-        with self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'):
-            started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0')  # nobody trained the goat
+        with (
+            mock.patch.object(policy_files, 'available', lambda variant: ()),
+            self.assertRaisesRegex(FileNotFoundError, 'no policy is shipped for'),
+        ):
+            started(PLANE, controller='PD_Biped3D_LLC_Trail_Step-v0')
+        with self.assertRaisesRegex(ValueError, "policy of 'FSM_Goat2D.*' observes .*plan 13"):
+            started(PLANE, controller='FSM_Goat2D_Terrain_Cliffs-v0')
         with self.assertRaises(FileNotFoundError):
             footstep_controller.load(self.folder / 'none.npz')
         (self.folder / 'broken.npz').write_bytes(b'no')
