@@ -52,7 +52,7 @@ def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -
     keys = 'distance', 'distance_interval', 'median_distance', 'speed'
     return {
         **{key: found[key] for key in keys},
-        'curve': [[point['samples'], point['distance']] for point in curve],
+        'curve': [[p['samples'], p['distance']] for p in curve if 'distance' in p],
     }
 
 

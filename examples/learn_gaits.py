@@ -645,7 +645,8 @@ class Learner:
 
         `metres` and `falls` are those of simulations without random actions and without retries
         since the last point, by environment. Without episodes of evaluation `distance` is their
-        ratio in the environment of the run; it is their mean distance to a fall.
+        ratio in the environment of the run; it is their mean distance to a fall. It is absent if
+        these simulations have not moved, as after the final phase.
         """
         s, begin = self.settings, time.process_time()
         point: dict[str, Any] = {}
@@ -659,7 +660,7 @@ class Learner:
                 point[name] = result[name]
             if s.also:
                 point['distances'] = [result['distance'] for result in results]
-        else:
+        elif self.tally[0].any():
             point['distance'] = float(self.tally[0, 0] / max(self.tally[0, 1], 1))
         self.seconds['evaluation'] += time.process_time() - begin
         metres, falls = self.tally.T.round(1).tolist()
@@ -747,7 +748,8 @@ def _train(
             bar.update(learner.samples - before)
             if learner.samples // s.evaluate_every > before // s.evaluate_every:
                 point = learner.evaluate()
-                bar.set_postfix(distance=f'{point["distance"]:.1f} m', loss=f'{point["loss"]:.4f}')
+                far = point.get('distance', np.nan)
+                bar.set_postfix(distance=f'{far:.1f} m', loss=f'{point["loss"]:.4f}')
             if learner.samples // s.write_every > before // s.write_every:
                 learner.save(folder)
     learner.save(folder)
@@ -764,7 +766,8 @@ def main() -> None:
         __doc__.splitlines()[0], 'cycles', {'action': ACTIONS}
     )
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        print(f'{point["samples"]:9} {point["distance"]:.1f} m')
+        if 'distance' in point:
+            print(f'{point["samples"]:9} {point["distance"]:.1f} m')
     print(folder / 'policy.npz')
 
 

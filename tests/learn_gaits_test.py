@@ -206,6 +206,7 @@ class LearnTest(parameterized.TestCase):
         self.assertEqual(point['falls'], falls)
         self.assertAlmostEqual(point['distance'], point['metres'][0] / falls[0], delta=0.1)
         np.testing.assert_array_equal(learner.tally, 0)
+        self.assertNotIn('distance', learner.evaluate())  # nothing has moved since
 
     def test_unknown_and_foreign_environments_are_refused(self):
         with self.assertRaisesRegex(ValueError, 'FSM_Hoper'):

@@ -335,7 +335,7 @@ def curve(id: str) -> np.ndarray:
         front = run['seed'] == found['shipped']
         axis.plot(
             [point['samples'] / unit for point in run['curve']],
-            [point[value] for point in run['curve']],
+            [point.get(value) for point in run['curve']],
             color='tab:blue' if front else '0.75', linewidth=1.5 if front else 1, marker='.',
             markersize=3,
         )  # fmt: skip
