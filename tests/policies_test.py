@@ -217,6 +217,9 @@ class ActTest(parameterized.TestCase):
         prefers = policy.with_preference(0.75)
         np.testing.assert_array_equal(prefers([near, far]), choices[[1, 0]])
         np.testing.assert_array_equal(policy([near, far]), choices[[0, 0]])
+        for bad in (np.nan, np.inf, 'much', [1, 2]):
+            with self.assertRaisesRegex(ValueError, '^preference: '):
+                policy.with_preference(bad)
         for without in (make(), dataclasses.replace(policy, choices=choices[[0, 2, 2]])):
             with self.assertRaisesRegex(ValueError, 'expected one action of zeros'):
                 without.with_preference(1.0)

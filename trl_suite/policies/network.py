@@ -209,8 +209,10 @@ class Policy:
           preference: number that is added to the value of the action of zeros.
 
         Raises:
-          ValueError: the policy does not select one of several actions, or none is of zeros.
+          ValueError: the policy does not select one of several actions, or none is of zeros; or the
+            preference is not a finite number.
         """
+        preference = checks.array('preference', preference, ())
         zeros = () if self.choices is None else np.flatnonzero(~self.choices.any(1))
         if len(zeros) != 1:
             raise ValueError('choices: expected one action of zeros, which can be preferred')
