@@ -487,8 +487,9 @@ def results_of(spec: catalogue.EnvSpec) -> Iterator[tuple[str, dict[str, Any]]]:
         shipped = 'shipped policy, ' * (run['seed'] == found['shipped'])
         yield f'{shipped}seed {run["seed"]}', run['evaluation']
     if spec.id in (shared := stored('shared')):
-        policy = shared[spec.id]['policy']
-        yield f'shipped policy of `{policy}`', shared[spec.id]['evaluation']
+        entry = shared[spec.id]
+        preference = f', preference {entry["preference"]:g}' if 'preference' in entry else ''
+        yield f'shipped policy of `{entry["policy"]}`{preference}', entry['evaluation']
     if spec.id in (gaits := stored('default_gaits')):
         yield 'default gait', gaits[spec.id]
     for path in sorted(RESULTS.glob(f'{spec.id}.*.json')):
