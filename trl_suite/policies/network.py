@@ -212,12 +212,12 @@ class Policy:
           ValueError: the policy does not select one of several actions, or none is of zeros; or the
             preference is not a finite number.
         """
-        preference = checks.array('preference', preference, ())
+        added = checks.array('preference', preference, ())
         zeros = () if self.choices is None else np.flatnonzero(~self.choices.any(1))
         if len(zeros) != 1:
             raise ValueError('choices: expected one action of zeros, which can be preferred')
         last = self.biases[-1].copy()
-        last[zeros] += preference
+        last[zeros] += added
         return dataclasses.replace(self, biases=(*self.biases[:-1], last))
 
     def check(self, environment: Any) -> None:
