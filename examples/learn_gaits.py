@@ -19,8 +19,10 @@ Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command cont
 identical results, and with a larger `--samples` for longer), `curve.json` (settings, learning
 curve), `last.npz` (the current averaged network), and at the end `policy.npz`: the result of a final
 phase without new samples, in which a new network learns from the replay with a falling learning rate
-(with an initial policy the same network continues). A run may learn over several environments of one
-character at a time, and may learn in rounds: the network collects, then learns anew from the replay.
+(with an initial policy the same network continues). With `--members 4` four networks learn in this
+phase, and the policy has the mean of their values, whose errors are smaller. A run may learn over
+several environments of one character at a time, and may learn in rounds: the policy collects, then
+learns anew from the replay.
 Needs `pip install 'trl_suite[train]'`.
 """
 
@@ -95,6 +97,7 @@ class Settings:
     polyak: float = 0.005  # weight of the new weights in the target network
     final_updates: int = 8000  # updates in which the learning rate falls to `final_rate`
     final_rate: float = 1e-5
+    members: int = 1  # networks that learn in a final phase; the policy has their mean values
     view: float = 6.5  # m; distance of the farthest ground height in the input
     relief: float = (
         1.5  # m; heights relative to the root are clipped at this deviation from the mean
@@ -151,9 +154,11 @@ _STATE = (
 )  # fmt: skip
 # Settings that may change when a run is continued.
 _CHANGEABLE = (
-    'samples', 'final_updates', 'final_rate', 'write_every', 'evaluate_every', 'evaluation_episodes',
+    'samples', 'final_updates', 'final_rate', 'members', 'write_every', 'evaluate_every',
+    'evaluation_episodes',
 )  # fmt: skip
-_PARTS = 'network', 'target', 'optimizer'
+_NETWORKS = 'network', 'target'
+_PARTS = *_NETWORKS, 'optimizer'
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
@@ -358,6 +363,7 @@ class Learner:
         self.origin = int(np.flatnonzero(self.columns == environments.blocks['pose'].start)[0])
         self.mean, self.std = np.zeros(len(self.columns)), np.ones(len(self.columns))
         self.begin_network()
+        self.members: list[Network] = []  # of the ensemble, after a final phase that made one
         self.replay = Replay(
             int(s.capacity), len(self.columns), self.choices.shape[1] if s.actors else 1
         )
@@ -402,10 +408,12 @@ class Learner:
     def begin_with(self, policy: policies.Policy) -> None:
         """Copies the weights and scales of a policy that this program has trained.
 
+        Of an ensemble, they are those of its first network.
+
         Raises:
           ValueError: its inputs or its base actions differ.
         """
-        line = policy.convolution
+        line, weights, biases = policy.networks[0]
         if line is None or not np.array_equal(policy.columns, self.columns):
             raise ValueError(
                 f'the network of {policy.id} has other inputs; expected one that learn_gaits.py trained'
@@ -418,8 +426,8 @@ class Learner:
             )
         self.mean, self.std = policy.mean.astype(float), policy.std.astype(float)
         parts = [*self.network.filters, *self.network.hidden, self.network.last]
-        weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in policy.weights)]
-        biases = [*line.biases, *policy.biases]
+        weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in weights)]
+        biases = [*line.biases, *biases]
         count = len(self.choices)
         with torch.no_grad():
             if self.network.actors is not None and weights[-1].shape[0] > count:
@@ -460,7 +468,9 @@ class Learner:
             chosen = (away**2).sum(2).argmin(1)
         else:
             with torch.no_grad():
-                values, learnt = self.network.both(self.seen(self.observation[:, self.columns]))
+                seen = self.seen(self.observation[:, self.columns])
+                found = [each.both(seen) for each in self.members or [self.network]]
+                values, learnt = (sum(each) / len(each) for each in zip(*found, strict=True))
             chosen, changes = values.argmax(1).numpy(), learnt.numpy()
             epsilon[self.greedy] = 0.0
         again = (self.tried[0] > 0) & (self.tried[1] < s.retry_cycles)
@@ -565,7 +575,8 @@ class Learner:
         middle = time.process_time()
         if before < s.begin <= self.samples and not s.start:
             self.set_scales()
-        if self.samples >= s.begin:
+        if self.samples >= s.begin and s.updates:
+            self.members = []
             for _ in range(s.updates):
                 self.learn()
         self.seconds['simulation'] += middle - begin
@@ -575,31 +586,40 @@ class Learner:
             self.finish()
 
     def finish(self) -> None:
-        """Learns with a falling learning rate, without new samples.
+        """Learns with a falling learning rate, without new samples, once for each member.
 
         A new network learns from the replay, unless the run began with a policy or has actors: the
         values of experts are those of their actors.
         """
-        s = self.settings
+        s, begin = self.settings, time.process_time()
         if s.renew_every:  # so that a continued run is identical
             torch.manual_seed(int(self.random.integers(2**32)))
-        if not s.start and not s.actors:
-            self.begin_network()
-        self.begin_optimizer()
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            self.optimizer, s.final_updates, s.final_rate
-        )
-        begin = time.process_time()
-        for _ in tqdm.trange(s.final_updates, unit='update', desc='last updates'):
-            self.learn()
-            schedule.step()
+        members, first = [], [copy.deepcopy(getattr(self, name).state_dict()) for name in _NETWORKS]
+        for _ in range(s.members):
+            if s.start or s.actors:
+                for name, weights in zip(_NETWORKS, first, strict=True):
+                    getattr(self, name).load_state_dict(weights)
+            else:
+                self.begin_network()
+            self.begin_optimizer()
+            schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+                self.optimizer, s.final_updates, s.final_rate
+            )
+            for _ in tqdm.trange(s.final_updates, unit='update', desc='last updates'):
+                self.learn()
+                schedule.step()
+            members.append(copy.deepcopy(self.target))
+        self.members = members if s.members > 1 else []
         self.renewed = self.samples
         if s.renew_every:
             self.network.load_state_dict(self.target.state_dict())
         self.seconds['learning'] += time.process_time() - begin
 
     def exported(self) -> policies.Policy:
-        """Returns the target network as a policy without PyTorch."""
+        """Returns the target network, or the ensemble, as a policy without PyTorch."""
+        return policies.ensemble(list(map(self._policy, self.members or [self.target])))
+
+    def _policy(self, network: Network) -> policies.Policy:
 
         def arrays(parts: nn.ModuleList, axes: tuple[int, ...]) -> dict[str, Any]:
             return {
@@ -607,7 +627,7 @@ class Learner:
                 'biases': tuple(part.bias.numpy().copy() for part in parts),
             }
 
-        environments, network = self.environments, self.target
+        environments = self.environments
         layers = arrays(nn.ModuleList([*network.hidden, network.last]), (1, 0))
         if network.actors is not None:
             actors = arrays(nn.ModuleList([network.actors]), (1, 0))
@@ -675,6 +695,7 @@ class Learner:
         state = {name: getattr(self, name) for name in _STATE}
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
         state |= {name: getattr(self, name).get_state() for name in ('replay', 'simulations')}
+        state['members'] = [each.state_dict() for each in self.members]
         state['past'] = list(map(list, self.past))
         state['chains'] = [
             [(before, tuple(action), reward) for before, action, reward in chain]
@@ -714,6 +735,9 @@ class Learner:
         ]
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
+        self.members = [copy.deepcopy(self.target) for _ in state['members']]
+        for network, weights in zip(self.members, state['members'], strict=True):
+            network.load_state_dict(weights)
         for name in ('replay', 'simulations'):
             getattr(self, name).set_state(state[name])
         self.random.bit_generator.state = state['random']

@@ -48,6 +48,33 @@ class LearnTest(parameterized.TestCase):
         for env_id, past in enumerate(learner.past):
             self.assertLessEqual(len(past), settings.back[1] + 1, env_id)
 
+    @parameterized.parameters('discrete', 'both')
+    def test_an_ensemble_learns_and_selects_by_mean_values(self, action):
+        settings = dataclasses.replace(
+            TINY, action=action, expert_cycles=0, begin=0, members=3, updates=0, renew_every=16,
+            epsilon=0.0, noise_share=0.0, retry=0.0,
+        )  # fmt: skip
+        learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
+        while learner.samples < 16:
+            learner.advance()
+        self.assertLen(learner.members, 3)
+        observation = learner.observation
+        with torch.no_grad():
+            seen = learner.seen(observation[:, learner.columns])
+            values = torch.stack([each(seen) for each in learner.members])
+        self.assertGreater(float((values[0] - values[1]).abs().max()), 0)
+        chosen = learner.act().number
+        np.testing.assert_array_equal(chosen, values.mean(0).argmax(1))
+        policy = learner.exported()
+        self.assertLen(policy.networks, 3)
+        if action == 'discrete':
+            expected = learner.choices[chosen]
+            np.testing.assert_allclose(policy(observation), expected, atol=learn_gaits.CHOICE_ERROR)
+        other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+        other.begin_with(policy)
+        with torch.no_grad():
+            np.testing.assert_allclose(other.network(seen), values[0], rtol=1e-4, atol=1e-5)
+
     def test_a_restored_simulation_has_its_old_state(self):
         learner = learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, retry=1.0), 1)
         seen = []
@@ -218,8 +245,8 @@ class LearnTest(parameterized.TestCase):
 
     @parameterized.parameters(
         {},
-        {'also': (WALLS,), 'renew_every': 16, 'updates': 0, 'evaluation_episodes': 0},
-        {'action': 'both', 'noise_share': 0.9},
+        {'also': (WALLS,), 'renew_every': 16, 'updates': 0, 'evaluation_episodes': 0, 'members': 2},
+        {'action': 'both', 'noise_share': 0.9, 'members': 2},
     )
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
         curves = []

@@ -134,6 +134,68 @@ class ActTest(parameterized.TestCase):
         expected = [plain(policy, row) for row in observations]
         np.testing.assert_allclose(policy(observations), expected, atol=2e-6)
 
+    @parameterized.parameters(make, make_convolving)
+    def test_an_ensemble_has_the_mean_output(self, make_one):
+        scales = {'mean': make_one().mean, 'std': make_one().std}  # those of the whole ensemble
+        members = []
+        for seed in range(3):
+            one = dataclasses.replace(make_one(seed), **scales)
+            last = one.weights[-1] / 8  # so that no output is clipped
+            members.append(dataclasses.replace(one, weights=[*one.weights[:-1], last]))
+        together = policies.ensemble(members)
+        size = together.observation_size
+        observations = np.random.default_rng(1).normal(0, 0.3, (50, size))
+        outputs = [np.array([plain(each, row) for row in observations]) for each in members]
+        self.assertLess(np.abs(outputs).max(), 1)
+        np.testing.assert_allclose(together(observations), np.mean(outputs, 0), atol=2e-6)
+        alone = [together(row) for row in observations]
+        np.testing.assert_array_equal(together(observations), alone)
+
+    def test_an_ensemble_selects_the_action_with_the_largest_mean_value(self):
+        choices = np.array([[0.5], [-0.5], [0.0]])
+        weight = np.zeros((3, 1, 3))
+        bias = np.array([[3.0, 0, 2], [0, 3, 2], [0, 0, 0]])  # means 1, 1, 4/3
+        policy = make(
+            hidden=(), blocks=(('a', 1),), actions=('hip',), weights=[weight], biases=[bias],
+            mean=np.zeros(1), std=np.ones(1), choices=choices,
+        )  # fmt: skip
+        np.testing.assert_array_equal(policy([0.0]), [0.0])
+        changed = dataclasses.replace(policy, biases=[bias - [0, 0, 0.5]])
+        np.testing.assert_array_equal(changed([0.0]), [0.5])
+        np.testing.assert_array_equal(changed.with_preference(0.3)([0.0]), [0.0])
+        np.testing.assert_array_equal(changed.with_preference(0.1)([0.0]), [0.5])
+
+    def test_networks_of_an_ensemble_have_the_same_shapes(self):
+        one, line = make(), make_convolving()
+        two = policies.ensemble([one, one])
+        for changes, message in (
+            ({'weights': [*two.weights[:2], one.weights[2]]}, r'weight_2: .*expected \(2, 5, 2\)'),
+            ({'biases': [one.biases[0], *two.biases[1:]]}, r'bias_0: .*expected \(2, 6\)'),
+            ({'weights': [w[:0] for w in two.weights]}, 'weight_0: .*at least one network'),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                dataclasses.replace(two, **changes)
+        with self.assertRaisesRegex(ValueError, r'line: convolutions of 1 .* those of 2'):
+            dataclasses.replace(policies.ensemble([line, line]), convolution=line.convolution)
+        with self.assertRaisesRegex(ValueError, 'weight_0: is too large'):
+            policies.ensemble(
+                [one, dataclasses.replace(one, weights=[1e37 * w for w in one.weights])]
+            )
+
+    def test_only_networks_of_one_policy_are_an_ensemble(self):
+        one = make()
+        self.assertIs(policies.ensemble([one]), one)
+        for members, message in (
+            ([], 'at least one'),
+            ([one, make(clip=2)], 'different clip'),
+            ([one, dataclasses.replace(one, std=2 * one.std)], 'different std'),
+            ([one, make(hidden=(6, 4))], 'different shapes'),
+            ([one, make(hidden=(6,))], 'different shapes'),
+            ([one, policies.ensemble([one, one])], 'one network each'),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(ValueError, f'members: .*{message}'):
+                policies.ensemble(members)
+
     def test_convolutions_do_not_depend_on_the_batch(self):
         policy = make_convolving(layer_norm=True)
         observations = np.random.default_rng(1).normal(0, 2, (67, 13))
@@ -393,9 +455,11 @@ class FileTest(FolderTest):
             np.testing.assert_array_equal(getattr(again, name), getattr(policy, name))
             self.assertRegex(files.__doc__, rf'\n    {name}\b')
 
-    @parameterized.parameters(9, None)
-    def test_round_trip_of_convolutions(self, origin):
+    @parameterized.parameters((9, 1), (None, 1), (9, 3))
+    def test_round_trip_of_convolutions(self, origin, networks):
         policy = make_convolving(layer_norm=True)
+        if networks > 1:
+            policy = policies.ensemble([policy] * networks)
         line = dataclasses.replace(policy.convolution, origin=origin)
         policy = dataclasses.replace(policy, convolution=line)
         path = self.folder / 'p.npz'

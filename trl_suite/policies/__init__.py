@@ -11,7 +11,7 @@ from trl_suite.policies.files import (
     save,
     trained_for,
 )
-from trl_suite.policies.network import ACTIVATIONS, Policy, placed
+from trl_suite.policies.network import ACTIVATIONS, Policy, ensemble, placed
 
 __all__ = [
     'ACTIVATIONS',
@@ -20,6 +20,7 @@ __all__ = [
     'Convolution',
     'Policy',
     'available',
+    'ensemble',
     'load',
     'placed',
     'preference_for',

@@ -28,6 +28,18 @@ def array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return copied
 
 
+def stack(name: str, weight: Any, axes: int) -> tuple[int, ...]:
+    """Returns (m,) if the weights are those of m networks, with one axis more than `axes`, else ().
+
+    Raises:
+      ValueError: m is 0; the message has the name.
+    """
+    found = np.shape(weight)[:1] if np.ndim(weight) == axes + 1 else ()
+    if found == (0,):
+        raise ValueError(f'{name}: expected the weights of at least one network')
+    return found
+
+
 def columns(name: str, value: Any, axes: int, inputs: int) -> np.ndarray:
     """Returns a read-only copy of indices of columns, at least one.
 

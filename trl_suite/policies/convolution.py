@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -21,11 +22,13 @@ class Convolution:
       line: number of inputs that form the line, l.
       strides: strides of each layer, in positions of its input.
       weights: per layer (width, channels, filters), float32 and read-only, as all arrays; the first
-        has one channel, each other as many channels as the previous layer has filters.
-      biases: per layer (filters,).
+        has one channel, each other as many channels as the previous layer has filters. Of the m
+        networks of an ensemble, (m, width, channels, filters).
+      biases: per layer (filters,), or (m, filters).
       origin: index of the input that is subtracted from those of the line, such as the root's
         height, before normalisation; None for none.
       outputs: number of outputs: positions times filters of the last layer.
+      members: the convolutions of each network of an ensemble; or only this one.
 
     Raises:
       ValueError: fields are inconsistent; the message names one.
@@ -51,12 +54,12 @@ class Convolution:
                 f'{len(self.biases)} biases'
             )
         weights, biases, positions, channels = [], [], self.line, 1
+        stack = checks.stack('filter_0', self.weights[0], 3)
         for i, stride in enumerate(self.strides):
-            width, _, filters = (
-                np.shape(self.weights[i]) if np.ndim(self.weights[i]) == 3 else 3 * (0,)
-            )
-            weights.append(checks.array(f'filter_{i}', self.weights[i], (width, channels, filters)))
-            biases.append(checks.array(f'filter_bias_{i}', self.biases[i], (filters,)))
+            width, _, filters = (0, 0, 0, *np.shape(self.weights[i]))[-3:]
+            shape = width, channels, filters
+            weights.append(checks.array(f'filter_{i}', self.weights[i], (*stack, *shape)))
+            biases.append(checks.array(f'filter_bias_{i}', self.biases[i], (*stack, filters)))
             if stride < 1 or not 1 <= width <= positions or not filters:
                 raise ValueError(
                     f'filter_{i}: {filters} of width {width} and stride {stride} on {positions} positions'
@@ -65,6 +68,13 @@ class Convolution:
         put('weights', tuple(weights))
         put('biases', tuple(biases))
         put('outputs', positions * channels)
+
+    @functools.cached_property
+    def members(self) -> tuple[Convolution, ...]:
+        if self.weights[0].ndim == 3:
+            return (self,)
+        arrays = zip(zip(*self.weights, strict=True), zip(*self.biases, strict=True), strict=True)
+        return tuple(dataclasses.replace(self, weights=w, biases=b) for w, b in arrays)
 
     def check(self, inputs: int) -> None:
         """Raises ValueError unless it fits a network with this number of inputs."""

@@ -70,6 +70,9 @@ and, if hidden layers have layer normalisation before the activation: mean 0 and
 
     layer_norm   int ()      1
 
+An ensemble of m networks, whose outputs are averaged, has a first axis of m in all of its `weight`,
+`bias`, `filter` and `filter_bias` arrays.
+
 Floats are written as float32, or as float16 if that is exact.
 """
 
@@ -177,6 +180,8 @@ def load(path: str | os.PathLike[str]) -> Policy:
                 raise ValueError(f'is {fields[name]!r}; expected {FORMAT!r}')
             if name == 'version' and fields[name] != VERSION:
                 raise ValueError(f'is {fields[name]}; expected {VERSION}')
+        read.field = 'weight_0'
+        read.stacked = int('weight_0' in archive and archive['weight_0'].ndim == 3)
         weights, biases = read.layers('', fields['layers'], 2)
         if any(name.startswith('mirror_') for name in archive.files):
             side = 'feet' if 'mirror_feet' in archive else 'phase'
@@ -319,6 +324,7 @@ class _Reader:
         self.archive: Any = {}
         self.field = ''
         self.taken: set[str] = set()
+        self.stacked = 0  # number of axes before those of a layer: 1 for an ensemble
 
     def __call__(self, field: str, kind: str, axes: int) -> np.ndarray:
         self.field = field
@@ -334,6 +340,10 @@ class _Reader:
         """Returns weights and biases of `count` layers of one kind."""
         weight, bias = (kind, f'{kind}_bias') if kind else ('weight', 'bias')
         found = [
-            (self(f'{weight}_{i}', 'f', axes), self(f'{bias}_{i}', 'f', 1)) for i in range(count)
+            (
+                self(f'{weight}_{i}', 'f', self.stacked + axes),
+                self(f'{bias}_{i}', 'f', self.stacked + 1),
+            )
+            for i in range(count)
         ]
         return tuple(part[0] for part in found), tuple(part[1] for part in found)

@@ -20,6 +20,8 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     'relu': lambda x: np.maximum(x, 0),
     'elu': lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
 }
+_Arrays = tuple[np.ndarray, ...]
+_Network = tuple[Convolution | None, _Arrays, _Arrays]  # convolution, weights, biases
 _FLAT = 'observations'  # key of the flat vector, if an environment returns one
 _LEAST_VARIANCE = 1e-5  # added to the variance in layer normalisation
 REACH = 1.0  # m; `placed` keeps the positions of nearer places, and the directions of others
@@ -39,8 +41,9 @@ class Policy:
       mean: mean of the inputs, for normalisation, (c,) float32; all arrays are read-only.
       std: standard deviation of the inputs, for normalisation, (c,).
       clip: bound of the normalised observation.
-      weights: per layer (inputs, outputs).
-      biases: per layer (outputs,).
+      weights: per layer (inputs, outputs); of an ensemble of m networks, whose outputs are averaged,
+        (m, inputs, outputs).
+      biases: per layer (outputs,), or (m, outputs).
       activation: activation of all layers but the last, convolutions included, one of `ACTIVATIONS`.
       log_std: logarithm of the exploration noise's standard deviation, (a,).
       info: how the policy was trained; a JSON object.
@@ -116,7 +119,7 @@ class Policy:
         if self.choices is not None:
             last = len(self.choices)
             put('choices', checks.array('choices', self.choices, (last, a)))
-            if self.biases and np.size(self.biases[-1]) == last * (1 + a):
+            if self.biases and np.shape(self.biases[-1])[-1:] == (last * (1 + a),):
                 last *= 1 + a
             if not last or np.abs(self.choices).max() > 1:
                 raise ValueError('choices: expected at least one action, in [-1, 1]')
@@ -125,20 +128,24 @@ class Policy:
         layers = len(self.weights)
         if not layers or len(self.biases) != layers:
             raise ValueError(f'weights: {layers} layers with {len(self.biases)} biases')
-        inputs = seen
+        inputs, stack = seen, checks.stack('weight_0', self.weights[0], 2)
         if self.convolution is not None:
             self.convolution.check(seen)
             inputs += self.convolution.outputs - self.convolution.line
+            own, count = len(self.convolution.members), stack[0] if stack else 1
+            if own != count:
+                raise ValueError(f'line: convolutions of {own} networks; expected those of {count}')
         put('layer_norm', bool(self.layer_norm))
         weights, biases = [], []
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             outputs = last if i == layers - 1 else np.shape(weight)[-1] if np.ndim(weight) else 0
-            weights.append(checks.array(f'weight_{i}', weight, (inputs, outputs)))
-            biases.append(checks.array(f'bias_{i}', bias, (outputs,)))
+            weights.append(checks.array(f'weight_{i}', weight, (*stack, inputs, outputs)))
+            biases.append(checks.array(f'bias_{i}', bias, (*stack, outputs)))
             inputs = outputs
         put('weights', tuple(weights))
         put('biases', tuple(biases))
-        self._check_sums()
+        for network in self.networks:
+            self._check_sums(*network)
         try:
             put('info', json.loads(json.dumps(self.info, allow_nan=False)))
         except (TypeError, ValueError) as error:
@@ -148,18 +155,25 @@ class Policy:
         if self.mirror is not None:
             self.mirror.check(k, a)
 
-    def _check_sums(self) -> None:
+    @functools.cached_property
+    def networks(self) -> tuple[_Network, ...]:
+        """Convolution (or None), weights and biases of each network: of all of an ensemble, or of one."""
+        if self.weights[0].ndim == 2:
+            return ((self.convolution, self.weights, self.biases),)
+        arrays = tuple(zip(*self.weights, strict=True)), tuple(zip(*self.biases, strict=True))
+        lines = (None,) * len(arrays[0]) if self.convolution is None else self.convolution.members
+        return tuple(zip(lines, *arrays, strict=True))
+
+    def _check_sums(self, line: Convolution | None, weights: _Arrays, biases: _Arrays) -> None:
         """Raises an error if a sum may overflow, since an action could then be NaN."""
         bound = self.clip
-        if self.convolution is not None:
-            for i, layer in enumerate(
-                zip(self.convolution.weights, self.convolution.biases, strict=True)
-            ):
+        if line is not None:
+            for i, layer in enumerate(zip(line.weights, line.biases, strict=True)):
                 bound = self._hidden(checks.largest_sum(f'filter_{i}', *layer, bound))
             bound = max(bound, self.clip)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
             bound = checks.largest_sum(f'weight_{i}', weight, bias, bound)
-            if i < len(self.weights) - 1:
+            if i < len(weights) - 1:
                 if self.layer_norm:
                     checks.largest_sum(
                         f'weight_{i}', np.full((len(bias), 1), bound), np.zeros(1), bound
@@ -217,7 +231,7 @@ class Policy:
         if len(zeros) != 1:
             raise ValueError('choices: expected one action of zeros, which can be preferred')
         last = self.biases[-1].copy()
-        last[zeros] += added
+        last[..., zeros] += added
         return dataclasses.replace(self, biases=(*self.biases[:-1], last))
 
     def check(self, environment: Any) -> None:
@@ -285,18 +299,10 @@ class Policy:
         if self.convolution is not None:
             seen = self.convolution.relative(seen)
         mean, std = self._scales
-        x = _bounded((seen - mean) / std, self.clip).astype(np.float32, order='C')
-        activation = ACTIVATIONS[self.activation]
-        if self.convolution is not None:
-            x = self.convolution(x, activation)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            # One product per row, so that an action does not depend on the batch size.
-            x = (x @ weight if len(x) == 1 else np.matmul(x[:, None], weight)[:, 0]) + bias
-            if i < len(self.weights) - 1:
-                if self.layer_norm:
-                    x = x - x.mean(1, keepdims=True)
-                    x /= np.sqrt((x * x).mean(1, keepdims=True) + np.float32(_LEAST_VARIANCE))
-                x = activation(x)
+        inputs = _bounded((seen - mean) / std, self.clip).astype(np.float32, order='C')
+        x, *others = (self._run(inputs, *network) for network in self.networks)
+        if others:
+            x = sum(others, x.astype(float)) / len(self.networks)
         if self.choices is not None:
             number = len(self.choices)
             chosen, changes = x[:, :number].argmax(1), x[:, number:]
@@ -307,6 +313,68 @@ class Policy:
         if self.mirror is not None and left is not None:
             x = self.mirror.unmirror_action(x, left)
         return x.astype(float).reshape(*flat.shape[:-1], len(self.actions))
+
+    def _run(
+        self, x: np.ndarray, line: Convolution | None, weights: _Arrays, biases: _Arrays
+    ) -> np.ndarray:
+        """Maps normalised inputs (n, c) to the outputs of one network."""
+        activation = ACTIVATIONS[self.activation]
+        if line is not None:
+            x = line(x, activation)
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            # One product per row, so that an action does not depend on the batch size.
+            x = (x @ weight if len(x) == 1 else np.matmul(x[:, None], weight)[:, 0]) + bias
+            if i < len(weights) - 1:
+                if self.layer_norm:
+                    x = x - x.mean(1, keepdims=True)
+                    x /= np.sqrt((x * x).mean(1, keepdims=True) + np.float32(_LEAST_VARIANCE))
+                x = activation(x)
+        return x
+
+
+def ensemble(members: Sequence[Policy]) -> Policy:
+    """Returns the policy with the mean outputs of policies, whose errors are smaller than theirs.
+
+    Args:
+      members: policies that differ only in weights, biases and convolutions, each of one network;
+        the result has the other fields of the first.
+
+    Raises:
+      ValueError: there is none, or they have networks of different shapes, several networks, or
+        different blocks, actions, scales, columns or choices.
+    """
+    if not members:
+        raise ValueError('members: expected at least one policy')
+    first = members[0]
+    if len(members) == 1:
+        return first
+    for name in ('blocks', 'actions', 'quantity', 'clip', 'activation', 'layer_norm'):
+        if any(getattr(each, name) != getattr(first, name) for each in members):
+            raise ValueError(f'members: have different {name}')
+    for name in ('mean', 'std', 'places', 'columns', 'choices'):
+        if not all(np.array_equal(getattr(each, name), getattr(first, name)) for each in members):
+            raise ValueError(f'members: have different {name}')
+    if any(len(each.networks) > 1 for each in members):
+        raise ValueError('members: expected policies of one network each')
+    lines, weights, biases = zip(*(each.networks[0] for each in members), strict=True)
+    line = first.convolution
+    if line is not None:
+        line = dataclasses.replace(
+            line,
+            weights=_stacked([each.weights for each in lines]),
+            biases=_stacked([each.biases for each in lines]),
+        )
+    return dataclasses.replace(
+        first, weights=_stacked(weights), biases=_stacked(biases), convolution=line
+    )
+
+
+def _stacked(members: Sequence[Sequence[np.ndarray]]) -> tuple[np.ndarray, ...]:
+    """Returns the arrays of each layer, with a first axis of the members."""
+    try:
+        return tuple(np.stack(layer) for layer in zip(*members, strict=True))
+    except ValueError as error:
+        raise ValueError(f'members: have networks of different shapes ({error})') from None
 
 
 def _bounded(x: np.ndarray, bound: float) -> np.ndarray:
