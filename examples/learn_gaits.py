@@ -786,8 +786,9 @@ def _train(
 
 
 def main() -> None:
+    further = {'action': {'choices': ACTIONS}, 'members': {'type': int}}
     id_, seed, changes, folder, threads = ppo.command_line(
-        __doc__.splitlines()[0], 'cycles', {'action': ACTIONS}
+        __doc__.splitlines()[0], 'cycles', further
     )
     for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
         if 'distance' in point:

@@ -675,14 +675,14 @@ def _train(
 
 
 def command_line(
-    description: str, sample: str, choices: Mapping[str, Sequence[str]] | None = None
+    description: str, sample: str, further: Mapping[str, Mapping[str, Any]] | None = None
 ) -> tuple[str, int, dict[str, Any], pathlib.Path, int]:
     """Parses the command line of a training program.
 
     Args:
       description: description of the program.
       sample: what its samples are.
-      choices: further settings, and their values.
+      further: further settings, and keyword arguments of `argparse.ArgumentParser.add_argument`.
 
     Returns:
       Id, seed, settings other than the defaults, folder and threads.
@@ -693,11 +693,11 @@ def command_line(
     parser.add_argument('--threads', type=int, default=0, help='0: all cores')
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
     parser.add_argument('--samples', type=float, help=f'{sample}, instead of the default')
-    for name, values in (choices or {}).items():
-        parser.add_argument(f'--{name}', choices=values, help='instead of the default')
+    for name, keywords in (further or {}).items():
+        parser.add_argument(f'--{name}', help='instead of the default', **keywords)
     chosen = parser.parse_args()
     id_ = suite.find(chosen.id).id
-    given = {name: getattr(chosen, name) for name in ('samples', *(choices or ()))}
+    given = {name: getattr(chosen, name) for name in ('samples', *(further or ()))}
     changes = {name: value for name, value in given.items() if value is not None}
     return id_, chosen.seed, changes, chosen.output / id_ / f'seed_{chosen.seed}', chosen.threads
 
