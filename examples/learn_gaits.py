@@ -140,7 +140,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'also': ('FSM_Raptor2D_*',), 'num_envs': 70,
     },
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {**GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',)},
-    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536},
+    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},
     # A hopper must choose its hops four cycles, or 9 m, ahead.
     'FSM_Hopper2D_Terrain_Mixed-v0': {
         **GENERALIST, **SCRATCH, 'also': ('FSM_Hopper2D_*',), 'num_envs': 70, 'view': 10.0,

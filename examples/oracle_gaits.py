@@ -6,13 +6,19 @@
 The policy runs until it falls. From the states before its last cycles other actions are tried, each
 for one cycle, after which the policy continues: every base action, and random parameters (a base
 action plus normal noise in all parameters). An action prevents the fall if the character gets
-`PASSED` metres beyond the place of the fall. If base actions prevent most falls, the policy can be
-improved by learning; if random parameters prevent more, other gaits are needed; if nothing helps,
-the gait itself is the limit, or the view, or the fall was decided more than `BACK` cycles earlier.
+`PASSED` metres beyond the place of the fall. If random parameters prevent more falls than base actions,
+other gaits are needed; if nothing helps, the gait itself is the limit, or the view, or the fall was
+decided more than `BACK` cycles earlier.
+
+An action is found here with hindsight. To tell a wrong choice from bad luck, the policy also continues
+from the same states with joint angles that are changed by `NUDGE`, which its network hardly sees. As
+far as that prevents the fall as often as other actions do, no policy could have selected a better one
+from its observation, and more learning does not help; where other actions prevent more, it does.
 
 Writes `trained/oracles.json`: ID -> settings and, for 1 to `BACK` cycles before the end, the share of
-falls that some action prevents, and the mean share of actions that do. The policy's own action is
-tried as well: it falls again, unless two actions are so close in value that rounding decides.
+falls that some action prevents, and the mean share of actions that do; and the same for the policy's
+own action from changed states. Its own action from the same state is tried as well: it falls again,
+unless two actions are so close in value that rounding decides.
 """
 
 from __future__ import annotations
@@ -21,7 +27,7 @@ import argparse
 import collections
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +43,8 @@ BACK = 5  # largest number of cycles from a state to the fall
 PASSED = 2.0  # m beyond the place of the fall
 MOST_CYCLES = 12  # after the action that is tried
 NOISE = 0.3  # standard deviation of random parameters, in units of the action
-KINDS = 'base', 'random'
+NUDGE = 1e-3  # standard deviation of changes of joint angles, rad
+KINDS = 'base', 'random', 'nudged'
 Act = Callable[[np.ndarray], np.ndarray]
 
 
@@ -75,12 +82,42 @@ def falls(
     return [list(each) for each in past], position(environments)
 
 
+def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray) -> dict[str, Any]:
+    """Returns the state of a simulation with changed joint angles.
+
+    Args:
+      copies: environments of this kind.
+      state: the state.
+      change: changes of the angles of the joints, without the root, (j,) rad.
+    """
+    world = state['world'][0].copy()
+    qpos = world[1 : 1 + copies.task.world.qpos.shape[1]]  # time precedes the positions
+    joints = np.delete(np.arange(len(qpos)), copies.task.figure.pose_qpos[:3])
+    qpos[joints] += change
+    return {**state, 'world': [world]}
+
+
 def prevented(
-    copies: VectorEnvironment, state: dict[str, Any], place: float, actions: np.ndarray, act: Act
+    copies: VectorEnvironment,
+    states: Sequence[dict[str, Any]],
+    place: float,
+    actions: np.ndarray,
+    act: Act,
 ) -> np.ndarray:
-    """Returns which of some actions (m, k), each for one cycle, prevent a fall at a place, (m,)."""
+    """Returns which of some actions prevent a fall.
+
+    Args:
+      copies: environments of this kind, at least m.
+      states: the states in which the actions are tried, m.
+      place: place of the fall, m.
+      actions: the actions, each for one cycle, (m, k).
+      act: the policy that continues.
+
+    Returns:
+      (m,) bool.
+    """
     going = np.arange(len(actions))
-    for i in going.tolist():
+    for i, state in enumerate(states):
         copies.set_state(state, [i])
     action = np.zeros((copies.num_envs, actions.shape[1]))
     action[going] = actions
@@ -104,19 +141,23 @@ def measure(
     environments = VectorEnvironment(id_, number, 1, seed, **options)
     parameters = environments.task.gait.parameters
     base = parameters.action(parameters.base_actions)
-    states, places = falls(environments, policy)
-    copies = VectorEnvironment(id_, 1 + len(base) + randoms, 1, seed, **options)
+    past, places = falls(environments, policy)
+    ends = np.cumsum([1, len(base), randoms, randoms])  # of the copies of each kind
+    copies = VectorEnvironment(id_, int(ends[-1]), 1, seed, **options)
     copies.reset()
+    joints = copies.task.world.qpos.shape[1] - 3
     found = np.zeros((number, BACK, copies.num_envs), bool)
     for i, place in enumerate(tqdm.tqdm(places, unit='fall')):
-        for back, state in enumerate(states[i]):
+        for back, state in enumerate(past[i]):
             copies.set_state(state, [0])
             own = policy(copies.task.observation[:1])
             around = base[rng.integers(len(base), size=randoms)]
             noisy = np.clip(around + rng.normal(0, NOISE, around.shape), -1, 1)
-            tried = np.concatenate([own, base, noisy])
-            found[i, back] = prevented(copies, state, float(place), tried, policy)
-    parts = found[..., 1 : 1 + len(base)], found[..., 1 + len(base) :]
+            changes = rng.normal(0, NUDGE, (randoms, joints))
+            states = [state] * ends[2] + [nudged(copies, state, each) for each in changes]
+            tried = np.concatenate([own, base, noisy, np.repeat(own, randoms, 0)])
+            found[i, back] = prevented(copies, states, float(place), tried, policy)
+    parts = np.split(found, ends[:-1], axis=2)[1:]
     result: dict[str, Any] = {
         'falls': number, 'seed': seed, 'samples': policy.info.get('samples'),
         'policy': policy.id, 'own': float(found[..., 0].mean()),
@@ -138,7 +179,9 @@ def main() -> None:
     parser.add_argument('ids', nargs='+', metavar='ID', help='ids of environments with a gait')
     parser.add_argument('--policy', help='file; default: the shipped policy')
     parser.add_argument('--falls', type=int, default=24, help='number of falls')
-    parser.add_argument('--randoms', type=int, default=8, help='number of random actions')
+    parser.add_argument(
+        '--randoms', type=int, default=8, help='number of random actions, and of changed states'
+    )
     parser.add_argument('--seed', type=int, default=ppo.EVALUATION_SEED + 1)
     arguments = parser.parse_args()
     path = resources.directory('trained') / 'oracles.json'

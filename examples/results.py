@@ -162,7 +162,7 @@ def oracle_rows() -> list[list[str]]:
     for id_, found in (json.loads(path.read_text()) if path.exists() else {}).items():
         shares = [
             ' '.join(f'{share:.0%}' for share in found[kind]['prevented'])
-            for kind in ('base', 'random')
+            for kind in ('base', 'random', 'nudged')
         ]
         rows.append([f'`{id_}`', str(found['falls']), *shares, f'{found["ever_prevented"]:.0%}'])
     return rows
@@ -314,9 +314,11 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'Measured by `examples/oracle_gaits.py`: the share of the falls of a policy that some action '
             'prevents if it is taken one, two, ... five cycles before the end and the policy goes on from '
             'there. *Base*: every base action; *random*: eight base actions with noise in all parameters; '
-            '*any*: the share of falls that some action prevents, at any time. Where it is high, the '
-            'policy is the limit; where it is low, the gait is.',
-            table(('environment', 'falls', 'base', 'random', 'any'), rows),
+            '*nudged*: no other action, but joint angles that are changed by 0.001 rad, eight times; '
+            '*any*: the share of falls that some action prevents, at any time. Where it is low, the gait '
+            'is the limit, or the view. Where base actions prevent more than nudges, the choice of the '
+            'action is; where they do not, falls depend on differences that the policy cannot observe.',
+            table(('environment', 'falls', 'base', 'random', 'nudged', 'any'), rows),
         ]
     rows = footstep_rows()
     if rows:

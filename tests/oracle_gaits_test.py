@@ -6,6 +6,7 @@ import sys
 import numpy as np
 from absl.testing import absltest
 
+from trl_suite import policies
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -37,9 +38,33 @@ class OracleTest(absltest.TestCase):
                 # The same action falls again; at a place far behind nothing is prevented by it.
                 for nearer, expected in ((0.0, False), (1e3, True)):
                     found = oracle_gaits.prevented(
-                        copies, state, place - nearer, np.zeros((2, size)), default
+                        copies, [state] * 2, place - nearer, np.zeros((2, size)), default
                     )
                     self.assertEqual(found.tolist(), [expected] * 2 if back > 1 else [False] * 2)
+
+    def test_only_the_joint_angles_of_a_state_are_changed(self):
+        environments = VectorEnvironment(HOPPER, 2, 1, 0, autoreset='disabled', step_limit=None)
+        environments.reset()
+        state, task = environments.get_state([0]), environments.task
+        before = [task.world.qpos.copy(), task.world.qvel.copy()]
+        changed = oracle_gaits.nudged(environments, state, np.array([0.1, -0.2]))
+        environments.set_state(changed, [0])
+        change = task.world.qpos - before[0]
+        np.testing.assert_allclose(change, [[0, 0, 0, 0.1, -0.2], [0] * 5], atol=1e-12)
+        np.testing.assert_array_equal(task.world.qvel, before[1])
+        environments.set_state(state, [0])
+        np.testing.assert_array_equal(task.world.qpos, before[0])
+
+    def test_every_kind_of_action_is_counted(self):
+        policy = policies.reference(HOPPER)
+        found = oracle_gaits.measure(HOPPER, policy, 2, 3, 0)
+        count = {'base': len(policy.choices) if policy.choices is not None else 8}
+        for kind in oracle_gaits.KINDS:
+            self.assertEqual(found[kind]['actions'], count.get(kind, 3))
+            for name in ('prevented', 'actions_that_prevent'):
+                self.assertLen(found[kind][name], oracle_gaits.BACK)
+            some, mean = (found[kind][name] for name in ('prevented', 'actions_that_prevent'))
+            self.assertTrue(np.all(np.array(some) >= mean))
 
 
 if __name__ == '__main__':
