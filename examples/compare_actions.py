@@ -2,7 +2,8 @@
 
     python examples/compare_actions.py                     # one seed
     python examples/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json
-    python examples/compare_actions.py --json benchmarks/gait_actions.json --page docs/findings.md
+    python examples/compare_actions.py --seeds 1 2 3 --json benchmarks/gait_actions.json \
+        --page docs/findings.md --picture docs/pictures/gait_actions.png
 
 Every result is a run with the same number of cycles: of `learn_gaits.py` with its default settings and
 random first actions instead of those of a shipped policy, or of `ppo.py`. The policy is then evaluated
@@ -79,6 +80,35 @@ def table(found: dict[str, Any]) -> str:
     return '\n'.join(lines)
 
 
+def plot(found: dict[str, Any], path: pathlib.Path) -> None:
+    """Draws the learning curves; a last point, joined by a dotted line, is the final policy."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figure, axis = pyplot.subplots(figsize=(8, 4))
+    for colour, (action, name) in zip(pyplot.get_cmap('tab10').colors, NAMES.items(), strict=False):
+        runs = [run for key, run in found['results'].items() if key.split('/')[0] == action]
+        for run in runs:
+            cycles, distance = np.array(run['curve']).T
+            label = name if run is runs[0] else None
+            axis.plot(cycles / 1e3, distance, color=colour, label=label)
+            end = [distance[-1], run['distance']]
+            axis.plot([found['cycles'] / 1e3] * 2, end, ':', color=colour)
+            axis.plot(found['cycles'] / 1e3, end[1], 'o', color=colour)
+    axis.set_xlabel('cycles, thousand')
+    axis.set_ylabel('distance to the first fall, m')
+    axis.set_xlim(left=0)
+    axis.set_ylim(bottom=0)
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    figure.tight_layout()
+    with files.replacing(path) as part:
+        figure.savefig(part, dpi=80, format='png')
+    pyplot.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seeds', type=int, nargs='+', default=[1])
@@ -86,6 +116,7 @@ def main() -> None:
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/actions'))
     parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/actions.json'))
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
+    parser.add_argument('--picture', type=pathlib.Path, help='a file for the learning curves; needs matplotlib')
     arguments = parser.parse_args()
     found: dict[str, Any] = {'id': ID, 'cycles': arguments.cycles, 'results': {}}
     if arguments.json.exists():
@@ -102,6 +133,8 @@ def main() -> None:
         files.write_json(found, arguments.json)
     text = table(found)
     print(text)
+    if arguments.picture is not None:
+        plot(found, arguments.picture)
     if arguments.page is not None:
         files.replace_between(arguments.page, _MARK, _END, text)
 

@@ -39,7 +39,8 @@ class CompareActionsTest(FolderTest):
 
         def train(id_, action, seed, cycles, runs):
             trained.append((action, seed))
-            return {'distance': 100.0 * seed + len(action), 'speed': 3.0}
+            curve = [[8, 50.0], [16, 60.0 + seed]]
+            return {'distance': 100.0 * seed + len(action), 'speed': 3.0, 'curve': curve}
 
         path = self.folder / 'found.json'
         argv = ['compare_actions.py', '--json', str(path), *arguments]
@@ -63,6 +64,21 @@ class CompareActionsTest(FolderTest):
         self.assertIn('| one of the base actions | 108 | 208 | 158 | 3.0 |', out)
         with self.assertRaisesRegex(ValueError, '32768 cycles; give another --json'):
             self.run_program('--cycles', '100')
+
+    def test_learning_curves_are_drawn(self):
+        from matplotlib import pyplot
+
+        picture = self.folder / 'curves.png'
+        with mock.patch.object(pyplot, 'close'):
+            self.run_program('--seeds', '1', '2', '--picture', str(picture))
+        axis = pyplot.gca()
+        pyplot.close('all')
+        self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
+        drawn = [line.get_xydata().tolist() for line in axis.get_lines()]
+        for seed in (1, 2):
+            self.assertIn([[0.008, 50], [0.016, 60 + seed]], drawn)
+        self.assertIn([[32.768, 208]], drawn)  # discrete, seed 2
+        self.assertLen(axis.get_legend().get_texts(), 4)
 
     @parameterized.parameters(
         (compare_actions.learn_gaits, 'both', {'action': 'both', 'expert_cycles': 0}),
