@@ -116,7 +116,9 @@ def main() -> None:
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/actions'))
     parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/actions.json'))
     parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
-    parser.add_argument('--picture', type=pathlib.Path, help='a file for the learning curves; needs matplotlib')
+    parser.add_argument(
+        '--picture', type=pathlib.Path, help='a file for the learning curves; needs matplotlib'
+    )
     arguments = parser.parse_args()
     found: dict[str, Any] = {'id': ID, 'cycles': arguments.cycles, 'results': {}}
     if arguments.json.exists():

@@ -133,7 +133,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST, **STARTED, 'start': 'FSM_Dog2D_Terrain_Mixed-v0', 'also': ('FSM_Dog2D_*',),
-        'num_envs': 78,
+        'num_envs': 78, 'samples': 294912, 'members': 4,
     },
     'FSM_Raptor2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST, **STARTED, 'start': 'FSM_Raptor2D_Terrain_Mixed-v0',

@@ -161,7 +161,7 @@ def oracle_rows() -> list[list[str]]:
     rows = []
     for id_, found in (json.loads(path.read_text()) if path.exists() else {}).items():
         shares = [
-            ' '.join(f'{share:.0%}' for share in found[kind]['prevented'])
+            ' '.join(f'{share:.0%}' for share in found[kind]['prevented']) if kind in found else '–'
             for kind in ('base', 'random', 'nudged')
         ]
         rows.append([f'`{id_}`', str(found['falls']), *shares, f'{found["ever_prevented"]:.0%}'])
