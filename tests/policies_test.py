@@ -179,7 +179,7 @@ class ActTest(parameterized.TestCase):
             dataclasses.replace(policies.ensemble([line, line]), convolution=line.convolution)
         with self.assertRaisesRegex(ValueError, 'weight_0: is too large'):
             policies.ensemble(
-                [one, dataclasses.replace(one, weights=[1e37 * w for w in one.weights])]
+                [one, dataclasses.replace(one, weights=[1e38 * w for w in one.weights])]
             )
 
     def test_only_networks_of_one_policy_are_an_ensemble(self):
