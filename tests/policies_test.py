@@ -183,7 +183,19 @@ class ActTest(parameterized.TestCase):
             )
 
     def test_only_networks_of_one_policy_are_an_ensemble(self):
-        one = make()
+        one, line = make(), make_convolving()
+        shifted = dataclasses.replace(line.convolution, origin=10)
+        weights = [np.zeros((13, 6)), *line.weights[1:]]
+        bare = dataclasses.replace(line, convolution=None, weights=weights)
+        mirror, twin = (
+            policies.mirror.Mirror(
+                phase=0, feet=None, observation_index=np.arange(7), observation_sign=np.ones(7),
+                action_index=np.arange(2), action_sign=np.ones(2),
+            )
+            for _ in range(2)
+        )  # fmt: skip
+        mirrored = [dataclasses.replace(one, mirror=each) for each in (mirror, twin)]
+        self.assertLen(policies.ensemble(mirrored).networks, 2)
         self.assertIs(policies.ensemble([one]), one)
         for members, message in (
             ([], 'at least one'),
@@ -192,6 +204,10 @@ class ActTest(parameterized.TestCase):
             ([one, make(hidden=(6, 4))], 'different shapes'),
             ([one, make(hidden=(6,))], 'different shapes'),
             ([one, policies.ensemble([one, one])], 'one network each'),
+            ([line, dataclasses.replace(line, convolution=shifted)], 'different convolutions'),
+            ([line, bare], 'different convolutions'),
+            ([bare, line], 'different convolutions'),
+            ([one, dataclasses.replace(one, mirror=mirror)], 'different mirrors'),
         ):
             with self.subTest(message), self.assertRaisesRegex(ValueError, f'members: .*{message}'):
                 policies.ensemble(members)
@@ -590,6 +606,7 @@ class FileTest(FolderTest):
         ({'weight_0': np.zeros((8, 6))}, r'weight_0: has shape \(8, 6\); expected \(7, 6\)'),
         ({'weight_2': np.zeros((5, 3))}, r'weight_2: has shape \(5, 3\); expected \(5, 2\)'),
         ({'bias_0': np.zeros(5)}, r'bias_0: has shape \(5,\); expected \(6,\)'),
+        ({'weight_0': np.zeros((2, 7, 6))}, r"'bias_0': has type float\d+ and 1 axes"),
         ({'weight_0': np.zeros(7)}, "'weight_0': has type float64 and 1 axes"),
         ({'weight_0': np.zeros((7, 6), int)}, "'weight_0': has type int64 and 2 axes"),
         ({'block_sizes': np.array([3, 5])}, r'mean: has shape \(7,\); expected \(8,\)'),

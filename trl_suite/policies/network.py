@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -336,12 +336,12 @@ def ensemble(members: Sequence[Policy]) -> Policy:
     """Returns the policy with the mean outputs of policies, whose errors are smaller than theirs.
 
     Args:
-      members: policies that differ only in weights, biases and convolutions, each of one network;
-        the result has the other fields of the first.
+      members: policies that differ only in weights and biases, those of convolutions included, each
+        of one network; the result has the other fields of the first.
 
     Raises:
       ValueError: there is none, or they have networks of different shapes, several networks, or
-        different blocks, actions, scales, columns or choices.
+        different blocks, actions, scales, columns, choices, mirrors or convolutions.
     """
     if not members:
         raise ValueError('members: expected at least one policy')
@@ -356,6 +356,11 @@ def ensemble(members: Sequence[Policy]) -> Policy:
             raise ValueError(f'members: have different {name}')
     if any(len(each.networks) > 1 for each in members):
         raise ValueError('members: expected policies of one network each')
+    if not all(_same(each.mirror, first.mirror) for each in members):
+        raise ValueError('members: have different mirrors')
+    arrays = 'weights', 'biases'
+    if not all(_same(each.convolution, first.convolution, arrays) for each in members):
+        raise ValueError('members: have different convolutions')
     lines, weights, biases = zip(*(each.networks[0] for each in members), strict=True)
     line = first.convolution
     if line is not None:
@@ -367,6 +372,14 @@ def ensemble(members: Sequence[Policy]) -> Policy:
     return dataclasses.replace(
         first, weights=_stacked(weights), biases=_stacked(biases), convolution=line
     )
+
+
+def _same(one: Any, other: Any, but: Collection[str] = ()) -> bool:
+    """Returns whether two dataclasses, or None, have equal fields, except for those in `but`."""
+    if one is None or other is None:
+        return one is other
+    names = {each.name for each in dataclasses.fields(one)} - {*but}
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
 
 
 def _stacked(members: Sequence[Sequence[np.ndarray]]) -> tuple[np.ndarray, ...]:
