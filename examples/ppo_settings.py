@@ -277,6 +277,7 @@ CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with muc
 LOW = {'WallHMin': 0.1, 'WallHMax': 0.25, 'StepH0Max': 0.2, 'StepH1Min': -0.2}
 # Few and varied obstacles: more simulations per update, and a longer time constant of the return.
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
+LONGER = {'averaged': 3e5, 'enough': np.inf}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
 CROWDED = {
@@ -325,12 +326,16 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         for to, start in (('Mixed', 'Walls'), ('Slopes_Mixed', 'Mixed'))
     ),
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
-    # Walls are rare, and have to be met in every phase of the stride: returns rise for a long time.
-    ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, 'samples': 6e6, 'averaged': 3e5, 'enough': np.inf}),
+    # Walls and gaps have to be met in every phase of the stride: returns rise for a long time.
+    ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, **LONGER, 'samples': 6e6}),
+    *(
+        (f'PD_{name}_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6})
+        for name in ('Raptor2D', 'Dog2D')
+    ),
     ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
     ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
     ('PD_*2D_Mixed_Terrain-v0', {'stages': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
-    ('PD_Raptor2D_Mixed_Terrain-v0', {'samples': 5e6, 'averaged': 3e5, 'enough': np.inf}),
+    ('PD_Raptor2D_Mixed_Terrain-v0', {**LONGER, 'samples': 5e6}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
