@@ -23,6 +23,7 @@ from trl_suite.vector import VectorEnvironment
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import checkpoints
 import compare_actions
+import compare_hierarchy
 import compare_transfer
 import evaluate_plans
 import expert
@@ -105,6 +106,84 @@ class CompareActionsTest(FolderTest):
         self.assertEqual({name: getattr(settings, name) for name in expected}, expected)
         self.assertEqual(found['curve'], [[8, 3.0]])
         self.assertGreater(found['distance'], 2.0)
+
+
+class CompareHierarchyTest(FolderTest):
+    def run_program(self, *arguments):
+        trained = []
+
+        def train(task, kind, seed, control_steps):
+            trained.append((task, kind, seed))
+            last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
+            first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
+            return [
+                {'control_steps': control_steps * (i + 1) / 2, **each}
+                for i, each in enumerate((first, last))
+            ]
+
+        path = self.folder / 'found.json'
+        argv = ['compare_hierarchy.py', '--json', str(path), *arguments]
+        with (
+            mock.patch.object(compare_hierarchy, 'train', train),
+            mock.patch.object(sys, 'argv', argv),
+            contextlib.redirect_stdout(io.StringIO()) as out,
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            compare_hierarchy.main()
+        return trained, out.getvalue()
+
+    def test_finished_runs_are_kept_and_shown(self):
+        first, _ = self.run_program('--seeds', '1', '--tasks', 'trail')
+        self.assertEqual(first, [('trail', 0, 1), ('trail', 1, 1)])
+        second, out = self.run_program('--seeds', '1', '2')
+        self.assertNotIn(('trail', 0, 1), second)
+        self.assertLen(second, 6)
+        self.assertIn(
+            'median distance along the trail in 200 s, m | 11.0 | 21.0 | 16.0 | 50% |', out
+        )
+        self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
+        with self.assertRaisesRegex(ValueError, '2e\\+06 control steps; give another --json'):
+            self.run_program('--control-steps', '100')
+
+    def test_curves_are_drawn(self):
+        from matplotlib import pyplot
+
+        picture = self.folder / 'curves.png'
+        with mock.patch.object(pyplot, 'close'):
+            self.run_program('--seeds', '1', '2', '--picture', str(picture))
+        trail, soccer = pyplot.gcf().axes
+        pyplot.close('all')
+        self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
+        drawn = [line.get_xydata().tolist() for line in trail.get_lines()]
+        self.assertIn([[1.0, 1.0], [2.0, 20.0]], drawn)  # with hierarchy, seed 2
+        self.assertLen(soccer.get_lines(), 4)
+        self.assertEqual(
+            [text.get_text() for text in trail.get_legend().get_texts()],
+            ['with hierarchy', 'without'],
+        )
+
+    @parameterized.parameters((0, 15), (1, 1))
+    def test_both_kinds_have_the_same_number_of_control_steps(self, kind, each):
+        """A plan of footsteps lasts 15 control steps of 1/30 s."""
+        asked = []
+
+        def run(id_, make, episodes, seed):
+            asked.append(make(None).id)
+            return {'trail': 1.0}
+
+        def shorter(id_, **changes):
+            tiny = {'num_envs': 2, 'horizon': 4, 'minibatch': 8}
+            return ppo_settings.settings_for(id_, **{**changes, **tiny})
+
+        module = mock.Mock(settings_for=shorter)
+        with (
+            mock.patch.object(compare_hierarchy.evaluate_plans, 'run', run),
+            mock.patch.object(compare_hierarchy, 'ppo_settings', module),
+        ):
+            found = compare_hierarchy.train('soccer', kind, 1, 32 * each)
+        steps = [point['control_steps'] for point in found]
+        self.assertEqual(steps, [8 * each, 16 * each, 24 * each, 32 * each])
+        self.assertEqual(set(asked), {compare_hierarchy.TASKS['soccer'][kind]})
 
 
 class JobsTest(parameterized.TestCase):
