@@ -113,9 +113,19 @@ def crowded(preset: str) -> tuple[Any, ...]:
     )
 
 
-def evenly(stages: Sequence[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
+def evenly(stages: Iterable[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:
     """Returns curriculum stages of equal length."""
-    return tuple((i / len(stages), options) for i, options in enumerate(stages))
+    listed = list(stages)
+    return tuple((i / len(listed), options) for i, options in enumerate(listed))
+
+
+def joined(*parts: tuple[tuple[float, dict[str, Any]], ...]) -> tuple[Any, ...]:
+    """Returns curriculum stages one after the other, of equal length.
+
+    All parts but the last are without their last stage, which is the preset.
+    """
+    *first, last = parts
+    return evenly(options for part in (*(p[:-1] for p in first), last) for _, options in part)
 
 
 # Differences from the defaults.
@@ -280,10 +290,7 @@ RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97
 LONGER = {'averaged': 3e5, 'enough': np.inf}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
-CROWDED = {
-    'gamma': 0.98, 'stages': crowded('slopes_mixed_humanoid'), 'least_share': {'com': 0.25},
-    'patience': 1.0,
-}  # fmt: skip
+NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
 # The same tasks without footstep planning: starts from the walk, and learns navigation.
@@ -332,10 +339,17 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         (f'PD_{name}_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6})
         for name in ('Raptor2D', 'Dog2D')
     ),
-    ('PD_Biped2D_*Mixed_Terrain-v0', {'averaged': 3e5}),
-    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', CROWDED),
-    ('PD_*2D_Mixed_Terrain-v0', {'stages': rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))}),
-    ('PD_Raptor2D_Mixed_Terrain-v0', {**LONGER, 'samples': 5e6}),
+    ('PD_*2D_*Mixed_Terrain-v0', {**LONGER, 'samples': 8e6}),
+    ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
+    (
+        'PD_*2D_Mixed_Terrain-v0',
+        {
+            'stages': joined(
+                rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6)), crowded('mixed_humanoid')
+            )
+        },
+    ),
+    ('PD_*2D_Slopes_Mixed_Terrain-v0', {'stages': crowded('slopes_mixed_humanoid')}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),

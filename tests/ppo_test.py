@@ -395,6 +395,15 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(types, ['var2d_slopes_walls', *['var2d_slopes_mixed'] * 2])
         np.testing.assert_allclose(np.concatenate(spacings), [8 / 3, 8 / 3, 8 / 3, 4, 4])
 
+    def test_curricula_may_be_joined(self):
+        heights = ppo_settings.rising('mixed_humanoid', ppo_settings.LOW, (0.0, 0.5))
+        dense = ppo_settings.crowded('mixed_humanoid')
+        joined = ppo_settings.joined(heights, dense)
+        np.testing.assert_allclose([begin for begin, _ in joined], np.arange(5) / 5)
+        expected = [options for _, options in (*heights[:2], *dense)]
+        self.assertEqual([options for _, options in joined], expected)
+        self.assertEqual(expected[-1], {})  # the preset, once
+
     def test_near_parts_of_maps(self):
         """Both velocity maps are reduced as the height map."""
         one = {'terrain': slice(0, 1024), 'pose': slice(1024, 1030)}
