@@ -55,16 +55,16 @@ def position(environments: VectorEnvironment) -> np.ndarray:
 
 
 def falls(
-    environments: VectorEnvironment, act: Act
+    environments: VectorEnvironment, act: Act, back: int = BACK
 ) -> tuple[list[list[dict[str, Any]]], np.ndarray]:
-    """Runs each simulation until a fall that is preceded by `BACK` cycles.
+    """Runs each simulation until a fall that is preceded by `back` steps.
 
     Returns:
-      For each simulation the states before its last `BACK` cycles, the last one first; and the
+      For each simulation the states before its last `back` steps, the last one first; and the
       position in which it fell, (n,) m.
     """
     count = environments.num_envs
-    past: list[collections.deque] = [collections.deque(maxlen=BACK) for _ in range(count)]
+    past: list[collections.deque] = [collections.deque(maxlen=back) for _ in range(count)]
     going, observation = np.ones(count, bool), environments.reset()
     with tqdm.tqdm(total=count, unit='fall') as bar:
         while going.any():
@@ -72,7 +72,7 @@ def falls(
                 past[i].appendleft(environments.get_state([i]))
             step = environments.step(act(observation), going)
             for i in np.flatnonzero(step.terminated & going).tolist():
-                if len(past[i]) == BACK:
+                if len(past[i]) == back:
                     going[i] = False
                     bar.update()
                 else:

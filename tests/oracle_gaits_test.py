@@ -10,8 +10,10 @@ from trl_suite import policies
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import oracle_falls
 import oracle_gaits
 
+RAPTOR = 'PD_Raptor2D_Slopes_Mixed_Terrain-v0'  # its policy falls often
 HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
 
 
@@ -65,6 +67,31 @@ class OracleTest(absltest.TestCase):
                 self.assertLen(found[kind][name], oracle_gaits.BACK)
             some, mean = (found[kind][name] for name in ('prevented', 'actions_that_prevent'))
             self.assertTrue(np.all(np.array(some) >= mean))
+
+    def test_a_tracking_policy_falls_again_without_noise(self):
+        """Noise prevents a fall if the character gets beyond its place, before or after its time."""
+        policy = policies.reference(RAPTOR)
+        environments = VectorEnvironment(RAPTOR, 2, 1, 0, autoreset='disabled', step_limit=None)
+        past, places = oracle_gaits.falls(environments, policy, 20)
+        copies = VectorEnvironment(RAPTOR, 2, 1, 1, autoreset='disabled', step_limit=None)
+        copies.reset()
+        none = np.zeros((20, 2, len(copies.action_map)))
+        for each, place in zip(past, places, strict=True):
+            self.assertLen(each, 20)
+            for nearer, expected in ((0.0, False), (1e3, True)):
+                found = oracle_falls.prevented(
+                    copies, [each[-1]] * 2, place - nearer, none, 60, policy
+                )
+                self.assertEqual(found.tolist(), [expected] * 2)
+
+    def test_every_noise_is_counted(self):
+        found = oracle_falls.measure(RAPTOR, policies.reference(RAPTOR), 2, 3, 0)
+        self.assertEqual(list(found['noise']), [str(std) for std in oracle_falls.STDS])
+        for each in found['noise'].values():
+            some, mean = np.array(each['prevented']), np.array(each['tries_that_prevent'])
+            self.assertLen(some, len(oracle_falls.BACK))
+            self.assertTrue((some >= mean).all())
+            self.assertBetween(each['ever_prevented'], some.max(), 1.0)
 
 
 if __name__ == '__main__':
