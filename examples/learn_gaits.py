@@ -137,7 +137,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     },
     'FSM_Raptor2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST, **STARTED, 'start': 'FSM_Raptor2D_Terrain_Mixed-v0',
-        'also': ('FSM_Raptor2D_*',), 'num_envs': 70,
+        'also': ('FSM_Raptor2D_*',), 'num_envs': 70, 'members': 4,
     },
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {**GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',)},
     'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},

@@ -335,11 +335,9 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_*2D_*Mixed_Terrain-v0', RARE),
     # Walls and gaps have to be met in every phase of the stride: returns rise for a long time.
     ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, **LONGER, 'samples': 6e6}),
-    *(
-        (f'PD_{name}_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6})
-        for name in ('Raptor2D', 'Dog2D')
-    ),
-    ('PD_*2D_*Mixed_Terrain-v0', {**LONGER, 'samples': 8e6}),
+    ('PD_Raptor2D_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6}),
+    ('PD_Dog2D_Gaps_Terrain-v0', {**LONGER, 'samples': 3e6}),
+    ('PD_*2D_*Mixed_Terrain-v0', {**LONGER, 'samples': 8e6, 'num_envs': 64, 'minibatch': 512}),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_*2D_Mixed_Terrain-v0',
