@@ -181,6 +181,24 @@ def fall_rows() -> list[list[str]]:
     return rows
 
 
+def generalist_rows() -> list[list[str]]:
+    """Returns the results of the policies for all terrains of a character, and of its specialists."""
+    rows = []
+    for path in sorted((resources.directory('trained') / 'generalist').glob('PD_*.json')):
+        entry = json.loads(path.read_text())
+        kinds = [entry[kind] for kind in ('specialists', 'distilled', 'evaluations')]
+        for id_ in entry['ids']:
+            each = [kind[id_] for kind in kinds]
+            cells = [f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each]
+            share = each[-1]['return'] / each[0]['return']
+            rows.append([f'`{id_}`', *cells, f'{share:.2f}'])
+        means = [
+            np.mean([kind[id_]['normalized_return'] for id_ in entry['ids']]) for kind in kinds
+        ]
+        rows.append(['mean', *(f'{mean:.3f}' for mean in means), f'{means[-1] / means[0]:.2f}'])
+    return rows
+
+
 def footstep_rows() -> list[list[str]]:
     path = resources.directory('trained') / 'footsteps.json'
     if not path.exists():
@@ -343,6 +361,16 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'action: 0.001, which shows how many falls are a matter of chance; 0.15; and 0.5. Where noise '
             'prevents a fall, neither the clip nor the torque limits are the reason of the fall.',
             table(('environment', 'falls', '0.001', '0.15', '0.5'), rows),
+        ]
+    rows = generalist_rows()
+    if rows:
+        parts += [
+            '## One policy for all terrains',
+            'Policies of `examples/generalist.py` (`--policy generalist`): return, divided by the maximum, and '
+            'in brackets the share of complete episodes, of the specialists of the terrains, of the policy '
+            'that was distilled from them, and of the same policy after PPO on all terrains; 200 episodes, '
+            'seed 0. *Share*: the last divided by the first.',
+            table(('environment', 'specialist', 'distilled', 'generalist', 'share'), rows),
         ]
     rows = footstep_rows()
     if rows:

@@ -15,9 +15,9 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
-from trl_suite import characters, policies
+from trl_suite import characters, evaluation, policies
 from trl_suite.registry import catalogue
-from trl_suite.util import files
+from trl_suite.util import files, resources
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -27,6 +27,7 @@ import compare_hierarchy
 import compare_transfer
 import evaluate_plans
 import expert
+import generalist
 import ppo
 import ppo_settings
 import share_gaits
@@ -357,6 +358,59 @@ class RandomizedTest(parameterized.TestCase):
         self.addCleanup(environments.close)
         policy.check(environments)
         self.assertEqual(policy.info['samples'], entry['shipped_at'])
+
+
+class GeneralistTest(FolderTest):
+    """One policy for all terrains of a character."""
+
+    def test_a_short_run_learns_from_the_specialists(self):
+        """The distilled policy acts more like them than a new one."""
+        ids = generalist.ids_of('biped2d')
+        short = generalist.Settings(distilled=1600, rounds=2, epochs=20, each=2)
+        ppo_ = {
+            **short.ppo,
+            'samples': 1000,
+            'averaged': 500,
+            'value_first': 500,
+            'evaluate_every': 1,
+        }
+        short = dataclasses.replace(short, ppo=ppo_)
+        with contextlib.redirect_stderr(io.StringIO()):
+            distilled, policy, curve = generalist.train(ids, 0, short, self.folder)
+        self.assertEqual(policy.id, 'PD_Biped2D_Mixed_Terrain-v0')
+        self.assertNotEmpty(curve)
+        observation = VectorEnvironment(ids[0], 8, 1, 0).reset()
+        action = policies.reference(ids[0])(observation)
+        error = np.abs(distilled(observation) - action).mean()
+        self.assertLess(error, 0.6 * np.abs(action).mean())
+        self.assertGreater(np.abs(policy(observation) - distilled(observation)).max(), 0)
+
+    def test_a_policy_is_entered_for_all_terrains(self):
+        ids = generalist.ids_of('biped2d')
+        policy = policies.reference(ids[-2])
+        with mock.patch.dict(os.environ, {'TRL_SUITE_TRAINED': str(self.folder)}):
+            generalist.enter(ids, policy, {'ids': ids})
+            self.assertEqual(policies.available('generalist'), tuple(sorted(ids)))
+            self.assertEqual(policies.reference(ids[0], 'generalist').id, ids[0])
+
+    @parameterized.parameters(*generalist.CHARACTERS)
+    def test_what_is_shipped_has_the_results_of_its_file(self, character):
+        ids = generalist.ids_of(character)
+        if ids[0] not in policies.available('generalist'):
+            self.skipTest('no policy is shipped')
+        self.assertContainsSubset(ids, policies.available('generalist'))
+        path = resources.directory('trained') / 'generalist' / f'{ids[-2]}.json'
+        entry = json.loads(path.read_text())
+        self.assertEqual(entry['ids'], ids)
+        self.assertEqual(
+            entry['settings'], json.loads(json.dumps(dataclasses.asdict(generalist.Settings())))
+        )
+        policy = policies.reference(ids[0], 'generalist')
+        for id_ in ids[:2]:  # flat ground and an incline, where episodes are alike
+            own = entry['evaluations'][id_]['return']
+            self.assertGreater(own, 0.9 * entry['specialists'][id_]['return'])
+            again = evaluation.evaluate(id_, policy, 8, 1)
+            self.assertAlmostEqual(again['return'] / own, 1, delta=0.05)
 
 
 class PageTest(absltest.TestCase):

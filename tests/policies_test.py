@@ -728,6 +728,19 @@ class ReferenceTest(FolderTest):
         with self.assertRaisesRegex(ValueError, "variant of policies 'random'.*'randomized'"):
             policies.reference(dog, 'random')
 
+    def test_a_generalist_is_the_policy_of_several_environments(self):
+        mixed, gaps = 'PD_Dog2D_Mixed_Terrain-v0', 'PD_Dog2D_Gaps_Terrain-v0'
+        policies.save(make(id=gaps), self.folder / f'{gaps}.npz')
+        folder = self.folder / 'generalist'
+        folder.mkdir()
+        policies.save(make(id=mixed, info={'seed': 7}), folder / f'{mixed}.npz')
+        (folder / policies.SHARED).write_text(json.dumps({gaps: {'policy': mixed}}))
+        self.assertEqual(policies.available('generalist'), (gaps, mixed))
+        self.assertEqual(policies.available(), (gaps,))
+        found = suite.reference_policy('plaid/dog_gaps', 'generalist')
+        self.assertEqual((found.id, found.info), (gaps, {'seed': 7}))
+        self.assertNotEqual(policies.reference(gaps).info, {'seed': 7})
+
     def test_no_policies_at_all(self):
         with self.assertRaisesRegex(FileNotFoundError, f"for '{GAPS}'; none is installed"):
             policies.reference(GAPS)
@@ -753,6 +766,7 @@ class ShippedTest(parameterized.TestCase):
             'footsteps',
             'default_gaits',
             'oracles',
+            'oracle_falls',
             'plans',
             'shared',
             'transfer',

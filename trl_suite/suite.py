@@ -76,8 +76,9 @@ def reference_policy(id: str, variant: str = '') -> policies.Policy:
 
     Args:
       id: id or alias of the environment.
-      variant: 'randomized' for the policy that was trained in worlds and with sensors that vary;
-        `policies.available('randomized')` lists the environments that have one.
+      variant: 'randomized' for the policy that was trained in worlds and with sensors that vary,
+        'generalist' for the policy for all terrains of a character in PLAiD;
+        `policies.available(variant)` lists the environments that have one.
 
     Raises:
       ValueError: unknown id or variant; the message has the closest matches.

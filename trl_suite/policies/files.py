@@ -96,7 +96,8 @@ from trl_suite.util.files import check_path, existing, load_arrays, replacing
 
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
-VARIANTS = ('randomized',)  # folders in trained/, with other policies of some environments
+# Folders in trained/, with other policies of some environments.
+VARIANTS = 'randomized', 'generalist'
 VERSION = 1
 # Key in the file -> dtype kinds, number of axes.
 _FIELDS = {
@@ -232,8 +233,9 @@ def reference(id: str, variant: str = '') -> Policy:
 
     Args:
       id: id of the environment; `suite.reference_policy` also accepts aliases.
-      variant: '', or one of `VARIANTS`: 'randomized' is a policy that was trained in worlds and
-        with sensors that vary, which some environments have in addition.
+      variant: '', or one of `VARIANTS`, which some environments have in addition: 'randomized' is a
+        policy that was trained in worlds and with sensors that vary, 'generalist' one for all
+        terrains of a character.
 
     Raises:
       TypeError: the id is not a string.
@@ -255,7 +257,7 @@ def reference(id: str, variant: str = '') -> Policy:
             f'no {f"{variant} " if variant else ""}policy is shipped for {id!r}; '
             + (f'the closest ids with a policy: {", ".join(near)}' if near else 'none is installed')
         )
-    other, preference = (id, 0.0) if variant else _source(id)
+    other, preference = _source(id, variant)
     path = _folder(variant) / f'{other}.npz'
     policy = load(path)
     if policy.id != other:
@@ -268,7 +270,7 @@ def reference(id: str, variant: str = '') -> Policy:
 def available(variant: str = '') -> tuple[str, ...]:
     """Returns the ids of the environments that have a shipped policy, sorted; see `reference`."""
     own = (path.stem for path in _folder(variant).glob('*.npz'))
-    return tuple(sorted({*own, *(() if variant else _shared())}))
+    return tuple(sorted({*own, *_shared(variant)}))
 
 
 def trained_for(id: str) -> str:
@@ -281,9 +283,9 @@ def preference_for(id: str) -> float:
     return _source(id)[1]
 
 
-def _source(id: str) -> tuple[str, float]:
+def _source(id: str, variant: str = '') -> tuple[str, float]:
     """Returns the environment whose policy an environment uses, and the preference."""
-    return _shared().get(id, (id, 0.0))
+    return _shared(variant).get(id, (id, 0.0))
 
 
 def _folder(variant: str) -> pathlib.Path:
@@ -293,13 +295,13 @@ def _folder(variant: str) -> pathlib.Path:
     return resources.directory('trained') / variant
 
 
-def _shared() -> dict[str, tuple[str, float]]:
+def _shared(variant: str = '') -> dict[str, tuple[str, float]]:
     """Returns the environments that use the policy of another one, its id, and the preference."""
-    path = resources.directory('trained') / SHARED
+    path = _folder(variant) / SHARED
     return _read_shared(path, path.stat().st_mtime_ns) if path.exists() else {}
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=len(VARIANTS) + 1)
 def _read_shared(path: pathlib.Path, changed: int) -> dict[str, tuple[str, float]]:
     """Reads the file of shared policies; `changed` is its modification time, ns."""
     return {
