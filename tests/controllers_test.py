@@ -203,6 +203,7 @@ class ParametersTest(parameterized.TestCase):
         np.testing.assert_array_equal(gait.action_scale, [1, 2, 3])
         np.testing.assert_array_equal(gait.search_scale, [1, 2, 2])
         for message, change in (
+            ("'Up.Hip' has no range.*in fixed", {'base_actions': [['b', 'b', 0]]}),
             ("set 'a' needs 3 finite numbers: Gain, Up.Hip", {'sets': {'a': [1, 2]}}),
             ("set 'a' needs 3", {'sets': {'a': [1, 2, float('nan')]}}),
             ("unknown parameter 'Up.Hp'.*'Up.Hip'", {'fixed': ['Up.Hp']}),

@@ -156,7 +156,8 @@ def read(data: dict[str, Any]) -> Parameters:
     """Makes parameters from the content of a file.
 
     Raises:
-      ValueError: a vector has another length, a name is unknown, or legs and feet do not fit.
+      ValueError: a vector has another length, a name is unknown, legs and feet do not fit, or no base
+        action changes a parameter of the actions.
     """
     if data['kind'] not in KINDS:
         raise ValueError(errors.unknown('kind of gait', data['kind'], KINDS))
@@ -179,6 +180,13 @@ def read(data: dict[str, Any]) -> Parameters:
     )
     action_offset = data['action_offset']
     action_offset = sets[action_offset] if isinstance(action_offset, str) else base[action_offset]
+    action_scale = np.abs(base - action_offset).max(0)
+    for name, scale in zip(names, action_scale, strict=True):
+        if scale == 0 and name not in data['fixed']:
+            raise ValueError(
+                f'parameter {name!r} has no range: expected a base action that changes it, or its '
+                'name in fixed'
+            )
     return Parameters(
         character=data['character'],
         kind=data['kind'],
@@ -195,7 +203,7 @@ def read(data: dict[str, Any]) -> Parameters:
         base_actions=base,
         blends=tuple((a, b, float(blend)) for a, b, blend in data['base_actions']),
         action_offset=action_offset,
-        action_scale=np.abs(base - action_offset).max(0),
+        action_scale=action_scale,
         search_scale=np.array([data['search_scale'][name.split('.')[-1]] for name in names]),
         start=data['start'],
         gravity_compensation=data.get('gravity_compensation', True),
