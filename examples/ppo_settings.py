@@ -348,6 +348,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         },
     ),
     ('PD_*2D_Slopes_Mixed_Terrain-v0', {'stages': crowded('slopes_mixed_humanoid')}),
+    ('PD_Dog2D_*Mixed_Terrain-v0', {'samples': 6e6}),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),
