@@ -129,7 +129,10 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Dog2D_Terrain_Mixed-v0': {'samples': 180224},
     'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 90112},
     'FSM_Biped2D_Terrain_Mixed-v0': {'samples': 40960},
-    'FSM_Hopper2D_*': {'samples': 49152, 'relief': 2.0},
+    'FSM_Hopper2D_*': {
+        'samples': 49152, 'relief': 2.0, 'expert_cycles': 0, 'evaluation_episodes': 0,
+        'evaluate_every': 8192,
+    },
     'FSM_Goat2D_*': {'samples': 49152, 'relief': 1.6},
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
         **GENERALIST, **STARTED, 'start': 'FSM_Dog2D_Terrain_Mixed-v0', 'also': ('FSM_Dog2D_*',),

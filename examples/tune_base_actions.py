@@ -3,6 +3,7 @@
     python examples/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
     python examples/tune_base_actions.py goat --terrain cliffs_rugged --alone
     python examples/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
+    python examples/tune_base_actions.py hopper --score mixed_hopper
 
 For each terrain, in the order given, the gaits found so far run over it until they fall, and the
 states one to three cycles before these falls are stored. The score of a gait in a state is the
@@ -16,7 +17,8 @@ With `--alone` a gait is repeated from the start of an episode instead, and its 
 travelled, divided by the distance at the target speed.
 
 Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
-gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`.
+gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`. `--score`
+measures the base actions that were not found by a search, and writes their scores into this file.
 Needs `pip install 'trl_suite[tune]'`.
 """
 
@@ -48,6 +50,7 @@ STARTS = 6  # number of noisy starts with `--alone`
 FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
 FRICTION = 0.81
 DIGITS = 4
+HAND = 'by hand'  # how sets were found that no search has found
 
 
 class Obstacles:
@@ -207,6 +210,29 @@ def complement(
     return chosen, obstacles.scores(np.array([*known, chosen]), fresh[1])
 
 
+def score(obstacles: Obstacles, terrain: str, rng: np.random.Generator) -> pathlib.Path:
+    """Writes the scores of the base actions that are sets chosen by hand, in states before falls."""
+    gait = obstacles.gait
+    states = obstacles.collect(gait.base_actions, VALIDATION, rng)
+    scores = obstacles.scores(gait.base_actions, states)
+    data = tune_gait.stored(gait.character)
+    tuning = data.setdefault('tuning', {})
+    originals = {name for a, b, _ in data.get('original_base_actions', ()) for name in (a, b)}
+    for number, (name, _, blend) in enumerate(gait.blends):
+        if (
+            blend == 0
+            and name not in originals
+            and tuning.get(name, {}).get('search', HAND) == HAND
+        ):
+            tuning[name] = {
+                'terrain': terrain, 'search': HAND, 'default': round(float(scores[0].mean()), 3),
+                'set_before': round(float(np.delete(scores, number, 0).max(0).mean()), 3),
+                'alone': round(float(scores[number].mean()), 3),
+                'set_after': round(float(scores.max(0).mean()), 3),
+            }  # fmt: skip
+    return tune_gait.write(gait.character, data)
+
+
 def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
     """Makes gaits the base actions of a character, in this order.
 
@@ -258,6 +284,7 @@ def main() -> None:
         metavar='SET',
         help='sets, or numbers of base actions of the original, that become the base actions',
     )
+    parser.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
     arguments = parser.parse_args()
     gait = controllers.load(arguments.character)
     arguments.output.mkdir(parents=True, exist_ok=True)
@@ -266,6 +293,11 @@ def main() -> None:
 
     if arguments.enter:
         print(enter(gait.character, stored, arguments.enter))
+        return
+
+    if arguments.score:
+        obstacles = Obstacles(gait, arguments.score, gait.base_actions[0], VALIDATION)
+        print(score(obstacles, arguments.score, np.random.default_rng(arguments.seed)))
         return
 
     def vector(name: str) -> np.ndarray:

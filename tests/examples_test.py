@@ -15,7 +15,7 @@ import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
 
-from trl_suite import characters, evaluation, policies
+from trl_suite import characters, controllers, evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.util import files, resources
 from trl_suite.vector import VectorEnvironment
@@ -33,6 +33,7 @@ import ppo_settings
 import share_gaits
 import train_all
 import train_randomized
+import tune_base_actions
 
 
 class CompareActionsTest(FolderTest):
@@ -185,6 +186,26 @@ class CompareHierarchyTest(FolderTest):
         steps = [point['control_steps'] for point in found]
         self.assertEqual(steps, [8 * each, 16 * each, 24 * each, 32 * each])
         self.assertEqual(set(asked), {compare_hierarchy.TASKS['soccer'][kind]})
+
+
+class TuneTest(absltest.TestCase):
+    def test_base_actions_that_no_search_has_found_get_scores(self):
+        gait = controllers.load('hopper')
+        written = {}
+        with (
+            mock.patch.object(tune_base_actions, 'VALIDATION', 2),
+            mock.patch.object(
+                tune_base_actions.tune_gait, 'write', lambda name, data: written.update(data)
+            ),
+        ):
+            obstacles = tune_base_actions.Obstacles(gait, 'mixed_hopper', gait.base_actions[0], 2)
+            tune_base_actions.score(obstacles, 'mixed_hopper', np.random.default_rng(0))
+        chosen = {name for name, _, _ in gait.blends} - {'run', 'big_hop'}
+        self.assertEqual(set(written['tuning']), chosen)
+        for each in written['tuning'].values():
+            self.assertBetween(each['alone'], 0, each['set_after'])
+            self.assertBetween(each['set_before'], each['default'], each['set_after'])
+            self.assertLessEqual(each['set_after'], 1)
 
 
 class JobsTest(parameterized.TestCase):

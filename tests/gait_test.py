@@ -547,7 +547,7 @@ class CycleTest(parameterized.TestCase):
 class BaseActionTest(parameterized.TestCase):
     """The discrete interface: a preference per base action, at 30 Hz."""
 
-    @parameterized.parameters(*zip(EXAMPLES, (8, 7, 8, 10, 8), strict=True))
+    @parameterized.parameters(*zip(EXAMPLES, (8, 7, 8, 10, 18), strict=True))
     def test_choices(self, id_, count):
         environment = make(id_, fresh=True, interface='base_action')
         self.assertEqual(environment.action_spec().shape, (count,))

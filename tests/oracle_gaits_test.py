@@ -60,7 +60,7 @@ class OracleTest(absltest.TestCase):
     def test_every_kind_of_action_is_counted(self):
         policy = policies.reference(HOPPER)
         found = oracle_gaits.measure(HOPPER, policy, 2, 3, 0)
-        counts = {'base': 8, 'random': 3, 'nudged': 3}  # the hopper has eight base actions
+        counts = {'base': 18, 'random': 3, 'nudged': 3}  # the hopper has 18 base actions
         for kind, count in counts.items():
             self.assertEqual(found[kind]['actions'], count)
             for name in ('prevented', 'actions_that_prevent'):

@@ -71,8 +71,8 @@ class GaitConfig(Config):
     )
     base_actions: str = option(
         'default',
-        "base actions: 'default', or 'original' for those of the papers; the two differ for the biped and the "
-        'goat',
+        "base actions: 'default', or 'original' for those of the papers; the two differ for biped, goat and "
+        'hopper',
         choices=BASE_ACTIONS,
     )
     substeps: int = option(
