@@ -64,6 +64,7 @@ GAITS = (  # gait environments that are trained by default
     'FSM_Biped2D_Terrain_Gaps-v0',
     'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
 )  # fmt: skip
 
 
