@@ -77,7 +77,7 @@ def reference_policy(id: str, variant: str = '') -> policies.Policy:
     Args:
       id: id or alias of the environment.
       variant: 'randomized' for the policy that was trained in worlds and with sensors that vary,
-        'generalist' for the policy for all terrains of a character in PLAiD;
+        'generalist' for a policy for all terrains of a character in PLAiD;
         `policies.available(variant)` lists the environments that have one.
 
     Raises:
