@@ -339,7 +339,6 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Raptor2D_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6}),
     ('PD_Dog2D_Gaps_Terrain-v0', {**LONGER, 'samples': 3e6}),
     ('PD_*2D_Mixed_Terrain-v0', {'stages': HIGHER}),
-    ('PD_Raptor2D_Mixed_Terrain-v0', {**LONGER, 'samples': 5e6}),
     ('PD_Biped2D_*Mixed_Terrain-v0', {**LONGER, **NO_STEPS_IN_PLACE}),
     (
         'PD_Biped2D_Mixed_Terrain-v0',
@@ -350,7 +349,29 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
             'stages': joined(HIGHER, crowded('mixed_humanoid')),
         },
     ),
-    ('PD_Biped2D_Slopes_Mixed_Terrain-v0', {'stages': crowded('slopes_mixed_humanoid')}),
+    (
+        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
+        {
+            'samples': 6e6,
+            'num_envs': 64,
+            'minibatch': 512,
+            'stages': joined(crowded('slopes_mixed_humanoid')[1:]),
+        },
+    ),
+    # Walls alone make dog and raptor forget gaps.
+    *(
+        (
+            f'PD_{name}_Mixed_Terrain-v0',
+            {
+                **LONGER,
+                'samples': 6e6,
+                'num_envs': 64,
+                'minibatch': 512,
+                'stages': joined(HIGHER, crowded('mixed_humanoid')[1:]),
+            },
+        )
+        for name in ('Dog2D', 'Raptor2D')
+    ),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
     ('Vel_Biped2D_*', {'samples': 1e6}),

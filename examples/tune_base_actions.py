@@ -31,7 +31,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cma
 import numpy as np
 import tune_gait
 
@@ -153,6 +152,7 @@ def search(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Returns the best gaits of the last generations, and the mean of the last one, (m, P)."""
+    import cma
 
     def vectors(candidates: Sequence[np.ndarray]) -> np.ndarray:
         result = np.tile(start, (len(candidates), 1))
