@@ -23,9 +23,9 @@ import numpy as np
 import ppo
 import ppo_settings
 import torch
+from several import Several
 
 from trl_suite import policies, sequences
-from trl_suite.vector import Step, VectorEnvironment
 
 NUM_ENVS = 64
 STRENGTH = 1.0  # of the penalty of `EWC`, in units of the divergence from the previous policy
@@ -84,7 +84,7 @@ class MultiTask(FineTuning):
     """One policy, trained on all environments from the start; the order has no effect."""
 
     def train(self, stage: sequences.Stage) -> None:
-        self.learn(Several.of(stage, stage.ids), stage.budget)
+        self.learn(together(stage, stage.ids), stage.budget)
 
 
 class EWC(FineTuning):
@@ -150,38 +150,7 @@ class EWC(FineTuning):
         self.anchor, self.fisher = state['anchor'], state['fisher']
 
 
-class Several:
-    """Simulations of several environments, with the parts of the interface that PPO uses.
-
-    Attributes:
-      parts: one vector environment for each; their simulations are concatenated.
-    """
-
-    def __init__(self, parts: list[VectorEnvironment]) -> None:
-        self.parts, first = parts, parts[0]
-        self.num_envs = sum(part.num_envs for part in parts)
-        self.spec, self.task, self.blocks = first.spec, first.task, first.blocks
-        self.action_map, self.control_timestep = first.action_map, first.control_timestep
-
-    @classmethod
-    def of(cls, stage: sequences.Stage, ids: tuple[str, ...]) -> Several:
-        """Makes `NUM_ENVS` simulations or a few fewer, as many of each environment."""
-        each = NUM_ENVS // len(ids)
-        return cls([stage.environments(each, id, autoreset='disabled') for id in ids])
-
-    def split(self, rows: np.ndarray) -> list[np.ndarray]:
-        """Splits an array (n, ...) into those of the parts."""
-        return np.split(rows, np.cumsum([part.num_envs for part in self.parts])[:-1])
-
-    def reset(self, mask: np.ndarray | None = None) -> np.ndarray:
-        masks = self.split(np.ones(self.num_envs, bool) if mask is None else mask)
-        return np.concatenate([part.reset(m) for part, m in zip(self.parts, masks, strict=True)])
-
-    def step(self, action: np.ndarray) -> Step:
-        steps = [part.step(a) for part, a in zip(self.parts, self.split(action), strict=True)]
-        *joined, infos = zip(*steps, strict=True)
-        terms = {
-            name: np.concatenate([info['reward_terms'][name] for info in infos])
-            for name in infos[0]['reward_terms']
-        }
-        return Step(*(np.concatenate(each) for each in joined), {'reward_terms': terms})
+def together(stage: sequences.Stage, ids: tuple[str, ...]) -> Several:
+    """Makes `NUM_ENVS` simulations or a few fewer, as many of each environment."""
+    each = NUM_ENVS // len(ids)
+    return Several([stage.environments(each, id, autoreset='disabled') for id in ids])

@@ -30,7 +30,7 @@ import ppo
 import ppo_settings
 import torch
 import tqdm
-from continual_baselines import Several
+from several import Several
 from train_all import SEED, trimmed
 
 from trl_suite import evaluation, policies

@@ -18,7 +18,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import ppo
 import torch
-from continual_baselines import FineTuning, Several
+from continual_baselines import FineTuning, together
+from several import Several
 
 from trl_suite import sequences
 
@@ -39,7 +40,7 @@ class Plaid(FineTuning):
         self.learn(environments, stage.budget - distilled)
         if distilled:
             experts = [before] * stage.number + [self.policy()]
-            distil(self.trainer, Several.of(stage, seen), experts, distilled)
+            distil(self.trainer, together(stage, seen), experts, distilled)
 
 
 def distil(

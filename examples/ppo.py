@@ -30,6 +30,7 @@ import torch
 import tqdm
 from expert import expert
 from ppo_settings import Settings, settings_for
+from several import Several
 from torch import nn
 from torch.optim import swa_utils
 
@@ -235,19 +236,30 @@ class Trainer:
         """Makes and resets the simulations of the current curriculum stage."""
         s, self.current = self.settings, self.stage
         self.best = -np.inf  # only policies of the last curriculum stage are shipped
-        seed: int | list[int] = self.seed
-        if self.current > 1:
-            sequence = np.random.SeedSequence((self.seed, self.current))
-            seed = sequence.generate_state(s.num_envs).tolist()
-        options = dict(s.stages[self.current - 1][1]) if self.current else {}
-        spec = dataclasses.replace(self.spec, terrain=options.pop('terrain', self.spec.terrain))
-        self.enter(
-            VectorEnvironment(
-                spec, s.num_envs, self.threads, seed, autoreset='disabled', task_kwargs=options
-            )
+        options = s.stages[self.current - 1][1] if self.current else {}
+        groups = options if isinstance(options, tuple) else (options,)
+        if self.current <= 1 and len(groups) == 1:
+            self.enter(self.simulations(groups[0], s.num_envs, self.seed))
+            return
+        sequence = np.random.SeedSequence((self.seed, self.current))
+        seeds = np.array_split(sequence.generate_state(s.num_envs), len(groups))
+        parts = [
+            self.simulations(each, len(own), own.tolist())
+            for each, own in zip(groups, seeds, strict=True)
+        ]
+        self.enter(Several(parts) if len(parts) > 1 else parts[0])
+
+    def simulations(
+        self, options: Mapping[str, Any], number: int, seed: int | list[int]
+    ) -> VectorEnvironment:
+        """Makes simulations with task options, which may include `terrain`."""
+        own = dict(options)
+        spec = dataclasses.replace(self.spec, terrain=own.pop('terrain', self.spec.terrain))
+        return VectorEnvironment(
+            spec, number, self.threads, seed, autoreset='disabled', task_kwargs=own
         )
 
-    def enter(self, environments: VectorEnvironment) -> None:
+    def enter(self, environments: VectorEnvironment | Several) -> None:
         """Continues in other simulations, with the networks, scales and optimiser so far."""
         self.environments, n = environments, environments.num_envs
         self.observation = environments.reset()

@@ -634,7 +634,7 @@ class BaselinesTest(parameterized.TestCase):
         """Two experts with constant actions, on terrains that the labels tell apart."""
         learner = plaid.Plaid(SHORT, 0)
         stage = sequences.Stage(SHORT, 1, 600, 0, 1)
-        environments = continual_baselines.Several.of(stage, SHORT.ids[:2])
+        environments = continual_baselines.together(stage, SHORT.ids[:2])
         labels = []
         size = len(environments.action_map)
         experts = [lambda o, a=a: np.full((len(o), size), a) for a in (0.5, -2.0)]
