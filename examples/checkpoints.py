@@ -22,9 +22,10 @@ import torch
 from trl_suite.util import files
 
 FORMAT = b'trl_suite checkpoint 1\n'
-# Globals in pickled arrays.
+# Globals in pickled arrays; `bytes` in empty ones.
 ARRAYS = [
     np.ndarray, np.dtype, np._core.multiarray._reconstruct, np._core.multiarray.scalar, codecs.encode,
+    bytes,
     *(type(np.dtype(kind)) for kind in '?bhilqBHILQefd'),
 ]  # fmt: skip
 

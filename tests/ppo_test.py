@@ -92,6 +92,16 @@ class PartsTest(parameterized.TestCase):
         # 0.3 s of smoothing: exp(-t / 0.3) < 0.37 at 0.3 s.
         self.assertBetween(steps / 30, 0.2, 0.35)
 
+    def test_several_options_at_the_same_time(self):
+        groups = {'start_phase': 0.25}, {'action_scale': 2.0}, {}
+        settings = ppo_settings.Settings(**TINY, stages=((0.0, groups),))
+        trainer = ppo.Trainer(FLAT, 0, settings, 1)
+        parts = trainer.environments.parts
+        self.assertEqual([part.num_envs for part in parts], [3, 3, 2])
+        self.assertLen({seed for part in parts for seed in part.seeds}, 8)
+        np.testing.assert_array_equal(parts[0].task.phase, 0.25)
+        self.assertGreater(np.ptp(parts[2].task.phase), 0)
+
 
 class RunTest(parameterized.TestCase):
     def setUp(self):
@@ -101,8 +111,12 @@ class RunTest(parameterized.TestCase):
         settings = ppo_settings.Settings(**{**TINY, **changes})
         return ppo.train(FLAT, 3, settings, self.folder / name, threads=1, progress=False)
 
-    def test_a_stopped_run_resumes_exactly(self):
-        whole = self.train('whole')
+    @parameterized.named_parameters(
+        ('plain', ()),
+        ('two sets of options', ((0.0, ({}, {'start_phase': 0.25})),)),
+    )
+    def test_a_stopped_run_resumes_exactly(self, stages):
+        whole = self.train('whole', stages=stages)
         learn, calls = ppo.Trainer.learn, []
 
         def stopped(trainer, batch):
@@ -112,9 +126,9 @@ class RunTest(parameterized.TestCase):
             return learn(trainer, batch)
 
         with mock.patch.object(ppo.Trainer, 'learn', stopped), self.assertRaises(KeyboardInterrupt):
-            self.train('parts')
+            self.train('parts', stages=stages)
         self.assertFalse((self.folder / 'parts' / 'last.npz').exists())
-        parts = self.train('parts')
+        parts = self.train('parts', stages=stages)
         for point in parts + whole:
             del point['seconds']
         self.assertEqual(parts, whole)
@@ -153,6 +167,11 @@ class RunTest(parameterized.TestCase):
             ValueError, 'contains pathlib.PurePosixPath; expected arrays, numbers'
         ):
             checkpoints.load(path)
+
+    def test_a_checkpoint_may_have_empty_arrays(self):
+        path = self.folder / 'checkpoint.pt'
+        checkpoints.save({'none': np.zeros((0, 3))}, path)
+        self.assertEqual(checkpoints.load(path)['none'].shape, (0, 3))
 
     def test_two_runs_in_one_folder(self):
         with checkpoints.only_run(self.folder / 'run'):
