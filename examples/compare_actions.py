@@ -12,16 +12,15 @@ in episodes without a limit of distance. Finished runs are kept in the JSON file
 
 from __future__ import annotations
 
-import argparse
-import json
+import functools
 import pathlib
 from typing import Any
 
+import comparisons
 import learn_gaits
 import numpy as np
 import ppo
 import ppo_settings
-import tqdm
 
 from trl_suite import evaluation, policies
 from trl_suite.util import files
@@ -34,7 +33,7 @@ NAMES = {
     'discrete': 'one of the base actions', 'continuous': 'default gait with changes',
     'both': 'base action with changes (MACE)', PPO: 'default gait with changes, PPO',
 }  # fmt: skip
-_MARK, _END = '<!-- actions, written by examples/compare_actions.py -->', '<!-- /actions -->'
+_MARKS = '<!-- actions, written by examples/compare_actions.py -->', '<!-- /actions -->'
 
 
 def train(id_: str, action: str, seed: int, cycles: float, runs: pathlib.Path) -> dict[str, Any]:
@@ -110,35 +109,18 @@ def plot(found: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--seeds', type=int, nargs='+', default=[1])
+    parser = comparisons.parser(__doc__.splitlines()[0], [1], 'runs/actions.json')
     parser.add_argument('--cycles', type=float, default=32768)
     parser.add_argument('--runs', type=pathlib.Path, default=pathlib.Path('runs/actions'))
-    parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/actions.json'))
-    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
-    parser.add_argument(
-        '--picture', type=pathlib.Path, help='a file for the learning curves; needs matplotlib'
-    )
     arguments = parser.parse_args()
-    found: dict[str, Any] = {'id': ID, 'cycles': arguments.cycles, 'results': {}}
-    if arguments.json.exists():
-        found = json.loads(arguments.json.read_text())
-        if found['cycles'] != arguments.cycles:
-            raise ValueError(
-                f'{arguments.json} has {found["cycles"]:g} cycles; give another --json'
-            )
-    jobs = [(action, seed) for seed in arguments.seeds for action in NAMES]
-    for action, seed in tqdm.tqdm(jobs, unit='run'):
-        if (key := f'{action}/{seed}') in found['results']:
-            continue
-        found['results'][key] = train(ID, action, seed, arguments.cycles, arguments.runs)
-        files.write_json(found, arguments.json)
-    text = table(found)
-    print(text)
-    if arguments.picture is not None:
-        plot(found, arguments.picture)
-    if arguments.page is not None:
-        files.replace_between(arguments.page, _MARK, _END, text)
+    jobs = {
+        f'{action}/{seed}': functools.partial(
+            train, ID, action, seed, arguments.cycles, arguments.runs
+        )
+        for seed in arguments.seeds for action in NAMES
+    }  # fmt: skip
+    found = comparisons.complete(arguments.json, {'id': ID, 'cycles': arguments.cycles}, jobs)
+    comparisons.show(found, table, plot, _MARKS, arguments)
 
 
 if __name__ == '__main__':

@@ -13,18 +13,17 @@ policy is evaluated in episodes of 200 s. Finished runs are kept in the JSON fil
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
+import functools
 import pathlib
 from typing import Any
 
+import comparisons
 import evaluate_plans
 import numpy as np
 import ppo
 import ppo_settings
 import torch
-import tqdm
 
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.util import files
@@ -44,7 +43,7 @@ COMMON: dict[str, Any] = {'stages': (), 'averaged': 0.0, 'stages_averaged': 1}
 STARTS: tuple[dict[str, Any], ...] = ({'start': ''}, {})
 QUARTERS = 4
 EPISODES, SEED = 32, 0
-_MARK, _END = '<!-- hierarchy, written by examples/compare_hierarchy.py -->', '<!-- /hierarchy -->'
+_MARKS = '<!-- hierarchy, written by examples/compare_hierarchy.py -->', '<!-- /hierarchy -->'
 
 
 def train(task: str, kind: int, seed: int, control_steps: float) -> list[dict[str, Any]]:
@@ -122,38 +121,19 @@ def plot(found: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--seeds', type=int, nargs='+', default=[1, 2, 3])
+    parser = comparisons.parser(__doc__.splitlines()[0], [1, 2, 3], 'runs/hierarchy.json')
     parser.add_argument('--tasks', nargs='+', choices=TASKS, default=list(TASKS))
     parser.add_argument('--control-steps', type=float, default=2e6)
-    parser.add_argument('--json', type=pathlib.Path, default=pathlib.Path('runs/hierarchy.json'))
-    parser.add_argument('--page', type=pathlib.Path, help='a page whose table is replaced')
-    parser.add_argument(
-        '--picture', type=pathlib.Path, help='a file for the curves; needs matplotlib'
-    )
     arguments = parser.parse_args()
-    found: dict[str, Any] = {'control_steps': arguments.control_steps, 'results': {}}
-    if arguments.json.exists():
-        found = json.loads(arguments.json.read_text())
-        if found['control_steps'] != arguments.control_steps:
-            raise ValueError(
-                f'{arguments.json} has {found["control_steps"]:g} control steps; give another --json'
-            )
-    jobs = [
-        (task, kind, seed)
-        for seed in arguments.seeds for task in arguments.tasks for kind in range(len(KINDS))
-    ]  # fmt: skip
-    for task, kind, seed in tqdm.tqdm(jobs, unit='run'):
-        key = f'{task}/{KINDS[kind]}/{seed}'
-        if key not in found['results']:
-            found['results'][key] = train(task, kind, seed, arguments.control_steps)
-            files.write_json(found, arguments.json)
-    text = table(found)
-    print(text)
-    if arguments.picture is not None:
-        plot(found, arguments.picture)
-    if arguments.page is not None:
-        files.replace_between(arguments.page, _MARK, _END, text)
+    jobs = {
+        f'{task}/{name}/{seed}': functools.partial(train, task, kind, seed, arguments.control_steps)
+        for seed in arguments.seeds
+        for task in arguments.tasks
+        for kind, name in enumerate(KINDS)
+    }
+    head = {'control_steps': arguments.control_steps}
+    found = comparisons.complete(arguments.json, head, jobs)
+    comparisons.show(found, table, plot, _MARKS, arguments)
 
 
 if __name__ == '__main__':

@@ -15,21 +15,16 @@ time before the end, the share of falls that some noise prevents, and the mean s
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import oracle_gaits
-import ppo
 import tqdm
 from oracle_gaits import position
 
-from trl_suite import policies, suite
+from trl_suite import policies
 from trl_suite.util import resources
-from trl_suite.util.files import write_json
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -118,22 +113,9 @@ def measure(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('ids', nargs='+', metavar='ID', help='ids of environments with a clip')
-    parser.add_argument('--policy', help='file; default: the shipped policy')
-    parser.add_argument('--falls', type=int, default=32, help='number of falls')
-    parser.add_argument('--tries', type=int, default=32, help='of each noise')
-    parser.add_argument('--seed', type=int, default=ppo.EVALUATION_SEED + 1)
-    arguments = parser.parse_args()
+    arguments = oracle_gaits.parser(__doc__.splitlines()[0], 32, 32, 'of each noise').parse_args()
     path = resources.directory('trained') / 'oracle_falls.json'
-    for name in arguments.ids:
-        id_, begin = suite.find(name).id, time.process_time()
-        policy = policies.load(arguments.policy) if arguments.policy else policies.reference(id_)
-        found = measure(id_, policy, arguments.falls, arguments.tries, arguments.seed)
-        found['cpu_seconds'] = round(time.process_time() - begin)
-        print(id_, json.dumps(found), flush=True)
-        stored = json.loads(path.read_text()) if path.exists() else {}
-        write_json(dict(sorted({**stored, id_: found}.items())), path)
+    oracle_gaits.measure_all(path, arguments, measure)
 
 
 if __name__ == '__main__':

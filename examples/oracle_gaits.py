@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 import collections
 import json
+import pathlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -174,27 +175,35 @@ def measure(
     return result
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('ids', nargs='+', metavar='ID', help='ids of environments with a gait')
-    parser.add_argument('--policy', help='file; default: the shipped policy')
-    parser.add_argument('--falls', type=int, default=24, help='number of falls')
-    parser.add_argument(
-        '--randoms', type=int, default=8, help='number of random actions, and of changed states'
-    )
-    parser.add_argument('--seed', type=int, default=ppo.EVALUATION_SEED + 1)
-    arguments = parser.parse_args()
-    path = resources.directory('trained') / 'oracles.json'
+def measure_all(
+    path: pathlib.Path, arguments: argparse.Namespace, measured: Callable[..., dict[str, Any]]
+) -> None:
+    """Measures the policies of environments, and enters the results into a JSON file."""
     for name in arguments.ids:
         id_, begin = suite.find(name).id, time.process_time()
         policy = policies.load(arguments.policy) if arguments.policy else policies.reference(id_)
-        found = measure(id_, policy, arguments.falls, arguments.randoms, arguments.seed)
+        found = measured(id_, policy, arguments.falls, arguments.tries, arguments.seed)
         found['cpu_seconds'] = round(time.process_time() - begin)
         print(id_, json.dumps(found), flush=True)
         stored = json.loads(path.read_text()) if path.exists() else {}
-        stored[id_] = found
-        with files.replacing(path) as part:
-            part.write_text(json.dumps(dict(sorted(stored.items())), indent=1) + '\n')
+        files.write_json(dict(sorted({**stored, id_: found}.items())), path)
+
+
+def parser(description: str, falls: int, tries: int, of: str) -> argparse.ArgumentParser:
+    """Returns a parser with the arguments of `measure_all`."""
+    parser_ = argparse.ArgumentParser(description=description)
+    parser_.add_argument('ids', nargs='+', metavar='ID', help='ids of environments')
+    parser_.add_argument('--policy', help='file; default: the shipped policy')
+    parser_.add_argument('--falls', type=int, default=falls, help='number of falls')
+    parser_.add_argument('--tries', type=int, default=tries, help=f'number {of}')
+    parser_.add_argument('--seed', type=int, default=ppo.EVALUATION_SEED + 1)
+    return parser_
+
+
+def main() -> None:
+    of = 'of random actions, and of changed states'
+    arguments = parser(__doc__.splitlines()[0], 24, 8, of).parse_args()
+    measure_all(resources.directory('trained') / 'oracles.json', arguments, measure)
 
 
 if __name__ == '__main__':
