@@ -496,9 +496,10 @@ class Trainer:
         layers = [layer for layer in network_ if isinstance(layer, nn.Linear)]
         columns = self.scales.columns
         weights = [layer.weight.detach().numpy().T.copy() for layer in layers]
-        weights[0] *= (
-            self.scales.gain[:, None] if columns is None else self.scales.gain[columns, None]
-        )
+        # The weights of inputs that were always 0 in training are still random: on a slope, where
+        # such inputs are not 0, a policy that was trained on level ground would be disturbed.
+        gain = np.where(self.scales.square == 0, 0.0, self.scales.gain)
+        weights[0] *= gain[:, None] if columns is None else gain[columns, None]
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
         return policies.Policy(
             id=self.spec.id,

@@ -92,6 +92,15 @@ class PartsTest(parameterized.TestCase):
         # 0.3 s of smoothing: exp(-t / 0.3) < 0.37 at 0.3 s.
         self.assertBetween(steps / 30, 0.2, 0.35)
 
+    def test_inputs_that_were_always_0_have_no_weights(self):
+        """A level ground's heights, for example, which are not 0 where the policy is used."""
+        trainer = ppo.Trainer('PD_Dog2D_LLC_Imitate_Flat-v0', 0, ppo_settings.Settings(**TINY), 1)
+        trainer.learn(trainer.collect())
+        unused = (trainer.scales.mean == 0) & (trainer.scales.square == 0)
+        self.assertBetween(np.count_nonzero(unused), 1, 10)
+        weights = np.abs(trainer.exported().weights[0]).max(1)
+        np.testing.assert_array_equal(weights == 0, unused)
+
     def test_several_options_at_the_same_time(self):
         groups = {'start_phase': 0.25}, {'action_scale': 2.0}, {}
         settings = ppo_settings.Settings(**TINY, stages=((0.0, groups),))
