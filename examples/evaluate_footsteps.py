@@ -44,6 +44,10 @@ def ramp(slope: float) -> dict[str, Any]:
     return {'Type': 'var3d_ramp', 'Params': [{'Slope': slope}]}
 
 
+def bumps(height: float) -> dict[str, Any]:
+    return {'Type': 'var3d_checkers', 'Params': [{'Slope': height}]}
+
+
 # Task options; `terrain` replaces that of the environment's spec.
 CONDITIONS: dict[str, dict[str, Any]] = {
     'straight': {'plans': STEADY},
@@ -56,12 +60,11 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     'made from the root, on the spot': {'plans': {'from_root': 1.0, 'root_length': (0.0, 0.0)}},
     'made from the root, turning about': {'plans': {'from_root': 1.0, 'root_turn': 0.6}},
     'pushes of 150 N': {'plans': {'sharp': 0.0}, 'pushes': PUSHES},
+    'pushes of 250 N': {'plans': {'sharp': 0.0}, 'pushes': {**PUSHES, 'force': (250, 250)}},
     'ramp up 8 %': {'plans': STEADY, 'terrain': ramp(0.08)},
     'ramp down 8 %': {'plans': STEADY, 'terrain': ramp(-0.08)},
-    'bumps of 3 cm': {
-        'plans': {'sharp': 0.0},
-        'terrain': {'Type': 'var3d_checkers', 'Params': [{'Slope': 0.03}]},
-    },
+    'bumps of 3 cm': {'plans': {'sharp': 0.0}, 'terrain': bumps(0.03)},
+    'bumps of 6 cm': {'plans': {'sharp': 0.0}, 'terrain': bumps(0.06)},
     'belts of 0.6 m/s': {'plans': {'sharp': 0.0}, 'terrain': BELTS},
 }
 
