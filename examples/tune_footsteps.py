@@ -1,7 +1,8 @@
 """Searches for a linear change of the plan that a footstep controller observes, without training it.
 
-    python examples/tune_footsteps.py --generations 40 --output tuned.npz
+    python examples/tune_footsteps.py --output tuned.npz
     python examples/evaluate_footsteps.py tuned.npz
+    python examples/tune_footsteps.py --output tuned.npz --enter
 
 A trained controller lands almost at the same place relative to its plan each time: too far on short
 steps, too near on long ones. Another plan in its observation corrects that, and costs no balance. The
@@ -18,14 +19,18 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import tqdm
+import train_all
 from evaluate_footsteps import CONDITIONS, ID, row_for
 
-from trl_suite import policies, suite
+from trl_suite import evaluation, policies, suite
+from trl_suite.util import files, resources
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -48,12 +53,11 @@ class Tuning:
         assert policy.blocks[-1][0] == 'plan', policy.blocks
         self.plan = start + np.array(PLAN)
         self.inputs = start + np.array((*PLAN, *HEIGHTS))
-        # The heights were constant in training, so their weights are random, and without effect on
-        # level ground.
+        # Heights were always 0 in training. They have no weights, and no standard deviation either.
+        std = policy.std.copy()
         heights = start + np.array(HEIGHTS)
-        weights, std = policy.weights[0].copy(), policy.std.copy()
-        weights[heights], std[heights] = 0.0, HEIGHT
-        self.policy = dataclasses.replace(policy, weights=(weights, *policy.weights[1:]), std=std)
+        std[heights[~policy.weights[0][heights].any(1)]] = HEIGHT
+        self.policy = dataclasses.replace(policy, std=std)
         self.shape = len(PLAN), len(self.inputs) + 1
         self.size = self.shape[0] * self.shape[1] + len(policy.biases[-1])
 
@@ -127,16 +131,30 @@ class Score:
         return (errors / np.maximum(steps, 1)).reshape(self.controllers, self.each).mean(1)
 
 
+def enter(policy: policies.Policy, record: dict[str, Any]) -> None:
+    """Ships a controller; the search becomes `tuned` of the training run."""
+    trained = resources.directory('trained')
+    path = trained / f'{ID}.json'
+    stored = json.loads(path.read_text())
+    run = train_all.shipped(stored)
+    run['tuned'] = record
+    run['evaluation'] = evaluation.evaluate(ID, policy, train_all.EPISODES, train_all.SEED, 1)
+    policies.save(policy, trained / f'{ID}.npz')
+    with files.replacing(path) as part:
+        part.write_text(json.dumps(stored) + '\n')
+
+
 def main() -> None:
     import cma
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--policy', help='.npz file; the reference policy by default')
-    parser.add_argument('--generations', type=int, default=40)
+    parser.add_argument('--generations', type=int, default=100)
     parser.add_argument('--population', type=int, default=16)
     parser.add_argument('--sd', type=float, default=0.03, help='initial standard deviation')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--output', type=pathlib.Path, required=True)
+    parser.add_argument('--enter', action='store_true', help='ship the result')
     arguments = parser.parse_args()
     given = arguments.policy
     tuning = Tuning(policies.load(given) if given else suite.reference_policy(ID))
@@ -159,6 +177,14 @@ def main() -> None:
     scores = Score(len(compared), COMPARED, SECONDS)(list(compared.values()), arguments.seed - 1)
     for name, values in zip(compared, scores, strict=True):
         print(f'{name:8} {values.mean():.4f}', dict(zip(CONDITIONS, values.round(3), strict=True)))
+    if arguments.enter:
+        record = {
+            'program': pathlib.Path(__file__).name, 'seed': arguments.seed, 'sd': arguments.sd,
+            'generations': arguments.generations, 'population': arguments.population,
+            'scores': {name: dict(zip(CONDITIONS, values.tolist(), strict=True))
+                       for name, values in zip(compared, scores, strict=True)},
+        }  # fmt: skip
+        enter(compared['after'], record)
 
 
 if __name__ == '__main__':

@@ -1,7 +1,9 @@
 """The search for a change of the plan that a footstep controller observes."""
 
 import dataclasses
+import json
 import pathlib
+import shutil
 import sys
 import tempfile
 from unittest import mock
@@ -98,6 +100,22 @@ class TuneFootstepsTest(absltest.TestCase):
         self.assertEqual(found.weights[0].shape, CONTROLLER.weights[0].shape)
         self.assertFalse(np.array_equal(found.weights[0], CONTROLLER.weights[0]))
         np.testing.assert_array_equal(found.weights[1], CONTROLLER.weights[1])
+
+    def test_a_tuned_controller_is_entered(self):
+        with tempfile.TemporaryDirectory() as folder:
+            trained = pathlib.Path(folder)
+            source = tune_footsteps.resources.directory('trained') / f'{tune_footsteps.ID}.json'
+            shutil.copy(source, trained)
+            found = {'return': 1.0}
+            with (
+                mock.patch.object(tune_footsteps.resources, 'directory', lambda _: trained),
+                mock.patch.object(tune_footsteps.evaluation, 'evaluate', lambda *_: found),
+            ):
+                tune_footsteps.enter(CONTROLLER, {'seed': 5})
+            [run] = json.loads((trained / source.name).read_text())['runs']
+            self.assertTrue((trained / f'{tune_footsteps.ID}.npz').exists())
+        self.assertEqual((run['tuned'], run['evaluation']), ({'seed': 5}, found))
+        self.assertNotEmpty(run['curve'])
 
 
 if __name__ == '__main__':
