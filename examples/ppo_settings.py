@@ -325,6 +325,7 @@ HIGHER = rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))
 # Few and varied obstacles: more simulations per update, and a longer time constant of the return.
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
 LONGER = {'averaged': 3e5, 'enough': np.inf}
+LONG = {**LONGER, 'samples': 6e6, 'num_envs': 64, 'minibatch': 512}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
@@ -374,39 +375,16 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Raptor2D_Walls_Terrain-v0', {**RARE, **LONGER, 'samples': 6e6}),
     ('PD_Raptor2D_Gaps_Terrain-v0', {**RARE, **LONGER, 'samples': 3e6}),
     ('PD_Dog2D_Gaps_Terrain-v0', {**LONGER, 'samples': 3e6}),
-    ('PD_*2D_Mixed_Terrain-v0', {'stages': HIGHER}),
-    ('PD_Biped2D_*Mixed_Terrain-v0', {**LONGER, **NO_STEPS_IN_PLACE}),
+    # Walls alone make dog and raptor forget gaps.
+    ('PD_*2D_Mixed_Terrain-v0', {**LONG, 'stages': joined(HIGHER, crowded('mixed_humanoid')[1:])}),
+    (
+        'PD_*2D_Slopes_Mixed_Terrain-v0',
+        {**LONG, 'stages': joined(crowded('slopes_mixed_humanoid')[1:])},
+    ),
+    ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_Biped2D_Mixed_Terrain-v0',
-        {
-            'samples': 8e6,
-            'num_envs': 64,
-            'minibatch': 512,
-            'stages': joined(HIGHER, crowded('mixed_humanoid')),
-        },
-    ),
-    (
-        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
-        {
-            'samples': 6e6,
-            'num_envs': 64,
-            'minibatch': 512,
-            'stages': joined(crowded('slopes_mixed_humanoid')[1:]),
-        },
-    ),
-    # Walls alone make dog and raptor forget gaps.
-    *(
-        (
-            f'PD_{name}_Mixed_Terrain-v0',
-            {
-                **LONGER,
-                'samples': 6e6,
-                'num_envs': 64,
-                'minibatch': 512,
-                'stages': joined(HIGHER, crowded('mixed_humanoid')[1:]),
-            },
-        )
-        for name in ('Dog2D', 'Raptor2D')
+        {'samples': 8e6, 'stages': joined(HIGHER, crowded('mixed_humanoid'))},
     ),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
