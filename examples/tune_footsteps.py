@@ -3,12 +3,14 @@
     python examples/tune_footsteps.py --output tuned.npz
     python examples/evaluate_footsteps.py tuned.npz
     python examples/tune_footsteps.py --output tuned.npz --enter
+    python examples/tune_footsteps.py --body --output tuned.npz --enter
 
 A trained controller lands almost at the same place relative to its plan each time: too far on short
 steps, too near on long ones. Another plan in its observation corrects that, and costs no balance. The
-plan z, in standard deviations and in right stance, becomes z + A z + b, with landing places and heading
-in z. CMA-ES (Hansen 2016, arXiv:1604.00772) selects A, b and a change of the output biases. The result
-is a network of the same shape, with other weights in its first layer and other biases.
+plan z, in standard deviations and in right stance, becomes z + A y + b; y has the landing places and the
+heading, and with `--body` also velocity and tilt of the pelvis and the phase. CMA-ES (Hansen 2016,
+arXiv:1604.00772) selects A, b and a change of the output biases. The result is a network of the same
+shape, with other weights in its first layer and other biases.
 
 The score of a controller is the mean landing error in all conditions of `evaluate_footsteps.py`; an
 error counts at most `MISS`, and as `MISS` in every step after a fall. All candidates of a generation
@@ -42,20 +44,28 @@ EACH, COMPARED = 2, 32  # simulations of each condition, in the search and for t
 # and to the left), and the heading. Heights are inputs too, with the standard deviation of a slope.
 PLAN, HEIGHTS = (3, 4, 6, 7, 12), (5, 8)
 HEIGHT = 0.1  # m
+# The velocity of the pelvis, ahead and to the left, its tilt, the phase and its first quarter.
+BODY = (
+    ('velocity', 0), ('velocity', 1), ('pose', 5), ('pose', 6), ('phase', 0), ('phase', 1),
+)  # fmt: skip
 BIAS = 0.2  # of the output biases, relative to the other parameters
 
 
 class Tuning:
     """A controller with parameters that change its plan; 0: no change."""
 
-    def __init__(self, policy: policies.Policy) -> None:
-        start = sum(size for _, size in policy.blocks[:-1])
-        assert policy.blocks[-1][0] == 'plan', policy.blocks
-        self.plan = start + np.array(PLAN)
-        self.inputs = start + np.array((*PLAN, *HEIGHTS))
+    def __init__(self, policy: policies.Policy, body: bool = False) -> None:
+        """Makes parameters for the plan, and with `body` also for inputs from other blocks."""
+        starts, start = {}, 0
+        for name, size in policy.blocks:
+            starts[name], start = start, start + size
+        plan = starts['plan']
+        self.plan = plan + np.array(PLAN)
+        more = [starts[name] + column for name, column in BODY] if body else []
+        self.inputs = np.array([*self.plan, *(plan + k for k in HEIGHTS), *more])
         # Heights were always 0 in training. They have no weights, and no standard deviation either.
         std = policy.std.copy()
-        heights = start + np.array(HEIGHTS)
+        heights = plan + np.array(HEIGHTS)
         std[heights[~policy.weights[0][heights].any(1)]] = HEIGHT
         self.policy = dataclasses.replace(policy, std=std)
         self.shape = len(PLAN), len(self.inputs) + 1
@@ -132,12 +142,12 @@ class Score:
 
 
 def enter(policy: policies.Policy, record: dict[str, Any]) -> None:
-    """Ships a controller; the search becomes `tuned` of the training run."""
+    """Ships a controller; the search is added to `tuned` of the training run."""
     trained = resources.directory('trained')
     path = trained / f'{ID}.json'
     stored = json.loads(path.read_text())
     run = train_all.shipped(stored)
-    run['tuned'] = record
+    run.setdefault('tuned', []).append(record)
     run['evaluation'] = evaluation.evaluate(ID, policy, train_all.EPISODES, train_all.SEED, 1)
     policies.save(policy, trained / f'{ID}.npz')
     with files.replacing(path) as part:
@@ -149,6 +159,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--policy', help='.npz file; the reference policy by default')
+    parser.add_argument('--body', action='store_true', help='with inputs from other blocks')
     parser.add_argument('--generations', type=int, default=100)
     parser.add_argument('--population', type=int, default=16)
     parser.add_argument('--sd', type=float, default=0.03, help='initial standard deviation')
@@ -157,7 +168,8 @@ def main() -> None:
     parser.add_argument('--enter', action='store_true', help='ship the result')
     arguments = parser.parse_args()
     given = arguments.policy
-    tuning = Tuning(policies.load(given) if given else suite.reference_policy(ID))
+    tuned = policies.load(given) if given else suite.reference_policy(ID)
+    tuning = Tuning(tuned, arguments.body)
     score = Score(arguments.population, EACH, SECONDS)
     strategy = cma.CMAEvolutionStrategy(
         np.zeros(tuning.size),
@@ -173,13 +185,14 @@ def main() -> None:
             policies.save(tuning.changed(strategy.mean), arguments.output)
             bar.set_postfix(best=found.min(), mean=found.mean(), refresh=False)
             bar.update()
-    compared = {'before': tuning.policy, 'after': tuning.changed(strategy.mean)}
+    compared = {'before': tuned, 'after': tuning.changed(strategy.mean)}
     scores = Score(len(compared), COMPARED, SECONDS)(list(compared.values()), arguments.seed - 1)
     for name, values in zip(compared, scores, strict=True):
         print(f'{name:8} {values.mean():.4f}', dict(zip(CONDITIONS, values.round(3), strict=True)))
     if arguments.enter:
         record = {
-            'program': pathlib.Path(__file__).name, 'seed': arguments.seed, 'sd': arguments.sd,
+            'program': pathlib.Path(__file__).name, 'body': arguments.body,
+            'seed': arguments.seed, 'sd': arguments.sd,
             'generations': arguments.generations, 'population': arguments.population,
             'scores': {name: dict(zip(CONDITIONS, values.tolist(), strict=True))
                        for name, values in zip(compared, scores, strict=True)},

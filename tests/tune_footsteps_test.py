@@ -9,7 +9,7 @@ import tempfile
 from unittest import mock
 
 import numpy as np
-from absl.testing import absltest
+from absl.testing import absltest, parameterized
 
 from trl_suite import policies
 
@@ -19,10 +19,12 @@ import tune_footsteps
 CONTROLLER = policies.reference(tune_footsteps.ID)
 
 
-class TuneFootstepsTest(absltest.TestCase):
-    def test_the_network_observes_the_changed_plan(self):
+class TuneFootstepsTest(parameterized.TestCase):
+    @parameterized.parameters((False, 7), (True, 13))
+    def test_the_network_observes_the_changed_plan(self, body, inputs):
         """In right stance, where observations are not mirrored."""
-        tuning = tune_footsteps.Tuning(CONTROLLER)
+        tuning = tune_footsteps.Tuning(CONTROLLER, body)
+        self.assertLen(tuning.inputs, inputs)
         rng = np.random.default_rng(0)
         parameters = 0.1 * rng.standard_normal(tuning.size)
         parameters[tuning.shape[0] * tuning.shape[1] :] = 0.0
@@ -114,7 +116,7 @@ class TuneFootstepsTest(absltest.TestCase):
                 tune_footsteps.enter(CONTROLLER, {'seed': 5})
             [run] = json.loads((trained / source.name).read_text())['runs']
             self.assertTrue((trained / f'{tune_footsteps.ID}.npz').exists())
-        self.assertEqual((run['tuned'], run['evaluation']), ({'seed': 5}, found))
+        self.assertEqual((run['tuned'], run['evaluation']), ([{'seed': 5}], found))
         self.assertNotEmpty(run['curve'])
 
 
