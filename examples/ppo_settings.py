@@ -381,6 +381,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         'PD_*2D_Slopes_Mixed_Terrain-v0',
         {**LONG, 'stages': joined(crowded('slopes_mixed_humanoid')[1:])},
     ),
+    (
+        'PD_Raptor2D_Mixed_Terrain-v0',
+        {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER},
+    ),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_Biped2D_Mixed_Terrain-v0',
