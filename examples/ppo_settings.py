@@ -139,9 +139,8 @@ RUNS_UNEVENLY = {'least_share': {'com': 0.2}}
 # after a push. Then it has to return to the plan, with a reward that extends far enough for that,
 # and to be accurate again. Later a large landing error ends the episode except in the two seconds
 # after a push or a sharp turn; otherwise the walker drifts off the plan. The last stages contain
-# stopping and turning about, which high-level controllers need. `MIXTURE` trains everything at the
-# same time, so that nothing is forgotten, with slopes, bumps and belts, and a narrower reward.
-WALKER = 41e6  # samples
+# stopping and turning about, which high-level controllers need.
+WALKER = 37e6  # samples
 VARIED = {'length': (0.25, 0.7), 'width': (0.1, 0.25), 'change': 1.0, 'turn': 0.3, 'from_root': 0.3}
 STAGES = (
     (0.0, {
@@ -222,40 +221,6 @@ STAGES = (
         },
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
-)  # fmt: skip
-ALL_PLANS = {
-    **VARIED, 'length': (0.0, 0.7), 'change': 0.3, 'sharp': 0.06,
-    'from_root': 0.3, 'root_length': (0.0, 0.7), 'root_turn': 0.6,
-}  # fmt: skip
-NARROW = {
-    'footstep_scale': (5.0, 60.0), 'heading_scale': 4.0, 'max_landing_error': 0.35, 'grace_period': 2.5,
-}  # fmt: skip
-UNEVEN = {
-    'footstep_scale': (3.0, 30.0), 'heading_scale': 4.0, 'max_landing_error': 0.6, 'grace_period': 2.5,
-    'plans': {**ALL_PLANS, 'sharp': 0.0},
-}  # fmt: skip
-MIXTURE = (
-    {**NARROW, 'plans': ALL_PLANS},
-    {**NARROW, 'plans': {**VARIED, 'change': 0.2, 'sharp': 0.1}},
-    {**NARROW, 'plans': {**ALL_PLANS, 'from_root': 1.0}},
-    {
-        **UNEVEN,
-        'plans': ALL_PLANS,
-        'pushes': {'force': (100, 280), 'duration': (0.2, 0.2), 'interval': (1.5, 4)},
-    },
-    *(
-        {**UNEVEN, 'terrain': {'Type': type_, 'Params': [values]}}
-        for type_, values in (
-            ('var3d_ramp', {'Slope': 0.1}),
-            ('var3d_ramp', {'Slope': -0.1}),
-            ('var3d_checkers', {'Slope': 0.06}),
-            ('conveyor3d', {
-                'ObstacleWidth0': 2, 'ObstacleWidth1': 2, 'ObstacleSpeed0': 0.6,
-                'ObstacleSpeed1': 0.6, 'ConveyorStripLength': 200, 'ConveyorNumStrips': 20,
-                'ConveyorSpacing': 1,
-            }),
-        )
-    ),
 )  # fmt: skip
 # Running: the environment's plan first, then other lengths and gentle turns, then plans from the
 # root.
@@ -400,7 +365,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_General_Step-v0', {'stages': (*STAGES, (37e6 / WALKER, MIXTURE))}),
+    ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # The environment mirrors its observation.
