@@ -204,7 +204,7 @@ class InfoTest(CommandTest):
         self.assertRegex(out, r'\n  Ascent.Hip +0.5132 +0.4128  rad +joint target\n')
         self.assertRegex(out, r'\n  Ascent.Knee +-0.7777 +0.241  m +joint target\n')
         self.assertRegex(
-            out, r'\n  MagicGain +0.8405 +0.162  1 +factor of the hip torque that keeps the root'
+            out, r'\n  MagicGain +0.8405 +0.3  1 +factor of the hip torque that keeps the root'
         )
         self.assertIn('\n  exp(-0.5 (v - 3)^2)\n', out)
         self.assertNotIn('fraction of time', out)
