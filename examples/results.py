@@ -186,16 +186,17 @@ def generalist_rows() -> list[list[str]]:
     rows = []
     for path in sorted((resources.directory('trained') / 'generalist').glob('PD_*.json')):
         entry = json.loads(path.read_text())
-        kinds = [entry[kind] for kind in ('specialists', 'distilled', 'evaluations')]
+        kinds = [entry[kind] for kind in ('specialists', 'distilled', 'trained')]
         for id_ in entry['ids']:
             each = [kind[id_] for kind in kinds]
             cells = [f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each]
-            share = each[-1]['return'] / each[0]['return']
+            share = entry[entry['shipped']][id_]['return'] / each[0]['return']
             rows.append([f'`{id_}`', *cells, f'{share:.2f}'])
         means = [
             np.mean([kind[id_]['normalized_return'] for id_ in entry['ids']]) for kind in kinds
         ]
-        rows.append(['mean', *(f'{mean:.3f}' for mean in means), f'{means[-1] / means[0]:.2f}'])
+        own = means[1 + ('distilled', 'trained').index(entry['shipped'])]
+        rows.append(['mean', *(f'{mean:.3f}' for mean in means), f'{own / means[0]:.2f}'])
     return rows
 
 
@@ -369,8 +370,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'Policies of `examples/generalist.py` (`--policy generalist`): return, divided by the maximum, and '
             'in brackets the share of complete episodes, of the specialists of the terrains, of the policy '
             'that was distilled from them, and of the same policy after PPO on all terrains; 200 episodes, '
-            'seed 0. *Share*: the last divided by the first.',
-            table(('environment', 'specialist', 'distilled', 'generalist', 'share'), rows),
+            'seed 0. *Share*: that of the better one, which is shipped, divided by that of the specialist.',
+            table(('environment', 'specialist', 'distilled', 'after PPO', 'share'), rows),
         ]
     rows = footstep_rows()
     if rows:
