@@ -186,17 +186,20 @@ def generalist_rows() -> list[list[str]]:
     rows = []
     for path in sorted((resources.directory('trained') / 'generalist').glob('PD_*.json')):
         entry = json.loads(path.read_text())
-        kinds = [entry[kind] for kind in ('specialists', 'distilled', 'trained')]
+        kinds, shipped = ('specialists', 'distilled', 'trained'), entry['shipped']
         for id_ in entry['ids']:
-            each = [kind[id_] for kind in kinds]
-            cells = [f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each]
-            share = entry[entry['shipped']][id_]['return'] / each[0]['return']
+            each = {kind: entry[kind][id_] for kind in kinds}
+            cells = [
+                f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each.values()
+            ]
+            share = each[shipped]['return'] / each['specialists']['return']
             rows.append([f'`{id_}`', *cells, f'{share:.2f}'])
-        means = [
-            np.mean([kind[id_]['normalized_return'] for id_ in entry['ids']]) for kind in kinds
-        ]
-        own = means[1 + ('distilled', 'trained').index(entry['shipped'])]
-        rows.append(['mean', *(f'{mean:.3f}' for mean in means), f'{own / means[0]:.2f}'])
+        means = {
+            kind: np.mean([entry[kind][id_]['normalized_return'] for id_ in entry['ids']])
+            for kind in kinds
+        }
+        share = means[shipped] / means['specialists']
+        rows.append(['mean', *(f'{mean:.3f}' for mean in means.values()), f'{share:.2f}'])
     return rows
 
 
