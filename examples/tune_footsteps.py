@@ -5,8 +5,8 @@
     python examples/tune_footsteps.py --output tuned.npz --enter
     python examples/tune_footsteps.py --body --output tuned.npz --enter
 
-A trained controller lands almost at the same place relative to its plan each time: too far on short
-steps, too near on long ones. Another plan in its observation corrects that, and costs no balance. The
+On steps of equal length a trained controller lands almost at the same distance from its plan each time.
+Another plan in its observation corrects that, but may cost balance and heading: evaluate the result. The
 plan z, in standard deviations and in right stance, becomes z + A y + b; y has the landing places and the
 heading, and with `--body` also velocity and tilt of the pelvis and the phase. CMA-ES (Hansen 2016,
 arXiv:1604.00772) selects A, b and a change of the output biases. The result is a network of the same
@@ -56,7 +56,15 @@ class Tuning:
     """A controller with parameters that change its plan; 0: no change."""
 
     def __init__(self, policy: policies.Policy, body: bool = False) -> None:
-        """Makes parameters for the plan, and with `body` also for inputs from other blocks."""
+        """Makes parameters for the plan, and with `body` also for inputs from other blocks.
+
+        Raises:
+          ValueError: the policy has no plan in its observation, or not all of its inputs.
+        """
+        if 'plan' not in dict(policy.blocks) or policy.columns is not None:
+            raise ValueError(
+                f'{policy.id}: expected a footstep controller, with a block plan and all inputs'
+            )
         starts, start = {}, 0
         for name, size in policy.blocks:
             starts[name], start = start, start + size
@@ -156,8 +164,6 @@ def enter(policy: policies.Policy, record: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    import cma
-
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--policy', help='.npz file; the reference policy by default')
     parser.add_argument('--body', action='store_true', help='with inputs from other blocks')
@@ -168,6 +174,8 @@ def main() -> None:
     parser.add_argument('--output', type=pathlib.Path, required=True)
     parser.add_argument('--enter', action='store_true', help='ship the result')
     arguments = parser.parse_args()
+    import cma
+
     given = arguments.policy
     tuned = policies.load(given) if given else suite.reference_policy(ID)
     tuning = Tuning(tuned, arguments.body)

@@ -58,6 +58,15 @@ class TuneFootstepsTest(parameterized.TestCase):
         self.assertEqual(one, two)
         self.assertBetween(one, 1e-4, 0.2)
 
+    def test_other_policies_are_refused(self):
+        columns = np.arange(len(CONTROLLER.mean))
+        for policy in (
+            policies.reference('PD_Biped3D_Imitate-v0'),
+            dataclasses.replace(CONTROLLER, columns=columns),
+        ):
+            with self.assertRaisesRegex(ValueError, f'{policy.id}: expected a footstep controller'):
+                tune_footsteps.Tuning(policy)
+
     def test_a_fall_counts_as_misses_until_the_end(self):
         falls = dataclasses.replace(
             CONTROLLER, biases=(*CONTROLLER.biases[:-1], np.full(len(CONTROLLER.actions), 1.0))
