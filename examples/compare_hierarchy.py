@@ -8,7 +8,8 @@ As Figure 9 of Peng et al. (2017), for the trail and for soccer: PPO with the sa
 steps of 1/30 s. A policy with hierarchy plans two footsteps, about every 15 control steps; its network
 is new, and action 0 walks straight on. A policy without hierarchy sets the joint targets of every
 control step and starts from the walk of `PD_Biped3D_Imitate-v0`. At every quarter of the training the
-policy is evaluated in episodes of 200 s. Finished runs are kept in the JSON file and not repeated.
+policy is saved in RUNS and evaluated in episodes of 200 s. Finished runs are kept in the JSON file and
+not repeated.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import ppo
 import ppo_settings
 import torch
 
+from trl_suite import policies, suite
 from trl_suite.tasks.components.spatial_rules import CONTROL_TIMESTEP
 from trl_suite.util import files
 from trl_suite.util.program import begin_script
@@ -46,22 +48,46 @@ EPISODES, SEED = 32, 0
 _MARKS = '<!-- hierarchy, written by examples/compare_hierarchy.py -->', '<!-- /hierarchy -->'
 
 
-def train(task: str, kind: int, seed: int, control_steps: float) -> list[dict[str, Any]]:
-    """Trains one policy; returns its evaluations after every quarter of the training."""
+def train(
+    task: str, kind: int, seed: int, control_steps: float, folder: pathlib.Path
+) -> list[pathlib.Path]:
+    """Trains one policy; returns the files of its state after every quarter of the training.
+
+    Files of an earlier training in the folder are returned without another one.
+    """
     torch.set_num_threads(1)
+    found = [folder / f'quarter_{i + 1}.npz' for i in range(QUARTERS)]
+    if all(path.exists() for path in found):
+        return found
     id_ = TASKS[task][kind]
+    folder.mkdir(parents=True, exist_ok=True)
     trainer = ppo.Trainer(id_, seed, ppo_settings.settings_for(id_, **COMMON, **STARTS[kind]), 1)
     each = trainer.environments.control_timestep / CONTROL_TIMESTEP  # control steps of a sample
     trainer.settings = dataclasses.replace(trainer.settings, samples=control_steps / each)
-    found: list[dict[str, Any]] = []
-    while len(found) < QUARTERS:
-        trainer.learn(trainer.collect())
-        if trainer.samples * each >= control_steps * (len(found) + 1) / QUARTERS:
-            policy = trainer.exported()
-            result = evaluate_plans.run(id_, lambda _, p=policy: p, EPISODES, SEED)
-            found.append({'control_steps': round(trainer.samples * each), **result})
+    for i, path in enumerate(found):
+        while trainer.samples * each < control_steps * (i + 1) / QUARTERS:
+            trainer.learn(trainer.collect())
+        policies.save(trainer.exported(), path)
     trainer.environments.close()
     return found
+
+
+def evaluate(id_: str, path: pathlib.Path) -> dict[str, Any]:
+    """Evaluates a policy, and returns the result with the control steps of its training."""
+    policy = policies.load(path)
+    each = suite.make(id_).control_timestep() / CONTROL_TIMESTEP
+    result = evaluate_plans.run(id_, lambda _: policy, EPISODES, SEED)
+    return {'control_steps': round(policy.info['samples'] * each), **result}
+
+
+def job(
+    task: str, kind: int, seed: int, control_steps: float, runs: pathlib.Path
+) -> list[dict[str, Any]]:
+    """Trains and evaluates one policy; returns its evaluations after every quarter."""
+    name = f'{task}_{("with", "without")[kind]}_{control_steps:.0f}'
+    folder = runs / name / f'seed_{seed}'
+    paths = train(task, kind, seed, control_steps, folder)
+    return [evaluate(TASKS[task][kind], path) for path in paths]
 
 
 def table(found: dict[str, Any]) -> str:
@@ -123,10 +149,16 @@ def plot(found: dict[str, Any], path: pathlib.Path) -> None:
 def main() -> None:
     parser = comparisons.parser(__doc__.splitlines()[0], [1, 2, 3], 'runs/hierarchy.json')
     parser.add_argument('--tasks', nargs='+', choices=TASKS, default=list(TASKS))
-    parser.add_argument('--control-steps', type=float, default=2e6)
+    parser.add_argument('--control-steps', type=float, default=1.2e6)
+    parser.add_argument(
+        '--runs', type=pathlib.Path, default=pathlib.Path('runs/hierarchy'),
+        help='a folder for the policies',
+    )  # fmt: skip
     arguments = parser.parse_args()
     jobs = {
-        f'{task}/{name}/{seed}': functools.partial(train, task, kind, seed, arguments.control_steps)
+        f'{task}/{name}/{seed}': functools.partial(
+            job, task, kind, seed, arguments.control_steps, arguments.runs
+        )
         for seed in arguments.seeds
         for task in arguments.tasks
         for kind, name in enumerate(KINDS)

@@ -116,7 +116,7 @@ class CompareHierarchyTest(FolderTest):
     def run_program(self, *arguments):
         trained = []
 
-        def train(task, kind, seed, control_steps):
+        def job(task, kind, seed, control_steps, runs):
             trained.append((task, kind, seed))
             last = {'trail': 10.0 * seed + kind, 'at_goal': 0.25 * seed, 'survived_minute': 0.5}
             first = {'trail': 1.0, 'at_goal': 0.0, 'survived_minute': 0.0}
@@ -128,7 +128,7 @@ class CompareHierarchyTest(FolderTest):
         path = self.folder / 'found.json'
         argv = ['compare_hierarchy.py', '--json', str(path), *arguments]
         with (
-            mock.patch.object(compare_hierarchy, 'train', train),
+            mock.patch.object(compare_hierarchy, 'job', job),
             mock.patch.object(sys, 'argv', argv),
             contextlib.redirect_stdout(io.StringIO()) as out,
             contextlib.redirect_stderr(io.StringIO()),
@@ -147,7 +147,7 @@ class CompareHierarchyTest(FolderTest):
         )
         self.assertIn('time with the ball at its goal, % | 25.0 | 50.0 | 37.5 | 50% |', out)
         with self.assertRaisesRegex(
-            ValueError, 'control_steps is 2000000.0, not .*; give another --json'
+            ValueError, 'control_steps is 1200000.0, not .*; give another --json'
         ):
             self.run_program('--control-steps', '100')
 
@@ -161,7 +161,7 @@ class CompareHierarchyTest(FolderTest):
         pyplot.close('all')
         self.assertEqual(picture.read_bytes()[:4], b'\x89PNG')
         drawn = [line.get_xydata().tolist() for line in trail.get_lines()]
-        self.assertIn([[1.0, 1.0], [2.0, 20.0]], drawn)  # with hierarchy, seed 2
+        self.assertIn([[0.6, 1.0], [1.2, 20.0]], drawn)  # with hierarchy, seed 2
         self.assertLen(soccer.get_lines(), 4)
         self.assertEqual(
             [text.get_text() for text in trail.get_legend().get_texts()],
@@ -186,10 +186,14 @@ class CompareHierarchyTest(FolderTest):
             mock.patch.object(compare_hierarchy.evaluate_plans, 'run', run),
             mock.patch.object(compare_hierarchy, 'ppo_settings', module),
         ):
-            found = compare_hierarchy.train('soccer', kind, 1, 32 * each)
+            found = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
+            with mock.patch.object(compare_hierarchy.ppo, 'Trainer') as trainer:
+                again = compare_hierarchy.job('soccer', kind, 1, 32 * each, self.folder)
         steps = [point['control_steps'] for point in found]
         self.assertEqual(steps, [8 * each, 16 * each, 24 * each, 32 * each])
         self.assertEqual(set(asked), {compare_hierarchy.TASKS['soccer'][kind]})
+        trainer.assert_not_called()  # the policies of a finished training are evaluated only
+        self.assertEqual(again, found)
 
 
 class TuneTest(absltest.TestCase):
