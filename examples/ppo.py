@@ -207,7 +207,8 @@ class Trainer:
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
         self.begun = not s.start
         if s.start and s.start not in TEACHERS:
-            self.begin_with(policies.reference(s.start))
+            file = pathlib.Path(s.start)
+            self.begin_with(policies.load(file) if file.suffix else policies.reference(s.start))
             self.begun = True
         self.networks = [self.policy, self.value]
         self.average: swa_utils.AveragedModel | None = None
@@ -586,15 +587,7 @@ class Trainer:
             'settings': dataclasses.asdict(self.settings),
             'environments': self.environments.get_state(),
         }
-        curve = {
-            'id': self.spec.id,
-            'seed': self.seed,
-            'settings': dataclasses.asdict(self.settings),
-            'threads': self.threads,
-            'curve': self.curve,
-        }
-        with files.replacing(folder / 'curve.json') as part:
-            part.write_text(json.dumps(curve, indent=1))
+        write_curve(self.spec.id, self.seed, self.settings, self.threads, self.curve, folder)
         # Last: a run that continues from it finds all other files.
         checkpoints.save(state, folder / 'checkpoint.pt')
 
@@ -630,12 +623,43 @@ def train(
 ) -> list[dict[str, Any]]:
     """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
 
+    With `further` settings each run has its own subfolder, and the curve is that of all runs.
+
     Raises:
       ValueError: the checkpoint is damaged, or has other settings.
       RuntimeError: another process trains in the folder.
     """
     with checkpoints.only_run(folder):
-        return _train(id_, seed, settings, folder, threads, progress)
+        if not settings.further:
+            return _train(id_, seed, settings, folder, threads, progress)
+        curve: list[dict[str, Any]] = []
+        start = settings.start
+        for i, changes in enumerate(({}, *settings.further)):
+            own = dataclasses.replace(settings, **{'further': (), 'start': start, **changes})
+            part, before = folder / f'run_{i + 1}', curve[-1]['samples'] if curve else 0
+            part.mkdir(exist_ok=True)
+            for point in _train(id_, seed, own, part, threads, progress):
+                curve.append({**point, 'samples': before + point['samples']})
+            start = str(part / 'last.npz')
+        for name in ('policy.npz', 'last.npz'):
+            policy = policies.load(part / name)
+            info = {**policy.info, 'samples': before + policy.info['samples']}
+            policies.save(dataclasses.replace(policy, info=info), folder / name)
+        write_curve(id_, seed, settings, threads, curve, folder)
+        return curve
+
+
+def write_curve(
+    id_: str, seed: int, settings: Settings, threads: int, curve: list[dict[str, Any]],
+    folder: pathlib.Path,
+) -> None:  # fmt: skip
+    """Writes settings and learning curve of a run."""
+    record = {
+        'id': id_, 'seed': seed, 'settings': dataclasses.asdict(settings), 'threads': threads,
+        'curve': curve,
+    }  # fmt: skip
+    with files.replacing(folder / 'curve.json') as part:
+        part.write_text(json.dumps(record, indent=1))
 
 
 def _train(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import os
 import pathlib
 import subprocess
@@ -121,11 +122,11 @@ class RunTest(parameterized.TestCase):
         return ppo.train(FLAT, 3, settings, self.folder / name, threads=1, progress=False)
 
     @parameterized.named_parameters(
-        ('plain', ()),
-        ('two sets of options', ((0.0, ({}, {'start_phase': 0.25})),)),
+        ('plain', {}),
+        ('two sets of options', {'stages': ((0.0, ({}, {'start_phase': 0.25})),)}),
     )
-    def test_a_stopped_run_resumes_exactly(self, stages):
-        whole = self.train('whole', stages=stages)
+    def test_a_stopped_run_resumes_exactly(self, changes):
+        whole = self.train('whole', **changes)
         learn, calls = ppo.Trainer.learn, []
 
         def stopped(trainer, batch):
@@ -135,9 +136,9 @@ class RunTest(parameterized.TestCase):
             return learn(trainer, batch)
 
         with mock.patch.object(ppo.Trainer, 'learn', stopped), self.assertRaises(KeyboardInterrupt):
-            self.train('parts', stages=stages)
+            self.train('parts', **changes)
         self.assertFalse((self.folder / 'parts' / 'last.npz').exists())
-        parts = self.train('parts', stages=stages)
+        parts = self.train('parts', **changes)
         for point in parts + whole:
             del point['seconds']
         self.assertEqual(parts, whole)
@@ -423,6 +424,16 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(types, ['var2d_slopes_walls', *['var2d_slopes_mixed'] * 2])
         np.testing.assert_allclose(np.concatenate(spacings), [8 / 3, 8 / 3, 8 / 3, 4, 4])
 
+    def test_half_of_the_simulations_may_have_walls_only(self):
+        stages = ppo_settings.with_walls('slopes_mixed_humanoid')
+        settings = ppo_settings.Settings(**TINY, stages=stages)
+        trainer = ppo.Trainer('PD_Raptor2D_Slopes_Mixed_Terrain-v0', 0, settings, 1)
+        grounds = [part.task.arena.grounds[0] for part in trainer.environments.parts]
+        types = [ground.type for ground in grounds]
+        self.assertEqual(types, ['var2d_slopes_mixed', 'var2d_slopes_walls'])
+        walls = [ground.parameters['WallHMax'] for ground in grounds]
+        self.assertEqual(walls, [0.4, 0.4])
+
     def test_curricula_may_be_joined(self):
         heights = ppo_settings.rising('mixed_humanoid', ppo_settings.LOW, (0.0, 0.5))
         dense = ppo_settings.crowded('mixed_humanoid')
@@ -461,6 +472,26 @@ class RunTest(parameterized.TestCase):
         trainer.learn(trainer.collect())
         for a, b in zip(before, trainer.parameters, strict=True):
             self.assertTrue(torch.equal(a, b))
+
+    def test_further_runs_start_from_the_policy_of_the_one_before(self):
+        first = self.train('first', samples=128)
+        further = {'samples': 128, 'num_envs': 4, 'value_first': 1e9}, {'value_first': 0.0}
+        found = self.train('all', samples=128, further=further)
+        self.assertEqual([point['samples'] for point in found], [128, 256, 384])
+        self.assertEqual(found[0]['normalized_return'], first[0]['normalized_return'])
+        one, two, last = (
+            policies.load(self.folder / name)
+            for name in ('first/last.npz', 'all/run_2/last.npz', 'all/last.npz')
+        )
+        for a, b in zip(one.weights, two.weights, strict=True):  # only its value was trained
+            rows = one.std > ppo.LEAST_STD if a is one.weights[0] else slice(None)
+            np.testing.assert_array_equal(a[rows], b[rows])
+        self.assertFalse(np.array_equal(two.weights[0], last.weights[0]))
+        self.assertEqual([one.info['samples'], last.info['samples']], [128, 384])
+        record = json.loads((self.folder / 'all' / 'curve.json').read_text())
+        self.assertEqual(record['settings']['further'], list(further))
+        self.assertLen(record['curve'], 3)
+        self.assertEqual(self.train('all', samples=128, further=further), found)
 
     def test_value_training_can_continue(self):
         trainer = ppo.Trainer(
