@@ -95,7 +95,7 @@ def table(found: dict[str, Any]) -> str:
     results = found['results']
     seeds = sorted({int(key.rsplit('/', 1)[1]) for key in results})
     lines = [
-        f'After {found["control_steps"]:g} control steps, {EPISODES} episodes of 200 s; seeds '
+        f'After {found["control_steps"] / 1e6:g} million control steps, {EPISODES} episodes of 200 s; seeds '
         f'{", ".join(map(str, seeds))}:',
         '',
         '| task | '
