@@ -636,17 +636,28 @@ def train(
         start = settings.start
         for i, changes in enumerate(({}, *settings.further)):
             own = dataclasses.replace(settings, **{'further': (), 'start': start, **changes})
-            part, before = folder / f'run_{i + 1}', curve[-1]['samples'] if curve else 0
+            part = folder / f'run_{i + 1}'
             part.mkdir(exist_ok=True)
-            for point in _train(id_, seed, own, part, threads, progress):
-                curve.append({**point, 'samples': before + point['samples']})
+            before, points = curve[-1:], _train(id_, seed, own, part, threads, progress)
+            curve += [continued(point, before) for point in points]
             start = str(part / 'last.npz')
         for name in ('policy.npz', 'last.npz'):
             policy = policies.load(part / name)
-            info = {**policy.info, 'samples': before + policy.info['samples']}
+            info = {**policy.info, **continued({'samples': policy.info['samples']}, before)}
             policies.save(dataclasses.replace(policy, info=info), folder / name)
         write_curve(id_, seed, settings, threads, curve, folder)
         return curve
+
+
+def continued(point: dict[str, Any], before: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Returns a point of a curve with the samples and seconds of an earlier run, if any, added."""
+    found = dict(point)
+    for earlier in before:
+        found['samples'] += earlier['samples']
+        if 'seconds' in found:
+            spent = found['seconds'].items()
+            found['seconds'] = {name: value + earlier['seconds'][name] for name, value in spent}
+    return found
 
 
 def write_curve(

@@ -306,15 +306,10 @@ HIGHER = rising('mixed_humanoid', LOW, (0.0, 0.3, 0.6))
 RARE = {'num_envs': 256, 'minibatch': 1024, 'learning_rate': 2e-4, 'gamma': 0.97}
 LONGER = {'averaged': 3e5, 'enough': np.inf}
 LONG = {**LONGER, 'samples': 6e6, 'num_envs': 64, 'minibatch': 512}
-
-
-def more_walls(preset: str) -> dict[str, Any]:
-    """Returns changes of the settings for a further run with more walls."""
-    return {
-        **RARE, 'samples': 3e6, 'stages': with_walls(preset), 'start_count': 1e6, 'value_first': 6e4
-    }  # fmt: skip
-
-
+# Training goes on with larger batches than before.
+MORE = {**RARE, **LONGER, 'samples': 3e6, 'start_count': 1e6, 'value_first': 6e4}
+MORE_WALLS = {**MORE, 'stages': with_walls('mixed_humanoid')}
+MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
@@ -375,10 +370,11 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER},
     ),
     # After these runs nine of ten falls of dog and raptor are at walls.
-    *(
-        (f'PD_{name}_Mixed_Terrain-v0', {'further': (more_walls('mixed_humanoid'),)})
-        for name in ('Dog2D', 'Raptor2D')
-    ),
+    ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
+    ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
+    ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'further': (MORE_WALLS_ON_SLOPES,)}),
+    ('PD_Raptor2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 4e6}),
+    ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_Biped2D_Mixed_Terrain-v0',

@@ -478,6 +478,8 @@ class RunTest(parameterized.TestCase):
         further = {'samples': 128, 'num_envs': 4, 'value_first': 1e9}, {'value_first': 0.0}
         found = self.train('all', samples=128, further=further)
         self.assertEqual([point['samples'] for point in found], [128, 256, 384])
+        times = [point['seconds']['simulation'] for point in found]
+        self.assertEqual(times, sorted(times))
         self.assertEqual(found[0]['normalized_return'], first[0]['normalized_return'])
         one, two, last = (
             policies.load(self.folder / name)
