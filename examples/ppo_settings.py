@@ -372,7 +372,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # After these runs nine of ten falls of dog and raptor are at walls.
     ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
     ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
-    ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {'further': (MORE_WALLS_ON_SLOPES,)}),
+    ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 2e6}),
     ('PD_Raptor2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 4e6}),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
