@@ -6,7 +6,8 @@
 Writes into OUTPUT/ID/seed_S: `checkpoint.pt` (everything; the same command continues from it with
 identical results), `curve.json` (settings, learning curve), `policy.npz` (the policy with the best
 score in the evaluations of the curve, for `trl_suite.policies`), `stage_N.npz` at the end of every
-curriculum stage but the last, and at the end `last.npz`.
+curriculum stage but the last, and at the end `last.npz`. Of several runs (`further`) each has its own
+subfolder `run_N` with these files, and the curve and the policies of the last one are joined above.
 
 PPO as in Schulman et al. 2017 (arXiv:1707.06347) with the details of Huang et al. 2022 (The 37
 Implementation Details of PPO); the settings of each environment are in `ppo_settings.py`. Needs
@@ -175,8 +176,14 @@ class Trainer:
     """One run: the simulations, the networks and the progress."""
 
     def __init__(
-        self, environment: str | EnvSpec, seed: int, settings: Settings, threads: int
+        self,
+        environment: str | EnvSpec,
+        seed: int,
+        settings: Settings,
+        threads: int,
+        initial: policies.Policy | None = None,
     ) -> None:
+        """Makes a run that starts from `initial`, or else from `start` of the settings."""
         torch.manual_seed(seed)
         self.spec = suite.find(environment) if isinstance(environment, str) else environment
         self.seed = seed
@@ -205,11 +212,12 @@ class Trainer:
         self.policy = network((inputs, *s.hidden, outputs), 0.01)
         self.value = network((inputs, *s.hidden, 1), 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
-        self.begun = not s.start
-        if s.start and s.start not in TEACHERS:
-            file = pathlib.Path(s.start)
-            self.begin_with(policies.load(file) if file.suffix else policies.reference(s.start))
-            self.begun = True
+        if initial is None and s.start and s.start not in TEACHERS:
+            initial = policies.reference(s.start)
+        if initial is not None:
+            self.begin_with(initial)
+        self.begun = not s.start or initial is not None
+        self.has_start = bool(s.start) or initial is not None
         self.networks = [self.policy, self.value]
         self.average: swa_utils.AveragedModel | None = None
         if s.averaged:
@@ -457,7 +465,7 @@ class Trainer:
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         divergence, stopped = 0.0, False
-        waits = bool(s.start) and self.samples <= s.value_first
+        waits = self.has_start and self.samples <= s.value_first
         for _ in range(s.epochs):
             order = torch.from_numpy(self.random.permutation(len(advantage)))
             for part in order.split(s.minibatch):
@@ -633,14 +641,14 @@ def train(
         if not settings.further:
             return _train(id_, seed, settings, folder, threads, progress)
         curve: list[dict[str, Any]] = []
-        start = settings.start
+        initial = None
         for i, changes in enumerate(({}, *settings.further)):
-            own = dataclasses.replace(settings, **{'further': (), 'start': start, **changes})
+            own = dataclasses.replace(settings, **{'further': (), **changes})
             part = folder / f'run_{i + 1}'
             part.mkdir(exist_ok=True)
-            before, points = curve[-1:], _train(id_, seed, own, part, threads, progress)
+            before, points = curve[-1:], _train(id_, seed, own, part, threads, progress, initial)
             curve += [continued(point, before) for point in points]
-            start = str(part / 'last.npz')
+            initial = policies.load(part / 'last.npz')
         for name in ('policy.npz', 'last.npz'):
             policy = policies.load(part / name)
             info = {**policy.info, **continued({'samples': policy.info['samples']}, before)}
@@ -674,10 +682,16 @@ def write_curve(
 
 
 def _train(
-    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int, progress: bool
+    id_: str,
+    seed: int,
+    settings: Settings,
+    folder: pathlib.Path,
+    threads: int,
+    progress: bool,
+    initial: policies.Policy | None = None,
 ) -> list[dict[str, Any]]:
     torch.set_num_threads(1)  # a second thread slows down networks of this size
-    trainer = Trainer(id_, seed, settings, threads)
+    trainer = Trainer(id_, seed, settings, threads, initial)
     if (folder / 'checkpoint.pt').exists():
         trainer.restore(folder)
     total = int(settings.samples)

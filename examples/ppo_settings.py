@@ -65,9 +65,9 @@ class Settings:
     # including `terrain`; or a tuple of options, with which as many simulations each run at the
     # same time. Evaluations use the options of the environment, or `evaluated_with`.
     stages: tuple[tuple[float, Any], ...] = ()
-    # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), or from
-    # a policy file, with its weights, scales and noise; the weights of inputs that it does not have
-    # are 0. Or from one of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
+    # Start from the shipped policy of this environment, as PLAiD does (Berseth et al. 2018), with
+    # its weights, scales and noise; the weights of inputs that it does not have are 0. Or from one
+    # of `ppo.TEACHERS`, which is imitated for `cloned` control steps.
     start: str = ''
     # Sample count of the scales of the initial policy. With a small count they adapt quickly to the
     # new environment, but the initial weights may then no longer fit the scales.

@@ -31,10 +31,22 @@ def fetch(url: str, folder: pathlib.Path) -> None:
     system, path = fsspec.core.url_to_fs(url)
     if not system.exists(path):
         return
-    for found in system.ls(path, detail=False):
-        name = found.rstrip('/').rpartition('/')[2]
-        if not name.startswith('.'):
+    for found in system.find(path):
+        name = found.removeprefix(path).lstrip('/')
+        if not _hidden(name):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             system.get_file(found, str(folder / name))
+
+
+def _names(folder: pathlib.Path) -> list[str]:
+    """Returns the files in a folder and in its subfolders, but hidden ones."""
+    paths = (path for path in folder.rglob('*') if path.is_file())
+    names = (path.relative_to(folder).as_posix() for path in paths)
+    return [name for name in names if not _hidden(name)]
+
+
+def _hidden(name: str) -> bool:
+    return any(part.startswith('.') for part in name.split('/'))
 
 
 def put(folder: pathlib.Path, url: str) -> None:
@@ -44,12 +56,12 @@ def put(folder: pathlib.Path, url: str) -> None:
     files that it needs are present.
     """
     system, path = fsspec.core.url_to_fs(url)
-    system.makedirs(path, exist_ok=True)
-    names = [each.name for each in folder.iterdir() if not each.name.startswith('.')]
-    for name in sorted(names, key=lambda name: name == CHECKPOINT):
-        part = f'{path}/.{name}.{uuid.uuid4().hex}.part'
+    for name in sorted(_names(folder), key=lambda name: name.endswith(CHECKPOINT)):
+        place, _, own = f'{path}/{name}'.rpartition('/')
+        system.makedirs(place, exist_ok=True)
+        part = f'{place}/.{own}.{uuid.uuid4().hex}.part'
         system.put_file(str(folder / name), part)
-        system.mv(part, f'{path}/{name}')
+        system.mv(part, f'{place}/{own}')
 
 
 def remove(url: str) -> None:
@@ -83,10 +95,11 @@ def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
         # Files are replaced, never changed, so hard links keep the current versions. The checkpoint is
         # linked first, so that the other files are not older.
         with tempfile.TemporaryDirectory(dir=folder.parent) as moment:
-            names = [each.name for each in folder.iterdir() if not each.name.startswith('.')]
-            for name in sorted(names, key=lambda name: name != CHECKPOINT):
+            for name in sorted(_names(folder), key=lambda name: not name.endswith(CHECKPOINT)):
+                linked = pathlib.Path(moment, name)
+                linked.parent.mkdir(parents=True, exist_ok=True)
                 with contextlib.suppress(FileNotFoundError):
-                    os.link(folder / name, pathlib.Path(moment, name))
+                    os.link(folder / name, linked)
             try:
                 put(pathlib.Path(moment), url)
             except OSError as error:  # training continues; the next copy may succeed
@@ -96,6 +109,5 @@ def _follow(folder: pathlib.Path, url: str, ended: threading.Event) -> None:
 
 
 def _written(folder: pathlib.Path) -> int:
-    """Returns the time at which the checkpoint was written, ns; 0 if there is none."""
-    path = folder / CHECKPOINT
-    return path.stat().st_mtime_ns if path.exists() else 0
+    """Returns the time at which the last checkpoint was written, ns; 0 if there is none."""
+    return max((path.stat().st_mtime_ns for path in folder.rglob(CHECKPOINT)), default=0)

@@ -211,7 +211,7 @@ def train_here(
             contextlib.redirect_stdout(log),
             contextlib.redirect_stderr(log),
         ):
-            how = 'continues' if (folder / storage.CHECKPOINT).exists() else 'begins'
+            how = 'continues' if any(folder.rglob(storage.CHECKPOINT)) else 'begins'
             print(f'{time.asctime()}: {how} on {platform.node()}', flush=True)
             program(id_).train(id_, seed, settings, folder, threads=1)
         return measured(id_, folder, machine, begin)

@@ -124,6 +124,7 @@ class RunTest(parameterized.TestCase):
     @parameterized.named_parameters(
         ('plain', {}),
         ('two sets of options', {'stages': ((0.0, ({}, {'start_phase': 0.25})),)}),
+        ('further', {'samples': 256, 'further': ({'value_first': 0.0},)}),
     )
     def test_a_stopped_run_resumes_exactly(self, changes):
         whole = self.train('whole', **changes)
@@ -148,7 +149,7 @@ class RunTest(parameterized.TestCase):
             for a, b in zip(one.weights + one.biases, two.weights + two.biases, strict=True):
                 np.testing.assert_array_equal(a, b)
         with self.assertRaisesRegex(ValueError, 'other settings'):
-            self.train('whole', clip=0.1)
+            self.train('whole', **{**changes, 'clip': 0.1})
 
     def test_a_damaged_checkpoint_is_refused(self):
         self.train('run', samples=128)

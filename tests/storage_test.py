@@ -50,6 +50,21 @@ class StorageTest(parameterized.TestCase):
         self.assertEqual(self.fetched(url), {})
         storage.remove(url)
 
+    @parameterized.parameters('memory://runs/b', '{}/runs/b')
+    def test_subfolders_come_back(self, url):
+        url = url.format(self.new())
+        for name in ('run_1/checkpoint.pt', 'run_1/last.npz', 'run_1/.lock', 'curve.json'):
+            (self.folder / 'run_1').mkdir(exist_ok=True)
+            (self.folder / name).write_text(name)
+        storage.put(self.folder, url)
+        folder = self.new()
+        storage.fetch(url, folder)
+        found = {path.relative_to(folder).as_posix() for path in folder.rglob('*.*')}
+        self.assertEqual(found, {'run_1/checkpoint.pt', 'run_1/last.npz', 'curve.json'})
+        self.assertEqual((folder / 'run_1/last.npz').read_text(), 'run_1/last.npz')
+        self.assertGreater(storage._written(folder), 0)
+        storage.remove(url)
+
     def test_the_checkpoint_comes_last(self):
         """A machine that is lost between two files leaves what the old checkpoint needs."""
         self.write(checkpoint_pt='', curve_json='', policy_npz='')
