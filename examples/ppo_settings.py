@@ -414,7 +414,7 @@ PRESET = 'harsh'
 CONTINUED = {
     'samples': 0.6e6, 'averaged': 5e4, 'learning_rate': 1.5e-4, 'last_learning_rate': 2e-5,
     'start_count': 1e6, 'value_first': 4e4, 'value_goes_on': True, 'least_share': {},
-    'stages_averaged': 1, 'enough': np.inf, 'evaluation_episodes': 64,
+    'stages_averaged': 1, 'further': (), 'enough': np.inf, 'evaluation_episodes': 64,
 }  # fmt: skip
 FEWER = {'samples': 2.5e5, 'value_first': 2e4, 'evaluate_every': 5e4, 'evaluation_episodes': 32}
 RANDOMIZED: dict[str, dict[str, Any]] = {
