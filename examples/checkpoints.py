@@ -1,4 +1,4 @@
-"""Checkpoints of training runs, with a check of their integrity; one run per folder.
+"""Files of training runs: checkpoints, with a check of their integrity, and curves; one run per folder.
 
 A checkpoint is a line that names the format, a line with the SHA-256 of the rest, and the output of
 `torch.save`. It is read with `weights_only`, so that loading a file cannot run code: it may contain
@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import dataclasses
 import hashlib
 import io
+import json
 import pathlib
 import re
 from collections.abc import Iterator
@@ -28,6 +30,19 @@ ARRAYS = [
     bytes,
     *(type(np.dtype(kind)) for kind in '?bhilqBHILQefd'),
 ]  # fmt: skip
+
+
+def write_curve(
+    folder: pathlib.Path, id_: str, seed: int, settings: Any, threads: int, curve: list[Any],
+    **more: Any,
+) -> None:  # fmt: skip
+    """Writes `curve.json`: the learning curve of a run, its settings, a dataclass, and `more`."""
+    record = {
+        'id': id_, 'seed': seed, **more, 'settings': dataclasses.asdict(settings),
+        'threads': threads, 'curve': curve,
+    }  # fmt: skip
+    with files.replacing(folder / 'curve.json') as part:
+        part.write_text(json.dumps(record, indent=1))  # settings may be infinite
 
 
 def save(state: dict[str, Any], path: pathlib.Path) -> None:

@@ -84,8 +84,7 @@ def job(
     task: str, kind: int, seed: int, control_steps: float, runs: pathlib.Path
 ) -> list[dict[str, Any]]:
     """Trains and evaluates one policy; returns its evaluations after every quarter."""
-    name = f'{task}_{("with", "without")[kind]}_{control_steps:.0f}'
-    folder = runs / name / f'seed_{seed}'
+    folder = runs / f'{control_steps:.0f}' / TASKS[task][kind] / f'seed_{seed}'
     paths = train(task, kind, seed, control_steps, folder)
     return [evaluate(TASKS[task][kind], path) for path in paths]
 

@@ -32,7 +32,6 @@ import collections
 import copy
 import dataclasses
 import fnmatch
-import json
 import pathlib
 import time
 from collections.abc import Sequence
@@ -49,7 +48,7 @@ from torch import nn
 from trl_suite import characters, evaluation, policies
 from trl_suite.registry import catalogue
 from trl_suite.tasks.gait import rules as gait_rules
-from trl_suite.util import errors, files
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -712,13 +711,10 @@ class Learner:
 
     def write_curve(self, folder: pathlib.Path) -> None:
         """Writes the settings and the curve."""
-        record = {
-            'id': self.environments.spec.id, 'seed': self.seed, 'environments': self.ids,
-            'settings': dataclasses.asdict(self.settings), 'threads': self.threads,
-            'curve': self.curve,
-        }  # fmt: skip
-        with files.replacing(folder / 'curve.json') as part:
-            part.write_text(json.dumps(record, indent=1))
+        checkpoints.write_curve(
+            folder, self.environments.spec.id, self.seed, self.settings, self.threads, self.curve,
+            environments=self.ids,
+        )  # fmt: skip
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
-import json
 import pathlib
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,7 +38,6 @@ from trl_suite import characters, evaluation, policies, suite
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.components import rewards
 from trl_suite.terrain.spatial import windows as spatial_ground
-from trl_suite.util import files
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -595,7 +593,9 @@ class Trainer:
             'settings': dataclasses.asdict(self.settings),
             'environments': self.environments.get_state(),
         }
-        write_curve(self.spec.id, self.seed, self.settings, self.threads, self.curve, folder)
+        checkpoints.write_curve(
+            folder, self.spec.id, self.seed, self.settings, self.threads, self.curve
+        )
         # Last: a run that continues from it finds all other files.
         checkpoints.save(state, folder / 'checkpoint.pt')
 
@@ -640,45 +640,36 @@ def train(
     with checkpoints.only_run(folder):
         if not settings.further:
             return _train(id_, seed, settings, folder, threads, progress)
+        runs = [
+            dataclasses.replace(settings, **{'further': (), **changes})
+            for changes in ({}, *settings.further)
+        ]
         curve: list[dict[str, Any]] = []
         initial = None
-        for i, changes in enumerate(({}, *settings.further)):
-            own = dataclasses.replace(settings, **{'further': (), **changes})
+        for i, own in enumerate(runs):
             part = folder / f'run_{i + 1}'
             part.mkdir(exist_ok=True)
-            before, points = curve[-1:], _train(id_, seed, own, part, threads, progress, initial)
+            before = curve[-1] if curve else None
+            points = _train(id_, seed, own, part, threads, progress, initial)
             curve += [continued(point, before) for point in points]
             initial = policies.load(part / 'last.npz')
         for name in ('policy.npz', 'last.npz'):
             policy = policies.load(part / name)
             info = {**policy.info, **continued({'samples': policy.info['samples']}, before)}
             policies.save(dataclasses.replace(policy, info=info), folder / name)
-        write_curve(id_, seed, settings, threads, curve, folder)
+        checkpoints.write_curve(folder, id_, seed, settings, threads, curve)
         return curve
 
 
-def continued(point: dict[str, Any], before: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Returns a point of a curve with the samples and seconds of an earlier run, if any, added."""
-    found = dict(point)
-    for earlier in before:
-        found['samples'] += earlier['samples']
-        if 'seconds' in found:
-            spent = found['seconds'].items()
-            found['seconds'] = {name: value + earlier['seconds'][name] for name, value in spent}
+def continued(point: dict[str, Any], before: dict[str, Any] | None) -> dict[str, Any]:
+    """Returns a point of a curve with the samples and seconds of earlier runs, if any, added."""
+    if before is None:
+        return point
+    found = {**point, 'samples': before['samples'] + point['samples']}
+    if 'seconds' in point:
+        spent = point['seconds'].items()
+        found['seconds'] = {name: before['seconds'][name] + value for name, value in spent}
     return found
-
-
-def write_curve(
-    id_: str, seed: int, settings: Settings, threads: int, curve: list[dict[str, Any]],
-    folder: pathlib.Path,
-) -> None:  # fmt: skip
-    """Writes settings and learning curve of a run."""
-    record = {
-        'id': id_, 'seed': seed, 'settings': dataclasses.asdict(settings), 'threads': threads,
-        'curve': curve,
-    }  # fmt: skip
-    with files.replacing(folder / 'curve.json') as part:
-        part.write_text(json.dumps(record, indent=1))
 
 
 def _train(

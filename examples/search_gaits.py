@@ -277,12 +277,7 @@ def _train(
             bar.set_postfix(distance=f'{point["median_distance"]:.1f} m', loss=f'{loss:.2f}')
             with files.replacing(folder / 'decisions.npz') as part:
                 np.savez_compressed(part, observation=observations, worth=worth)
-            record = {
-                'id': id_, 'seed': seed, 'settings': dataclasses.asdict(s), 'threads': threads,
-                'curve': curve,
-            }  # fmt: skip
-            with files.replacing(folder / 'curve.json') as part:
-                part.write_text(json.dumps(record, indent=1))
+            checkpoints.write_curve(folder, id_, seed, s, threads, curve)
     return curve
 
 

@@ -496,6 +496,11 @@ class RunTest(parameterized.TestCase):
         self.assertLen(record['curve'], 3)
         self.assertEqual(self.train('all', samples=128, further=further), found)
 
+    def test_further_settings_are_checked_before_the_first_run(self):
+        with self.assertRaisesRegex(TypeError, "unexpected keyword argument 'sample'"):
+            self.train('all', further=({'sample': 128},))
+        self.assertEmpty([path for path in self.folder.rglob('*') if path.suffix])
+
     def test_value_training_can_continue(self):
         trainer = ppo.Trainer(
             FLAT, 0, ppo_settings.Settings(**TINY, kl_per_action=-1.0, value_goes_on=True), 1
