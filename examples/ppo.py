@@ -457,13 +457,15 @@ class Trainer:
         """One update; returns the divergence of the new policy from the old one."""
         s = self.settings
         progress = min(self.samples / s.samples, 1.0)
+        waits = self.has_start and self.samples <= s.value_first
         rate = s.learning_rate + progress * (s.last_learning_rate - s.learning_rate)
+        if waits and s.value_rate is not None:
+            rate = s.value_rate
         for group in self.optimizer.param_groups:
             group['lr'] = rate
         advantage = batch['advantage']
         batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         divergence, stopped = 0.0, False
-        waits = self.has_start and self.samples <= s.value_first
         for _ in range(s.epochs):
             order = torch.from_numpy(self.random.permutation(len(advantage)))
             for part in order.split(s.minibatch):

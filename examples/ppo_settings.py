@@ -15,6 +15,7 @@ import numpy as np
 from trl_suite import terrain
 
 CLOSER = 2 / 3  # times the spacing of obstacles
+LARGER = 1.1  # times the size of the largest obstacles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,9 +78,11 @@ class Settings:
     # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
     cloning_epochs: int = 30  # of each round, over all labels so far
-    value_first: float = (
-        2e4  # first control steps after `start`, in which only the value is trained
-    )
+    # First control steps after `start`, in which only the value is trained, and the learning rate
+    # in them; None: the same as later. A value network that starts from random weights needs a
+    # high rate, a good policy a low one.
+    value_first: float = 2e4
+    value_rate: float | None = None
     # Changes of these settings in further runs, each of which starts from the policy of the one
     # before. The samples of these runs are those of the changes.
     further: tuple[dict[str, Any], ...] = ()
@@ -127,6 +130,22 @@ def with_walls(preset: str) -> tuple[Any, ...]:
     }
     ground = {'Type': mixed.type.replace('mixed', 'walls'), 'Params': [walls]}
     return ((0.0, ({}, {'terrain': ground})),)
+
+
+def with_larger(preset: str) -> tuple[Any, ...]:
+    """Returns a stage in which half of the simulations have larger obstacles than a preset's.
+
+    Their sizes are from the middle of the preset's range to a tenth more than its largest.
+    """
+    ground = terrain.load(preset)
+    values = dict(ground.parameter_sets[0])
+    for size in ('GapW', 'WallH', 'StepH0', 'StepH1'):
+        bounds = f'{size}Min', f'{size}Max'
+        if bounds[0] in values:
+            small, large = sorted((values[bound] for bound in bounds), key=abs)
+            between = sorted(((small + large) / 2, LARGER * large))
+            values |= dict(zip(bounds, between, strict=True))
+    return ((0.0, ({}, {'terrain': {'Type': ground.type, 'Params': [values]}})),)
 
 
 def evenly(stages: Iterable[dict[str, Any]]) -> tuple[tuple[float, dict[str, Any]], ...]:

@@ -15,7 +15,7 @@ import pytest
 import torch
 from absl.testing import absltest, parameterized
 
-from trl_suite import evaluation, policies
+from trl_suite import evaluation, policies, terrain
 from trl_suite.registry import catalogue
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
@@ -256,6 +256,21 @@ class RunTest(parameterized.TestCase):
         trainer.learn(trainer.collect())
         self.assertTrue((trainer.exported().weights[0] != before[0]).any())
 
+    def test_the_value_may_learn_faster_before_the_policy(self):
+        start = 'PD_Biped2D_Flat_Terrain-v0'
+        changes = {'hidden': (256, 256), 'learning_rate': 1e-4, 'last_learning_rate': 1e-4}
+        settings = ppo_settings.Settings(
+            **{**TINY, **changes}, start=start, value_first=1000, value_rate=1e-3
+        )
+        trainer = ppo.Trainer(start, 0, settings, 1)
+        rates = []
+        for samples in (0, 2000):
+            batch = trainer.collect()
+            trainer.samples = samples
+            trainer.learn(batch)
+            rates.append({group['lr'] for group in trainer.optimizer.param_groups})
+        self.assertEqual(rates, [{1e-3}, {1e-4}])
+
     @parameterized.parameters((2e4, 100.0), (1e9, 1e6))
     def test_scales_of_an_initial_policy_are_kept_for_the_given_time(self, count, least):
         """After a hundredth as many observations, means have moved by less than the step."""
@@ -434,6 +449,32 @@ class RunTest(parameterized.TestCase):
         self.assertEqual(types, ['var2d_slopes_mixed', 'var2d_slopes_walls'])
         walls = [ground.parameters['WallHMax'] for ground in grounds]
         self.assertEqual(walls, [0.4, 0.4])
+
+    @parameterized.parameters(
+        ('gaps_humanoid', {'GapW': (0.275, 0.33)}),
+        ('walls_humanoid', {'WallH': (0.15, 0.275)}),
+        (
+            'slopes_mixed_humanoid',
+            {
+                'GapW': (0.4, 0.55),
+                'WallH': (0.325, 0.44),
+                'StepH0': (0.2, 0.33),
+                'StepH1': (-0.33, -0.2),
+            },
+        ),
+    )
+    def test_half_of_the_simulations_may_have_larger_obstacles(self, preset, expected):
+        ((begin, (own, larger)),) = ppo_settings.with_larger(preset)
+        self.assertEqual((begin, own), (0.0, {}))
+        given = terrain.load(preset)
+        ground = terrain.load(larger['terrain'])
+        self.assertEqual(ground.type, given.type)
+        before, after = given.parameter_sets[0], ground.parameter_sets[0]
+        for name, bounds in expected.items():
+            found = after[f'{name}Min'], after[f'{name}Max']
+            np.testing.assert_allclose(found, bounds)
+        changed = {f'{name}{end}' for name in expected for end in ('Min', 'Max')}
+        self.assertEqual({name for name in after if after[name] != before[name]}, changed)
 
     def test_curricula_may_be_joined(self):
         heights = ppo_settings.rising('mixed_humanoid', ppo_settings.LOW, (0.0, 0.5))
