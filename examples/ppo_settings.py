@@ -327,6 +327,11 @@ LONGER = {'averaged': 3e5, 'enough': np.inf}
 LONG = {**LONGER, 'samples': 6e6, 'num_envs': 64, 'minibatch': 512}
 # Training goes on with larger batches than before.
 MORE = {**RARE, **LONGER, 'samples': 3e6, 'start_count': 1e6, 'value_first': 6e4}
+# From a policy that is good already: its scales stay, and the value is learnt first.
+AGAIN = {
+    **MORE, 'last_learning_rate': 2e-5, 'start_count': 1e9,
+    'value_first': 2e5, 'value_rate': 1e-3, 'value_goes_on': True,
+}  # fmt: skip
 MORE_WALLS = {**MORE, 'stages': with_walls('mixed_humanoid')}
 MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
@@ -394,6 +399,21 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 2e6}),
     ('PD_Raptor2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 4e6}),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
+    # All falls of the runs before are at the widest gaps.
+    ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
+    (
+        'PD_Raptor2D_Gaps_Terrain-v0',
+        {'further': ({**AGAIN, 'stages': with_larger('gaps_humanoid')},)},
+    ),
+    (
+        'PD_Dog2D_Walls_Terrain-v0',
+        {
+            **AGAIN,
+            'start': 'PD_Dog2D_Mixed_Terrain-v0',
+            'samples': 1.5e6,
+            'stages': with_larger('walls_humanoid'),
+        },
+    ),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_Biped2D_Mixed_Terrain-v0',
