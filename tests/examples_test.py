@@ -434,7 +434,8 @@ class GeneralistTest(FolderTest):
         entry = json.loads(path.read_text())
         self.assertEqual(entry['ids'], ids)
         self.assertEqual(
-            entry['settings'], json.loads(json.dumps(dataclasses.asdict(generalist.Settings())))
+            entry['settings'],
+            json.loads(json.dumps(dataclasses.asdict(generalist.SETTINGS[character]))),
         )
         policy = policies.reference(ids[0], 'generalist')
         for id_ in ids[:2]:  # flat ground and an incline, where episodes are alike
