@@ -416,8 +416,25 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
+        'PD_Biped2D_Slopes_Mixed_Terrain-v0',
+        {
+            'further': (
+                {
+                    **AGAIN,
+                    'samples': 4e6,
+                    'gamma': 0.98,
+                    'stages': with_larger('slopes_mixed_humanoid'),
+                },
+            )
+        },
+    ),
+    (
         'PD_Biped2D_Mixed_Terrain-v0',
-        {'samples': 8e6, 'stages': joined(HIGHER, crowded('mixed_humanoid'))},
+        {
+            'samples': 8e6,
+            'stages': joined(HIGHER, crowded('mixed_humanoid')),
+            'further': ({**AGAIN, 'samples': 2e6, 'gamma': 0.98, 'stages': ()},),
+        },
     ),
     ('MTU_Raptor2D_*', {'samples': 1.2e6}),
     ('MTU_Biped2D_*', {'samples': 1e6}),
