@@ -398,6 +398,8 @@ class Trainer:
             failed[t] = step.terminated | self.strays(step.info['reward_terms'])
             ended[t] = failed[t] | step.truncated
             reward[t] = step.reward
+            for name, cost in s.landing_costs.items():
+                reward[t] -= cost * step.info[name] * step.info['landed']
             unseen = np.flatnonzero(ended[t] & ~failed[t])
             if len(unseen):
                 cut.append((t, unseen, self.seen(step.observation[unseen])[0]))

@@ -52,6 +52,9 @@ class Settings:
     # standing still is a local optimum. Not used in evaluations.
     least_share: dict[str, float] = dataclasses.field(default_factory=dict)
     patience: float = 0.3
+    # Costs of the tracking errors in `info`, such as `landing_error`, per m or rad: in training they
+    # are subtracted from the reward of the control step in which a foot lands.
+    landing_costs: dict[str, float] = dataclasses.field(default_factory=dict)
     # Mirror observations and actions in left stance; for walkers in three dimensions.
     mirrored: bool = False
     # Part of a terrain map that is an input: distance ahead and to each side, m; None: all.

@@ -8,6 +8,8 @@ import numpy as np
 
 from trl_suite.vector import Step, VectorEnvironment
 
+FOOTSTEPS = 'landed', 'landing_error', 'heading_error'  # keys of `info` in footstep tracking
+
 
 class Several:
     """Simulations of several environments, with the parts of the interface that PPO uses.
@@ -37,7 +39,12 @@ class Several:
             name: np.concatenate([info['reward_terms'][name] for info in infos])
             for name in infos[0]['reward_terms']
         }
-        return Step(*(np.concatenate(each) for each in joined), {'reward_terms': terms})
+        info = {
+            name: np.concatenate([info[name] for info in infos])
+            for name in FOOTSTEPS
+            if name in infos[0]
+        }
+        return Step(*(np.concatenate(each) for each in joined), {'reward_terms': terms, **info})
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state of all simulations."""

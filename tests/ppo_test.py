@@ -102,6 +102,22 @@ class PartsTest(parameterized.TestCase):
         weights = np.abs(trainer.exported().weights[0]).max(1)
         np.testing.assert_array_equal(weights == 0, unused)
 
+    @parameterized.parameters(((),), (((0.0, ({}, {'heading_scale': 2.0})),),))
+    def test_landing_errors_may_cost_reward(self, stages):
+        """With one simulation environment, and with several."""
+        id_ = 'PD_Biped3D_LLC_General_Step-v0'
+        settings = ppo_settings.Settings(**{**TINY, 'horizon': 40}, stages=stages)
+        targets = []
+        for costs in ({}, {'landing_error': 1e3}):
+            trainer = ppo.Trainer(
+                id_, 0, dataclasses.replace(settings, landing_costs=costs, lambda_=1.0), 1
+            )
+            targets.append(trainer.collect()['target'].numpy().reshape(40, -1))
+        differs = (targets[0] != targets[1]).any(0)
+        self.assertTrue(differs.any())  # a foot has landed
+        np.testing.assert_array_less(targets[1], targets[0] + 1e-3)
+        self.assertLess((targets[1] - targets[0]).min(), -1)
+
     def test_several_options_at_the_same_time(self):
         groups = {'start_phase': 0.25}, {'action_scale': 2.0}, {}
         settings = ppo_settings.Settings(**TINY, stages=((0.0, groups),))
