@@ -337,6 +337,7 @@ AGAIN = {
 }  # fmt: skip
 MORE_WALLS = {**MORE, 'stages': with_walls('mixed_humanoid')}
 MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
+WALLS_AGAIN = {**AGAIN, 'samples': 2e6, 'stages': with_walls('mixed_humanoid')}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
@@ -397,10 +398,17 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER},
     ),
     # After these runs nine of ten falls of dog and raptor are at walls.
-    ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
+    ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS, WALLS_AGAIN)}),
     ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
     ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 2e6}),
-    ('PD_Raptor2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 4e6}),
+    (
+        'PD_Raptor2D_Slopes_Mixed_Terrain-v0',
+        {
+            **MORE_WALLS_ON_SLOPES,
+            'samples': 4e6,
+            'further': ({**WALLS_AGAIN, 'stages': with_walls('slopes_mixed_humanoid')},),
+        },
+    ),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
     # All falls of the runs before are at the widest gaps.
     ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
