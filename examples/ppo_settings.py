@@ -416,15 +416,6 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         'PD_Raptor2D_Gaps_Terrain-v0',
         {'further': ({**AGAIN, 'stages': with_larger('gaps_humanoid')},)},
     ),
-    (
-        'PD_Dog2D_Walls_Terrain-v0',
-        {
-            **AGAIN,
-            'start': 'PD_Dog2D_Mixed_Terrain-v0',
-            'samples': 1.5e6,
-            'stages': with_larger('walls_humanoid'),
-        },
-    ),
     ('PD_Biped2D_*Mixed_Terrain-v0', NO_STEPS_IN_PLACE),
     (
         'PD_Biped2D_Slopes_Mixed_Terrain-v0',
