@@ -30,7 +30,7 @@ import torch
 import tqdm
 from expert import expert
 from ppo_settings import Settings, settings_for
-from several import Several
+from several import LANDING_ERRORS, Several
 from torch import nn
 from torch.optim import swa_utils
 
@@ -38,6 +38,7 @@ from trl_suite import characters, evaluation, policies, suite
 from trl_suite.registry.catalogue import EnvSpec
 from trl_suite.tasks.components import rewards
 from trl_suite.terrain.spatial import windows as spatial_ground
+from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
@@ -192,6 +193,8 @@ class Trainer:
                 f'stages_averaged: {s.stages_averaged}; expected 1 to {max(1, len(s.stages))}, the '
                 'number of stages'
             )
+        if unknown := s.landing_costs.keys() - set(LANDING_ERRORS):
+            raise ValueError(errors.unknown('landing cost', min(unknown), LANDING_ERRORS))
         self.samples = 0
         self.begin_stage()
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from trl_suite.vector import Step, VectorEnvironment
 
-FOOTSTEPS = 'landed', 'landing_error', 'heading_error'  # keys of `info` in footstep tracking
+LANDING_ERRORS = 'landing_error', 'heading_error'  # keys of `info` in footstep tracking
 
 
 class Several:
@@ -41,7 +41,7 @@ class Several:
         }
         info = {
             name: np.concatenate([info[name] for info in infos])
-            for name in FOOTSTEPS
+            for name in ('landed', *LANDING_ERRORS)
             if name in infos[0]
         }
         return Step(*(np.concatenate(each) for each in joined), {'reward_terms': terms, **info})

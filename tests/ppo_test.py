@@ -118,6 +118,11 @@ class PartsTest(parameterized.TestCase):
         np.testing.assert_array_less(targets[1], targets[0] + 1e-3)
         self.assertLess((targets[1] - targets[0]).min(), -1)
 
+    def test_unknown_landing_costs_are_refused(self):
+        settings = ppo_settings.Settings(**TINY, landing_costs={'landing_eror': 1.0})
+        with self.assertRaisesRegex(ValueError, "landing cost 'landing_eror'.*landing_error"):
+            ppo.Trainer('PD_Biped3D_LLC_General_Step-v0', 0, settings, 1)
+
     def test_several_options_at_the_same_time(self):
         groups = {'start_phase': 0.25}, {'action_scale': 2.0}, {}
         settings = ppo_settings.Settings(**TINY, stages=((0.0, groups),))
