@@ -410,7 +410,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         },
     ),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
-    # All falls of the runs before are at the widest gaps.
+    # After the runs before, falls are at the widest gaps.
     ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
     (
         'PD_Raptor2D_Gaps_Terrain-v0',
