@@ -400,7 +400,16 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # After these runs nine of ten falls of dog and raptor are at walls.
     ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS, WALLS_AGAIN)}),
     ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
-    ('PD_Dog2D_Slopes_Mixed_Terrain-v0', {**MORE_WALLS_ON_SLOPES, 'samples': 2e6}),
+    (
+        'PD_Dog2D_Slopes_Mixed_Terrain-v0',
+        {
+            **MORE_WALLS_ON_SLOPES,
+            'samples': 2e6,
+            'further': (
+                {**AGAIN, 'samples': 4e6, 'stages': with_walls('slopes_mixed_humanoid')},
+            ),
+        },
+    ),
     (
         'PD_Raptor2D_Slopes_Mixed_Terrain-v0',
         {
@@ -410,7 +419,11 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         },
     ),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
-    # After the runs before, falls are at the widest gaps.
+    # After the runs before, falls are at the highest walls and the widest gaps.
+    (
+        'PD_Dog2D_Walls_Terrain-v0',
+        {'further': ({**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid')},)},
+    ),
     ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
     (
         'PD_Raptor2D_Gaps_Terrain-v0',
