@@ -73,16 +73,16 @@ class Settings:
     )  # fmt: skip
 
 
+LARGE_UPDATES = {  # after the value has been learnt at a high rate
+    **OWN, 'samples': 2.5e6, 'gamma': 0.98, 'minibatch': 1024, 'learning_rate': 2e-4,
+    'last_learning_rate': 2e-5, 'value_rate': 1e-3, 'value_goes_on': True,
+}  # fmt: skip
 # With as many simulations over walls as elsewhere the policies of biped and raptor were worst there.
 SETTINGS = {
     'biped2d': Settings(
         twice=('Walls', 'Mixed', 'Slopes_Mixed'),
         each=24,
-        # Large updates, after the value has been learnt at a high rate.
-        ppo={
-            **OWN, 'samples': 2.5e6, 'gamma': 0.98, 'minibatch': 1024, 'learning_rate': 2e-4,
-            'last_learning_rate': 2e-5, 'value_rate': 1e-3, 'value_goes_on': True,
-        },  # fmt: skip
+        ppo=LARGE_UPDATES,
     ),
     'dog2d': Settings(),
     'raptor2d': Settings(twice=('Walls', 'Mixed', 'Slopes_Mixed')),

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from evaluate_footsteps import BELTS, bumps, ramp
 
 from trl_suite import terrain
 
@@ -259,6 +260,52 @@ STAGES = (
         'pushes': {'force': (100, 180), 'duration': (0.2, 0.2), 'interval': (3, 6)},
     }),
 )  # fmt: skip
+
+
+def pushes(least: float, largest: float) -> dict[str, tuple[float, float]]:
+    return {'force': (least, largest), 'duration': (0.2, 0.2), 'interval': (2.0, 4.0)}
+
+
+# Everything at the same time, in equal numbers of simulations, with a cost of landing errors. What
+# only few simulations contain is forgotten, so sharp turns and pushes are part of most conditions.
+FREE = {**VARIED, 'length': (0.2, 0.75), 'turn': 0.2, 'sharp': 0.1}
+BY_ROOT = {**FREE, 'from_root': 1.0, 'root_length': (0.0, 0.7)}
+PLACES = {'plans': {'sharp': 0.05}, 'pushes': pushes(60, 160)}
+CONDITIONS: tuple[dict[str, Any], ...] = (
+    {'plans': {'sharp': 0.15}, 'pushes': pushes(80, 180)},
+    {'plans': {'sharp': 0.2}},
+    {'plans': FREE, 'pushes': pushes(100, 200)},
+    {'plans': {**FREE, 'change': 0.0}, 'pushes': pushes(80, 180)},
+    {'plans': BY_ROOT, 'pushes': pushes(60, 160)},
+    {'plans': {**BY_ROOT, 'root_length': (0.0, 0.1), 'root_turn': 0.6}},
+    {'plans': {'sharp': 0.03}, 'pushes': pushes(140, 260)},
+    {'plans': {'sharp': 0.03}, 'pushes': pushes(60, 160), 'terrain': BELTS},
+    {**PLACES, 'terrain': ramp(0.08)},
+    {**PLACES, 'terrain': bumps(0.06)},
+)
+EVEN = {'length': (0.25, 0.75), 'change': 0.0, 'turn': 0.0, 'sharp': 0.02}
+
+
+def together(conditions: Iterable[dict[str, Any]], **options: Any) -> tuple[Any, ...]:
+    """Returns a stage with all conditions at the same time, and further options in all of them."""
+    common = {'max_landing_error': 0.6, 'grace_period': 2.5, **options}
+    return ((0.0, tuple({**common, **own} for own in conditions)),)
+
+
+ACCURATELY = {
+    'samples': 8e6, 'num_envs': 260, 'minibatch': 1024, 'learning_rate': 1.5e-4,
+    'last_learning_rate': 2e-5, 'start_count': 1e9, 'value_first': 3e5, 'value_rate': 1e-3,
+    'value_goes_on': True, 'stages_averaged': 1, 'evaluate_every': 4e5,
+    'landing_costs': {'landing_error': 20.0, 'heading_error': 5.0},
+    'stages': together(CONDITIONS, footstep_scale=5.0, heading_scale=2.0),
+}  # fmt: skip
+MORE_ACCURATELY = {
+    **ACCURATELY, 'samples': 6e6, 'num_envs': 264, 'gamma': 0.98,
+    'landing_costs': {'landing_error': 30.0, 'heading_error': 6.0},
+    'stages': together(
+        (*CONDITIONS[:4], {'plans': EVEN}, *CONDITIONS[4:]), footstep_scale=15.0, heading_scale=3.0
+    ),
+}  # fmt: skip
 # Running: the environment's plan first, then other lengths and gentle turns, then plans from the
 # root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
@@ -405,9 +452,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {
             **MORE_WALLS_ON_SLOPES,
             'samples': 2e6,
-            'further': (
-                {**AGAIN, 'samples': 4e6, 'stages': with_walls('slopes_mixed_humanoid')},
-            ),
+            'further': ({**AGAIN, 'samples': 4e6, 'stages': with_walls('slopes_mixed_humanoid')},),
         },
     ),
     (
@@ -440,6 +485,12 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
                     'gamma': 0.98,
                     'stages': with_larger('slopes_mixed_humanoid'),
                 },
+                {
+                    **AGAIN,
+                    'samples': 3e6,
+                    'gamma': 0.98,
+                    'stages': with_walls('slopes_mixed_humanoid'),
+                },
             )
         },
     ),
@@ -461,7 +512,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
+    (
+        'PD_Biped3D_LLC_General_Step-v0',
+        {'stages_averaged': 2, 'further': (ACCURATELY, MORE_ACCURATELY)},
+    ),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # The environment mirrors its observation.
