@@ -602,9 +602,9 @@ def solved() -> str:
         ))  # fmt: skip
     said = (
         'Medians over the environments of each family that have a policy, each evaluated with the mean of '
-        'its actions in 50 episodes (`terrainrl`: 200): the return divided by its maximum, the share of '
+        'its actions in 50 episodes (`terrainrl`: up to 200): the return divided by its maximum, the share of '
         'episodes that lasted to the end, and the mean distance. Episodes of `terrainrl` end with a fall '
-        'only.'
+        'or after 5000 gait cycles.'
     )
     header = ('family', 'with a policy', 'return', 'complete', 'distance')
     return f'{textwrap.fill(said, 100)}\n\n{table(header, cells)}'

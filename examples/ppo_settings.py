@@ -78,7 +78,7 @@ class Settings:
     # new environment, but the initial weights may then no longer fit the scales.
     start_count: float = 2e4
     cloned: float = 1e4
-    # Rounds of imitation. After the first round the policy selects the actions, and the baseline
+    # Rounds of imitation. After the first round the policy selects the actions, and the teacher
     # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
     cloning_epochs: int = 30  # of each round, over all labels so far
@@ -357,12 +357,16 @@ GUIDED = {
     'evaluation_episodes': 32,
 }  # fmt: skip
 MOVING = {**GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8}  # m/s
-BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
+ON_BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
 # A goal so large that a kicked ball comes to rest in it, then smaller goals.
 DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
     'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
     'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
+}  # fmt: skip
+DRIBBLING_AGAIN = {
+    'samples': 4e5, 'num_envs': 128, 'minibatch': 512, 'last_learning_rate': 3e-5, 'stages': (),
+    'start_count': 1e6, 'value_first': 2e4, 'value_rate': 1e-3, 'evaluate_every': 8e4,
 }  # fmt: skip
 CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
@@ -525,9 +529,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_Forest-v0', GUIDED),
     ('PD_Biped3D_HLC_DynamicsObstacles-v0', {**MOVING, 'samples': 4e5, 'evaluate_every': 4e4}),
-    ('PD_Biped3D_HLC_Conveyors*', BELTS),
+    ('PD_Biped3D_HLC_Conveyors*', ON_BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
-    ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
+    # Trained again after the further runs of the footstep controller.
+    ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (DRIBBLING_AGAIN,)}),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
 )

@@ -140,7 +140,7 @@ def gait_rows(entries: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def shared_rows() -> list[list[str]]:
-    """Returns the results of policies on terrains on which they were not trained."""
+    """Returns the results of policies that are shipped for further environments."""
     path = resources.directory('trained') / policies.SHARED
     rows = []
     for id_, entry in (json.loads(path.read_text()) if path.exists() else {}).items():
@@ -325,7 +325,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Gaits on other terrains',
-            'Policies on terrains on which they were not trained, by `examples/share_gaits.py`. *Before*: '
+            'Policies that are shipped for further environments, by `examples/share_gaits.py`. *Before*: '
             'the mean of the policy that was replaced, or else of the default gait, in the same episodes. '
             '*Preference*: number that is added to the value of the default gait.',
             table(
