@@ -5,13 +5,14 @@
 
 The specialists are the shipped policies of the eight terrains. A new network imitates them in states
 that it visits itself, DAgger as in `plaid.py` (Ross et al. 2011, arXiv:1011.0686), and is then trained
-with PPO in the environments of all terrains at the same time. The policy has no information about the
-terrain but its observation.
+with PPO in the environments of all terrains at the same time. A third policy has the mean weights of both
+(Wortsman et al. 2022, arXiv:2203.05482). The policy has no information about the terrain but its
+observation.
 
-Writes the better one of the distilled and the trained policy to `trained/generalist/ID.npz`, where ID is
-the character's environment of mixed terrain, makes it the policy of the other terrains, too, in
+Writes the best of the three policies to `trained/generalist/ID.npz`, where ID is the character's
+environment of mixed terrain, makes it the policy of the other terrains, too, in
 `trained/generalist/shared.json`, and writes settings, learning curve, and evaluations of specialists,
-distilled and trained policy to `ID.json`.
+distilled, trained and averaged policy to `ID.json`.
 """
 
 from __future__ import annotations
@@ -174,7 +175,9 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         begin = time.monotonic()
         distilled, policy, curve = train(ids, arguments.seed, settings, folder)
-        made = {'distilled': trimmed(distilled), 'trained': trimmed(policy)}
+        averaged = ppo.mean_of([distilled, policy])
+        found = {'distilled': distilled, 'trained': policy, 'averaged': averaged}
+        made = {kind: trimmed(each) for kind, each in found.items()}
         results = {kind: evaluated(ids, lambda _, p=p: p, EPISODES) for kind, p in made.items()}
         best = max(made, key=lambda kind: mean_score(results[kind]))
         entry = {
@@ -187,7 +190,7 @@ def main() -> None:
         for id_ in ids:
             words = ' '.join(
                 f'{entry[kind][id_]["normalized_return"]:.3f} ({entry[kind][id_]["completion_rate"]:.0%})'
-                for kind in ('specialists', 'distilled', 'trained')
+                for kind in ('specialists', *made)
             )
             print(f'{id_:40} {words}', flush=True)
 

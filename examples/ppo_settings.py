@@ -326,9 +326,9 @@ RUN_STAGES = (
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),)
-STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
-    **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
-    'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
+STEPS_ON = {  # other terrains and plans, from the policy after its further runs
+    **FOOTSTEPS, **ACCURATELY, 'samples': 2e6, 'num_envs': 256, 'value_first': 2e5, 'stages': ACCURATE,
+    'start': 'PD_Biped3D_LLC_General_Step-v0', 'evaluate_every': 2e5,
 }  # fmt: skip
 # In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward
 # alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its

@@ -181,25 +181,31 @@ def fall_rows() -> list[list[str]]:
     return rows
 
 
+# Keys of `trained/generalist/ID.json` with evaluations.
+GENERALISTS = 'specialists', 'distilled', 'trained', 'averaged'
+
+
 def generalist_rows() -> list[list[str]]:
     """Returns the results of the policies for all terrains of a character, and of its specialists."""
     rows = []
     for path in sorted((resources.directory('trained') / 'generalist').glob('PD_*.json')):
         entry = json.loads(path.read_text())
-        kinds, shipped = ('specialists', 'distilled', 'trained'), entry['shipped']
+        shipped = entry['shipped']
+        kinds = [kind for kind in GENERALISTS if kind in entry]  # the newest kind is not in all
+        unknown = ['–'] * (len(GENERALISTS) - len(kinds))
         for id_ in entry['ids']:
             each = {kind: entry[kind][id_] for kind in kinds}
             cells = [
                 f'{r["normalized_return"]:.3f} ({r["completion_rate"]:.0%})' for r in each.values()
             ]
             share = each[shipped]['return'] / each['specialists']['return']
-            rows.append([f'`{id_}`', *cells, f'{share:.2f}'])
+            rows.append([f'`{id_}`', *cells, *unknown, f'{share:.2f}'])
         means = {
             kind: np.mean([entry[kind][id_]['normalized_return'] for id_ in entry['ids']])
             for kind in kinds
         }
         share = means[shipped] / means['specialists']
-        rows.append(['mean', *(f'{mean:.3f}' for mean in means.values()), f'{share:.2f}'])
+        rows.append(['mean', *(f'{mean:.3f}' for mean in means.values()), *unknown, f'{share:.2f}'])
     return rows
 
 
@@ -372,9 +378,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             '## One policy for all terrains',
             'Policies of `examples/generalist.py` (`--policy generalist`): return, divided by the maximum, and '
             'in brackets the share of complete episodes, of the specialists of the terrains, of the policy '
-            'that was distilled from them, and of the same policy after PPO on all terrains; 200 episodes, '
-            'seed 0. *Share*: that of the better one, which is shipped, divided by that of the specialist.',
-            table(('environment', 'specialist', 'distilled', 'after PPO', 'share'), rows),
+            'that was distilled from them, of the same policy after PPO on all terrains, and of the policy '
+            'with the mean weights of both; 200 episodes, seed 0. *Share*: that of the best one, which is '
+            'shipped, divided by that of the specialist.',
+            table(
+                ('environment', 'specialist', 'distilled', 'after PPO', 'mean weights', 'share'),
+                rows,
+            ),
         ]
     rows = footstep_rows()
     if rows:
