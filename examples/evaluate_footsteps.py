@@ -118,6 +118,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('policy', nargs='?', help='.npz file; the reference policy by default')
     parser.add_argument('--id', default=ID)
+    parser.add_argument(
+        '--variant', default='', choices=('', *policies.VARIANTS), help='of the reference policy'
+    )
     parser.add_argument('--filter', nargs='+', choices=CONDITIONS, default=list(CONDITIONS))
     parser.add_argument('--episodes', type=int, default=100)
     parser.add_argument('--seed', type=int, default=0)
@@ -127,7 +130,7 @@ def main() -> None:
     policy = (
         policies.load(arguments.policy)
         if arguments.policy
-        else suite.reference_policy(arguments.id)
+        else suite.reference_policy(arguments.id, arguments.variant)
     )
     found = {}
     for name in arguments.filter:

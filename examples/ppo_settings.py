@@ -266,8 +266,9 @@ def pushes(least: float, largest: float) -> dict[str, tuple[float, float]]:
     return {'force': (least, largest), 'duration': (0.2, 0.2), 'interval': (2.0, 4.0)}
 
 
-# Everything at the same time, in equal numbers of simulations, with a cost of landing errors. What
-# only few simulations contain is forgotten, so sharp turns and pushes are part of most conditions.
+# For the variant 'accurate': everything at the same time, in equal numbers of simulations, with a cost
+# of landing errors. What only few simulations contain is forgotten, so sharp turns and pushes are part
+# of most conditions.
 FREE = {**VARIED, 'length': (0.2, 0.75), 'turn': 0.2, 'sharp': 0.1}
 BY_ROOT = {**FREE, 'from_root': 1.0, 'root_length': (0.0, 0.7)}
 PLACES = {'plans': {'sharp': 0.05}, 'pushes': pushes(60, 160)}
@@ -296,6 +297,7 @@ ACCURATELY = {
     'samples': 8e6, 'num_envs': 260, 'minibatch': 1024, 'learning_rate': 1.5e-4,
     'last_learning_rate': 2e-5, 'start_count': 1e9, 'value_first': 3e5, 'value_rate': 1e-3,
     'value_goes_on': True, 'stages_averaged': 1, 'evaluate_every': 4e5,
+    'start': 'PD_Biped3D_LLC_General_Step-v0',
     'landing_costs': {'landing_error': 20.0, 'heading_error': 5.0},
     'stages': together(CONDITIONS, footstep_scale=5.0, heading_scale=2.0),
 }  # fmt: skip
@@ -326,9 +328,9 @@ RUN_STAGES = (
 FOOTSTEPS = {'samples': WALKER, 'gamma': 0.97, 'stages': STAGES, 'averaged': 5e5}
 SHORTER = {'samples': 2e6, 'stages': evenly([options for _, options in STAGES[:3]])}
 ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_error': 0.6}),)
-STEPS_ON = {  # other terrains and plans, from the policy after its further runs
-    **FOOTSTEPS, **ACCURATELY, 'samples': 2e6, 'num_envs': 256, 'value_first': 2e5, 'stages': ACCURATE,
-    'start': 'PD_Biped3D_LLC_General_Step-v0', 'evaluate_every': 2e5,
+STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
+    **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
 # In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward
 # alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its
@@ -363,10 +365,6 @@ DRIBBLING = {
     'samples': 1e6, 'num_envs': 64, 'minibatch': 256, 'gamma': 0.97, 'kl_per_action': 0.006,
     'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
     'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
-}  # fmt: skip
-DRIBBLING_AGAIN = {
-    'samples': 4e5, 'num_envs': 128, 'minibatch': 512, 'last_learning_rate': 3e-5, 'stages': (),
-    'start_count': 1e6, 'value_first': 2e4, 'value_rate': 1e-3, 'evaluate_every': 8e4,
 }  # fmt: skip
 CYCLES = {  # a step is a gait cycle of 0.3 to 0.6 s: few samples, each with much simulation
     'samples': 6e4, 'horizon': 16, 'minibatch': 128, 'learning_rate': 1e-4, 'gamma': 0.9,
@@ -449,7 +447,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {'samples': 5e6, 'num_envs': 256, 'minibatch': 1024, 'stages': HIGHER},
     ),
     # After these runs nine of ten falls of dog and raptor are at walls.
-    ('PD_Dog2D_Mixed_Terrain-v0', {'further': (MORE_WALLS, WALLS_AGAIN)}),
+    (
+        'PD_Dog2D_Mixed_Terrain-v0',
+        {'further': (MORE_WALLS, WALLS_AGAIN, {**WALLS_AGAIN, 'samples': 3e6})},
+    ),
     ('PD_Raptor2D_Mixed_Terrain-v0', {'further': (MORE_WALLS,)}),
     (
         'PD_Dog2D_Slopes_Mixed_Terrain-v0',
@@ -516,10 +517,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    (
-        'PD_Biped3D_LLC_General_Step-v0',
-        {'stages_averaged': 2, 'further': (ACCURATELY, MORE_ACCURATELY)},
-    ),
+    ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
     *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
     # The environment mirrors its observation.
@@ -531,8 +529,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_HLC_DynamicsObstacles-v0', {**MOVING, 'samples': 4e5, 'evaluate_every': 4e4}),
     ('PD_Biped3D_HLC_Conveyors*', ON_BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
-    # Trained again after the further runs of the footstep controller.
-    ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (DRIBBLING_AGAIN,)}),
+    ('PD_Biped3D_HLC_Soccer-v0', DRIBBLING),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
 )
@@ -576,6 +573,12 @@ def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """Returns the settings of an environment."""
     return Settings(**{**matching(id_, OVERRIDES), **changes})
+
+
+def accurate_settings(**changes: Any) -> Settings:
+    """Returns the settings of the footstep controller of the variant 'accurate'."""
+    own = {**ACCURATELY, 'further': (MORE_ACCURATELY,), **changes}
+    return settings_for('PD_Biped3D_LLC_General_Step-v0', **own)
 
 
 def randomized_settings_for(id_: str, **changes: Any) -> Settings:
