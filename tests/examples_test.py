@@ -25,12 +25,14 @@ import checkpoints
 import compare_actions
 import compare_hierarchy
 import compare_transfer
+import evaluate_footsteps
 import evaluate_plans
 import expert
 import generalist
 import ppo
 import ppo_settings
 import share_gaits
+import train_accurate
 import train_all
 import train_randomized
 import tune_base_actions
@@ -443,6 +445,54 @@ class GeneralistTest(FolderTest):
             self.assertGreater(own, 0.9 * entry['specialists'][id_]['return'])
             again = evaluation.evaluate(id_, policy, 8, 1)
             self.assertAlmostEqual(again['return'] / own, 1, delta=0.05)
+
+
+class AccurateTest(FolderTest):
+    """The footstep controller that lands more accurately."""
+
+    def test_a_short_run_continues_and_is_entered(self):
+        words = ['train_accurate.py', '--samples', '9000', '--runs', str(self.folder / 'runs')]
+        shipped = policies.reference(train_accurate.ID)
+        tiny = {
+            'num_envs': 20, 'horizon': 8, 'minibatch': 80, 'evaluate_every': 1e4, 'evaluation_episodes': 2,
+        }  # fmt: skip
+        first = {**ppo_settings.ACCURATELY, **tiny}
+        second = {**ppo_settings.MORE_ACCURATELY, **tiny, 'num_envs': 22}
+        trained = str(self.folder / 'trained')
+        with (
+            mock.patch.object(ppo_settings, 'ACCURATELY', first),
+            mock.patch.object(ppo_settings, 'MORE_ACCURATELY', second),
+            mock.patch.object(policies, 'reference', lambda *_: shipped),
+            mock.patch.object(train_all, 'EPISODES', 1),
+            mock.patch.dict(os.environ, {'TRL_SUITE_TRAINED': trained}),
+            mock.patch.object(sys, 'argv', words),
+            contextlib.redirect_stdout(io.StringIO()) as output,
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            train_accurate.main()
+            entry = json.loads(train_accurate.place().read_text())
+            policy = policies.load(train_accurate.place().with_suffix('.npz'))
+        self.assertIn('of the maximum', output.getvalue())
+        self.assertGreaterEqual(policy.info['samples'], 18000)
+        self.assertEqual(entry['shipped_at'], policy.info['samples'])
+
+    def test_what_is_shipped_lands_closer_to_the_plan(self):
+        """With steps of 0.3 m within a third of the error of the controller it started from."""
+        if train_accurate.ID not in policies.available('accurate'):
+            self.skipTest('no policy is shipped')
+        entry = json.loads(train_accurate.place().read_text())
+        settings = ppo_settings.accurate_settings()
+        self.assertEqual(entry['settings'], json.loads(json.dumps(dataclasses.asdict(settings))))
+        row = evaluate_footsteps.row_for(train_accurate.ID, None)
+        options = evaluate_footsteps.CONDITIONS['straight, 0.3 m']
+        before, after = (
+            evaluate_footsteps.run(
+                row, policies.reference(train_accurate.ID, variant), 6, 1, 5.0, **options
+            )
+            for variant in ('', 'accurate')
+        )
+        self.assertEqual(after['survived'], 1.0)
+        self.assertLess(after['landing'], before['landing'] / 3)
 
 
 class PageTest(absltest.TestCase):
