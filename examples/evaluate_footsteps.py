@@ -127,6 +127,8 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=SECONDS)
     parser.add_argument('--json', type=pathlib.Path)
     arguments = parser.parse_args()
+    if arguments.policy and arguments.variant:
+        parser.error('give either a file or --variant, not both')
     policy = (
         policies.load(arguments.policy)
         if arguments.policy

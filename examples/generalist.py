@@ -49,7 +49,7 @@ RESULTS = (
 
 
 # The first control steps of PPO only train the value, as after the start from a policy.
-OWN = {
+COMMON = {
     'hidden': (512, 256), 'gamma': 0.97, 'stages': (), 'averaged': 3e5,
     'start': 'expert', 'value_first': 2e5,
 }  # fmt: skip
@@ -66,7 +66,7 @@ class Settings:
     twice: tuple[str, ...] = ('Mixed', 'Slopes_Mixed')  # terrains with twice as many
     ppo: dict[str, Any] = dataclasses.field(
         default_factory=lambda: {
-            **OWN, 'samples': 1e6,
+            **COMMON, 'samples': 1e6,
             # With large updates it forgets faster than it learns.
             'horizon': 64, 'minibatch': 1024, 'learning_rate': 5e-5, 'last_learning_rate': 2e-5,
             'kl_per_action': 0.001,
@@ -75,16 +75,12 @@ class Settings:
 
 
 LARGE_UPDATES = {  # after the value has been learnt at a high rate
-    **OWN, 'samples': 2.5e6, 'gamma': 0.98, 'minibatch': 1024, 'learning_rate': 2e-4,
+    **COMMON, 'samples': 2.5e6, 'gamma': 0.98, 'minibatch': 1024, 'learning_rate': 2e-4,
     'last_learning_rate': 2e-5, 'value_rate': 1e-3, 'value_goes_on': True,
 }  # fmt: skip
 # With as many simulations over walls as elsewhere the policies of biped and raptor were worst there.
 SETTINGS = {
-    'biped2d': Settings(
-        twice=('Walls', 'Mixed', 'Slopes_Mixed'),
-        each=24,
-        ppo=LARGE_UPDATES,
-    ),
+    'biped2d': Settings(twice=('Walls', 'Mixed', 'Slopes_Mixed'), each=24, ppo=LARGE_UPDATES),
     'dog2d': Settings(),
     'raptor2d': Settings(twice=('Walls', 'Mixed', 'Slopes_Mixed')),
 }

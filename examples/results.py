@@ -397,8 +397,12 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'each plan is relative to position and heading of the root, as in the high-level environments; *pushes*: forces '
             'on the torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
             table(columns, rows),
+        ]
+    rows = footstep_rows('accurate')
+    if rows:
+        parts += [
             'The same controller after further training (`--policy accurate`):',
-            table(columns, footstep_rows('accurate')),
+            table(columns, rows),
         ]
     for tag, title, words in PLANS:
         rows = plan_rows(tag)
