@@ -387,6 +387,7 @@ AGAIN = {
 MORE_WALLS = {**MORE, 'stages': with_walls('mixed_humanoid')}
 MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
 WALLS_AGAIN = {**AGAIN, 'samples': 2e6, 'stages': with_walls('mixed_humanoid')}
+LARGER_WALLS = {**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid')}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
@@ -470,10 +471,8 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
     # After the runs before, falls are at the highest walls and the widest gaps.
-    (
-        'PD_Dog2D_Walls_Terrain-v0',
-        {'further': ({**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid')},)},
-    ),
+    ('PD_Dog2D_Walls_Terrain-v0', {'further': (LARGER_WALLS,)}),
+    ('PD_Biped2D_Walls_Terrain-v0', {'further': ({**LARGER_WALLS, 'gamma': 0.98},)}),
     ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
     (
         'PD_Raptor2D_Gaps_Terrain-v0',
