@@ -1,26 +1,31 @@
 """Measures whether other actions could have prevented the falls of a policy that tracks a clip.
 
     python examples/oracle_falls.py PD_Raptor2D_Mixed_Terrain-v0 --falls 32
+    python examples/oracle_falls.py PD_Biped3D_LLC_General_Step-v0 --condition 'pushes of 250 N'
 
 The policy runs until it falls. From the states `BACK` seconds before, it runs again with noise in its
 actions until the time of the fall, then without; each noise value lasts `HOLD` control steps. Noise
-prevents the fall if the character gets `PASSED` metres beyond the place of the fall. If few falls can
+prevents the fall if the character gets `PASSED` metres beyond the place of the fall, or, in a condition of
+`evaluate_footsteps.py`, if it has not fallen `AFTER` seconds after the time of the fall. If few falls can
 be prevented, the clip or the torque limits are the limit, or the noise is not what is needed; if many
 can, learning is. Noise of standard deviation `CHANCE`, which is no other behaviour, is tried as well,
 to tell bad luck from wrong actions.
 
-Writes `trained/oracle_falls.json`: ID -> settings and, for each standard deviation of the noise and each
-time before the end, the share of falls that some noise prevents, and the mean share of tries that do.
+Writes `trained/oracle_falls.json`: ID, or 'ID: condition' -> settings and, for each standard deviation of
+the noise and each time before the end, the share of falls that some noise prevents, and the mean share of
+tries that do.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import oracle_gaits
 import tqdm
+from evaluate_footsteps import CONDITIONS, row_for
 from oracle_gaits import position
 
 from trl_suite import policies
@@ -39,7 +44,7 @@ STDS = (CHANCE, 0.15, 0.5)  # standard deviations of the noise, in units of the 
 def prevented(
     copies: VectorEnvironment,
     states: Sequence[dict[str, Any]],
-    place: float,
+    place: float | None,
     noise: np.ndarray,
     after: int,
     policy: policies.Policy,
@@ -49,7 +54,7 @@ def prevented(
     Args:
       copies: environments of this kind, m.
       states: the states from which the policy runs, m.
-      place: place of the fall, m.
+      place: place of the fall, m; None: not to fall is enough.
       noise: added to the actions until the time of the fall, (steps, m, a).
       after: further control steps.
       policy: the policy.
@@ -68,25 +73,30 @@ def prevented(
             action = np.clip(action + noise[i], -1, 1)
         step = copies.step(action, going)
         going &= ~step.terminated
-        passed |= going & (position(copies) > place + PASSED)
-        going &= ~passed
+        if place is not None:
+            passed |= going & (position(copies) > place + PASSED)
+            going &= ~passed
         if not going.any():
             break
         observation = step.observation
-    return passed
+    return going if place is None else passed
 
 
 def measure(
-    id_: str, policy: policies.Policy, number: int, tries: int, seed: int
+    id_: str, policy: policies.Policy, number: int, tries: int, seed: int, condition: str = ''
 ) -> dict[str, Any]:
     """Returns the results for a number of falls, as they are stored."""
     rng = np.random.default_rng(seed)
-    options: dict[str, Any] = {'autoreset': 'disabled', 'step_limit': None}
-    environments = VectorEnvironment(id_, number, 1, seed, **options)
+    task_options = dict(CONDITIONS[condition]) if condition else {}
+    row = row_for(id_, task_options.pop('terrain', None)) if condition else id_
+    options: dict[str, Any] = {
+        'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': task_options,
+    }  # fmt: skip
+    environments = VectorEnvironment(row, number, 1, seed, **options)
     rate = 1 / environments.control_timestep
     backs = [round(seconds * rate) for seconds in BACK]
     past, places = oracle_gaits.falls(environments, policy, max(backs))
-    copies = VectorEnvironment(id_, tries * len(STDS), 1, seed, **options)
+    copies = VectorEnvironment(row, tries * len(STDS), 1, seed, **options)
     copies.reset()
     std = np.repeat(STDS, tries)[:, None]
     found = np.zeros((number, len(backs), len(STDS), tries), bool)
@@ -95,7 +105,9 @@ def measure(
             shape = -(-back // HOLD), copies.num_envs, len(copies.action_map)
             noise = std * rng.standard_normal(shape).repeat(HOLD, axis=0)[:back]
             states = [past[i][back - 1]] * copies.num_envs
-            passed = prevented(copies, states, float(place), noise, round(AFTER * rate), policy)
+            passed = prevented(
+                copies, states, None if condition else float(place), noise, round(AFTER * rate), policy
+            )
             found[i, j] = passed.reshape(len(STDS), tries)
     some = found.any(3)
     return {
@@ -113,9 +125,13 @@ def measure(
 
 
 def main() -> None:
-    arguments = oracle_gaits.parser(__doc__.splitlines()[0], 32, 32, 'of each noise').parse_args()
-    path = resources.directory('trained') / 'oracle_falls.json'
-    oracle_gaits.measure_all(path, arguments, measure)
+    parser = oracle_gaits.parser(__doc__.splitlines()[0], 32, 32, 'of each noise')
+    parser.add_argument('--condition', choices=CONDITIONS, default='', help='of a footstep controller')
+    arguments = parser.parse_args()
+    path, condition = resources.directory('trained') / 'oracle_falls.json', arguments.condition
+    oracle_gaits.measure_all(
+        path, arguments, functools.partial(measure, condition=condition), condition
+    )
 
 
 if __name__ == '__main__':

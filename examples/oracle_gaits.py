@@ -176,7 +176,10 @@ def measure(
 
 
 def measure_all(
-    path: pathlib.Path, arguments: argparse.Namespace, measured: Callable[..., dict[str, Any]]
+    path: pathlib.Path,
+    arguments: argparse.Namespace,
+    measured: Callable[..., dict[str, Any]],
+    condition: str = '',
 ) -> None:
     """Measures the policies of environments, and enters the results into a JSON file."""
     for name in arguments.ids:
@@ -186,7 +189,8 @@ def measure_all(
         found['cpu_seconds'] = round(time.process_time() - begin)
         print(id_, json.dumps(found), flush=True)
         stored = json.loads(path.read_text()) if path.exists() else {}
-        files.write_json(dict(sorted({**stored, id_: found}.items())), path)
+        key = f'{id_}: {condition}' if condition else id_
+        files.write_json(dict(sorted({**stored, key: found}.items())), path)
 
 
 def parser(description: str, falls: int, tries: int, of: str) -> argparse.ArgumentParser:

@@ -10,11 +10,13 @@ from trl_suite import policies
 from trl_suite.vector import VectorEnvironment
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
+import evaluate_footsteps
 import oracle_falls
 import oracle_gaits
 
 RAPTOR = 'PD_Raptor2D_Slopes_Mixed_Terrain-v0'  # its policy falls often
 HOPPER = 'FSM_Hopper2D_Terrain_Gaps-v0'
+FOOTSTEPS = 'PD_Biped3D_LLC_General_Step-v0'
 
 
 class OracleTest(absltest.TestCase):
@@ -81,6 +83,23 @@ class OracleTest(absltest.TestCase):
             for nearer, expected in ((0.0, False), (1e3, True)):
                 found = oracle_falls.prevented(
                     copies, [each[-1]] * 2, place - nearer, none, 60, policy
+                )
+                self.assertEqual(found.tolist(), [expected] * 2)
+
+    def test_a_footstep_controller_falls_again_after_the_same_push(self):
+        condition = evaluate_footsteps.CONDITIONS['pushes of 250 N']
+        policy = policies.reference(FOOTSTEPS)
+        options = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': condition}
+        row = evaluate_footsteps.row_for(FOOTSTEPS, None)
+        environments = VectorEnvironment(row, 2, 1, 0, **options)
+        past, _ = oracle_gaits.falls(environments, policy, 15)
+        copies = VectorEnvironment(row, 2, 1, 1, **options)
+        copies.reset()
+        none = np.zeros((15, 2, len(copies.action_map)))
+        for each in past:
+            for steps, expected in ((14, True), (15, False)):  # of the 15 until the fall
+                found = oracle_falls.prevented(
+                    copies, [each[-1]] * 2, None, none[:steps], 0, policy
                 )
                 self.assertEqual(found.tolist(), [expected] * 2)
 
