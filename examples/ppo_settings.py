@@ -473,7 +473,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     # After the runs before, falls are at the highest walls and the widest gaps.
     ('PD_Dog2D_Walls_Terrain-v0', {'further': (LARGER_WALLS,)}),
     ('PD_Biped2D_Walls_Terrain-v0', {'further': ({**LARGER_WALLS, 'gamma': 0.98},)}),
-    ('PD_Dog2D_Gaps_Terrain-v0', {'further': ({**MORE, 'stages': with_larger('gaps_humanoid')},)}),
+    (
+        'PD_Dog2D_Gaps_Terrain-v0',
+        {'further': tuple({**own, 'stages': with_larger('gaps_humanoid')} for own in (MORE, AGAIN))},
+    ),
     (
         'PD_Raptor2D_Gaps_Terrain-v0',
         {'further': ({**AGAIN, 'stages': with_larger('gaps_humanoid')},)},
