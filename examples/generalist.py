@@ -81,7 +81,7 @@ LARGE_UPDATES = {  # after the value has been learnt at a high rate
 # With as many simulations over walls as elsewhere the policies of biped and raptor were worst there.
 SETTINGS = {
     'biped2d': Settings(twice=('Walls', 'Mixed', 'Slopes_Mixed'), each=24, ppo=LARGE_UPDATES),
-    'dog2d': Settings(),
+    'dog2d': Settings(each=24, ppo=LARGE_UPDATES),
     'raptor2d': Settings(twice=('Walls', 'Mixed', 'Slopes_Mixed')),
 }
 

@@ -641,16 +641,20 @@ def train(
     With `further` settings each run has its own subfolder, and the curve is that of all runs.
 
     Raises:
-      ValueError: the checkpoint is damaged, or has other settings.
+      ValueError: the checkpoint is damaged, or has other settings; a mean over more runs than there are.
       RuntimeError: another process trains in the folder.
     """
+    runs = [
+        dataclasses.replace(settings, **{'further': (), 'runs_averaged': 1, **changes})
+        for changes in ({}, *settings.further)
+    ]
+    if not 1 <= settings.runs_averaged <= len(runs):
+        raise ValueError(
+            f'runs_averaged: {settings.runs_averaged}; expected 1 to {len(runs)}, the number of runs'
+        )
     with checkpoints.only_run(folder):
         if not settings.further:
             return _train(id_, seed, settings, folder, threads, progress)
-        runs = [
-            dataclasses.replace(settings, **{'further': (), **changes})
-            for changes in ({}, *settings.further)
-        ]
         curve: list[dict[str, Any]] = []
         initial = None
         for i, own in enumerate(runs):
@@ -660,8 +664,10 @@ def train(
             points = _train(id_, seed, own, part, threads, progress, initial)
             curve += [continued(point, before) for point in points]
             initial = policies.load(part / 'last.npz')
-        for name in ('policy.npz', 'last.npz'):
-            policy = policies.load(part / name)
+        ends = [folder / f'run_{i + 1}' / 'last.npz' for i in range(len(runs))]
+        last = mean_of([policies.load(end) for end in ends[-settings.runs_averaged :]])
+        best = policies.load(part / 'policy.npz')
+        for name, policy in (('policy.npz', best), ('last.npz', last)):
             info = {**policy.info, **continued({'samples': policy.info['samples']}, before)}
             policies.save(dataclasses.replace(policy, info=info), folder / name)
         checkpoints.write_curve(folder, id_, seed, settings, threads, curve)

@@ -90,6 +90,8 @@ class Settings:
     # Changes of these settings in further runs, each of which starts from the policy of the one
     # before. The samples of these runs are those of the changes.
     further: tuple[dict[str, Any], ...] = ()
+    # The final policy has the mean weights of the policies of this number of last runs.
+    runs_averaged: int = 1
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
@@ -308,6 +310,23 @@ MORE_ACCURATELY = {
         (*CONDITIONS[:4], {'plans': EVEN}, *CONDITIONS[4:]), footstep_scale=15.0, heading_scale=3.0
     ),
 }  # fmt: skip
+# After stronger pushes a landing error is no failure; more simulations turn about and stand on belts.
+STRONG = {'pushes': pushes(140, 270), 'max_landing_error': 1.5}
+MORE_STABLY = {
+    **MORE_ACCURATELY, 'samples': 8e6, 'num_envs': 300,
+    'landing_costs': {'landing_error': 25.0, 'heading_error': 6.0},
+    'stages': together(
+        (
+            *CONDITIONS[:4], {'plans': EVEN}, *CONDITIONS[4:6],
+            {'plans': {**BY_ROOT, 'root_turn': 0.6}, 'pushes': pushes(60, 160)},
+            {**STRONG, 'plans': {'sharp': 0.03}},
+            {**STRONG, 'plans': FREE},
+            {**STRONG, 'plans': {'sharp': 0.05}, 'pushes': pushes(100, 250)},
+            *CONDITIONS[7:], {'plans': {'sharp': 0.03}, 'terrain': BELTS},
+        ),
+        footstep_scale=15.0, heading_scale=3.0,
+    ),
+}  # fmt: skip
 # Running: the environment's plan first, then other lengths and gentle turns, then plans from the
 # root.
 RUN_PLANS = {'length': (1.0, 1.25), 'width': (0.1, 0.2), 'change': 1.0, 'sharp': 0.0}
@@ -387,6 +406,7 @@ AGAIN = {
 MORE_WALLS = {**MORE, 'stages': with_walls('mixed_humanoid')}
 MORE_WALLS_ON_SLOPES = {**MORE, 'stages': with_walls('slopes_mixed_humanoid')}
 WALLS_AGAIN = {**AGAIN, 'samples': 2e6, 'stages': with_walls('mixed_humanoid')}
+WALLS_ON_SLOPES_AGAIN = {**AGAIN, 'stages': with_walls('slopes_mixed_humanoid')}
 LARGER_WALLS = {**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid')}
 # With this discount a policy learns to step in place in front of a wall, unless that ends the
 # episode.
@@ -458,7 +478,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {
             **MORE_WALLS_ON_SLOPES,
             'samples': 2e6,
-            'further': ({**AGAIN, 'samples': 4e6, 'stages': with_walls('slopes_mixed_humanoid')},),
+            'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 4e6}, WALLS_ON_SLOPES_AGAIN),
         },
     ),
     (
@@ -466,7 +486,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
         {
             **MORE_WALLS_ON_SLOPES,
             'samples': 4e6,
-            'further': ({**WALLS_AGAIN, 'stages': with_walls('slopes_mixed_humanoid')},),
+            'further': ({**WALLS_ON_SLOPES_AGAIN, 'samples': 2e6},),
         },
     ),
     ('PD_Raptor2D_Slopes_Terrain-v0', {'further': ({**MORE, 'samples': 2e6},)}),
@@ -492,12 +512,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
                     'gamma': 0.98,
                     'stages': with_larger('slopes_mixed_humanoid'),
                 },
-                {
-                    **AGAIN,
-                    'samples': 3e6,
-                    'gamma': 0.98,
-                    'stages': with_walls('slopes_mixed_humanoid'),
-                },
+                {**WALLS_ON_SLOPES_AGAIN, 'gamma': 0.98},
             )
         },
     ),
@@ -579,7 +594,8 @@ def settings_for(id_: str, **changes: Any) -> Settings:
 
 def accurate_settings(**changes: Any) -> Settings:
     """Returns the settings of the footstep controller of the variant 'accurate'."""
-    own = {**ACCURATELY, 'further': (MORE_ACCURATELY,), **changes}
+    further = (MORE_ACCURATELY, MORE_STABLY)
+    own = {**ACCURATELY, 'further': further, 'runs_averaged': 2, **changes}
     return settings_for('PD_Biped3D_LLC_General_Step-v0', **own)
 
 

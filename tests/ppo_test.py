@@ -558,6 +558,24 @@ class RunTest(parameterized.TestCase):
         self.assertLen(record['curve'], 3)
         self.assertEqual(self.train('all', samples=128, further=further), found)
 
+    def test_policies_of_the_last_runs_are_averaged(self):
+        further = {'value_first': 0.0}, {'value_first': 0.0}
+        found = self.train('all', samples=128, further=further, runs_averaged=2)
+        two, three, mean = (
+            policies.load(self.folder / 'all' / f'{name}.npz')
+            for name in ('run_2/last', 'run_3/last', 'last')
+        )
+        for a, b, c in zip(two.weights, three.weights, mean.weights, strict=True):
+            self.assertFalse(np.array_equal(a, b))
+            np.testing.assert_allclose(c, (a + b) / 2, rtol=1e-5, atol=1e-7)
+        self.assertEqual(mean.info['samples'], found[-1]['samples'])
+
+    @parameterized.parameters(0, 3)
+    def test_mean_over_more_runs_than_exist_is_rejected(self, number):
+        with self.assertRaisesRegex(ValueError, f'runs_averaged: {number}; expected 1 to 2'):
+            self.train('all', further=({},), runs_averaged=number)
+        self.assertEmpty([path for path in self.folder.rglob('*') if path.suffix])
+
     def test_further_settings_are_checked_before_the_first_run(self):
         with self.assertRaisesRegex(TypeError, "unexpected keyword argument 'sample'"):
             self.train('all', further=({'sample': 128},))
