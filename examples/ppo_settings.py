@@ -268,8 +268,8 @@ def pushes(least: float, largest: float) -> dict[str, tuple[float, float]]:
     return {'force': (least, largest), 'duration': (0.2, 0.2), 'interval': (2.0, 4.0)}
 
 
-# For the variant 'accurate': everything at the same time, in equal numbers of simulations, with a cost
-# of landing errors. What only few simulations contain is forgotten, so sharp turns and pushes are part
+# After these stages everything at the same time, in equal numbers of simulations, with a cost of
+# landing errors. What only few simulations contain is forgotten, so sharp turns and pushes are part
 # of most conditions.
 FREE = {**VARIED, 'length': (0.2, 0.75), 'turn': 0.2, 'sharp': 0.1}
 BY_ROOT = {**FREE, 'from_root': 1.0, 'root_length': (0.0, 0.7)}
@@ -299,7 +299,6 @@ ACCURATELY = {
     'samples': 8e6, 'num_envs': 260, 'minibatch': 1024, 'learning_rate': 1.5e-4,
     'last_learning_rate': 2e-5, 'start_count': 1e9, 'value_first': 3e5, 'value_rate': 1e-3,
     'value_goes_on': True, 'stages_averaged': 1, 'evaluate_every': 4e5,
-    'start': 'PD_Biped3D_LLC_General_Step-v0',
     'landing_costs': {'landing_error': 20.0, 'heading_error': 5.0},
     'stages': together(CONDITIONS, footstep_scale=5.0, heading_scale=2.0),
 }  # fmt: skip
@@ -350,6 +349,14 @@ ACCURATE = ((0.0, {'footstep_scale': 5.0, 'heading_scale': 3.0, 'max_landing_err
 STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgetting
     **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
+}  # fmt: skip
+# Up and down the steps of a trail, in two runs.
+ON_TRAILS = {
+    **ACCURATELY, 'samples': 4e6, 'num_envs': 256, 'gamma': 0.98, 'averaged': 5e5,
+    'start': 'PD_Biped3D_LLC_General_Step-v0',
+    'landing_costs': {'landing_error': 10.0, 'heading_error': 3.0},
+    'stages': ((0.0, {'footstep_scale': 3.0, 'heading_scale': 2.0, 'max_landing_error': 1.0}),),
+    'further': ({},),
 }  # fmt: skip
 # In the plane: the environment's plan, then all lengths, with increasing accuracy. With the reward
 # alone the biped would walk a quarter of a metre ahead of the plan, as the reference with its
@@ -534,9 +541,17 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Imitate-Run-v0', {'samples': 1.5e6, **RUNS, **ENOUGH}),
     ('PD_Biped3D_Imitate-Track-v0', {'mirrored': False}),  # it does not observe the phase
     ('*_Biped3D_*_Step*', FOOTSTEPS),
-    ('PD_Biped3D_LLC_General_Step-v0', {'stages_averaged': 2}),
+    (
+        'PD_Biped3D_LLC_General_Step-v0',
+        {
+            'stages_averaged': 2,
+            'further': (ACCURATELY, MORE_ACCURATELY, MORE_STABLY),
+            'runs_averaged': 2,
+        },
+    ),
     ('PD_Biped3D_LLC_Run_FootStep-v0', RUN_STEPS),
-    *((f'PD_Biped3D_LLC_{name}_Step-v0', STEPS_ON) for name in ('Bumps', 'Trail')),
+    ('PD_Biped3D_LLC_Bumps_Step-v0', STEPS_ON),
+    ('PD_Biped3D_LLC_Trail_Step-v0', ON_TRAILS),
     # The environment mirrors its observation.
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
@@ -558,7 +573,8 @@ PRESET = 'harsh'
 CONTINUED = {
     'samples': 0.6e6, 'averaged': 5e4, 'learning_rate': 1.5e-4, 'last_learning_rate': 2e-5,
     'start_count': 1e6, 'value_first': 4e4, 'value_goes_on': True, 'least_share': {},
-    'stages_averaged': 1, 'further': (), 'enough': np.inf, 'evaluation_episodes': 64,
+    'stages_averaged': 1, 'further': (), 'runs_averaged': 1, 'enough': np.inf,
+    'evaluation_episodes': 64,
 }  # fmt: skip
 FEWER = {'samples': 2.5e5, 'value_first': 2e4, 'evaluate_every': 5e4, 'evaluation_episodes': 32}
 RANDOMIZED: dict[str, dict[str, Any]] = {
@@ -590,13 +606,6 @@ def matching(id_: str, rows: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, 
 def settings_for(id_: str, **changes: Any) -> Settings:
     """Returns the settings of an environment."""
     return Settings(**{**matching(id_, OVERRIDES), **changes})
-
-
-def accurate_settings(**changes: Any) -> Settings:
-    """Returns the settings of the footstep controller of the variant 'accurate'."""
-    further = (MORE_ACCURATELY, MORE_STABLY)
-    own = {**ACCURATELY, 'further': further, 'runs_averaged': 2, **changes}
-    return settings_for('PD_Biped3D_LLC_General_Step-v0', **own)
 
 
 def randomized_settings_for(id_: str, **changes: Any) -> Settings:

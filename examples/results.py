@@ -209,8 +209,8 @@ def generalist_rows() -> list[list[str]]:
     return rows
 
 
-def footstep_rows(variant: str) -> list[list[str]]:
-    path = resources.directory('trained') / variant / 'footsteps.json'
+def footstep_rows() -> list[list[str]]:
+    path = resources.directory('trained') / 'footsteps.json'
     if not path.exists():
         return []
     return [
@@ -386,7 +386,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                 rows,
             ),
         ]
-    rows = footstep_rows('')
+    rows = footstep_rows()
     columns = 'condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'
     if rows:
         parts += [
@@ -396,12 +396,6 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'a foot lands. *General*: the plans of the environment, with sharp turns; *made from the root*: '
             'each plan is relative to position and heading of the root, as in the high-level environments; *pushes*: forces '
             'on the torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
-            table(columns, rows),
-        ]
-    rows = footstep_rows('accurate')
-    if rows:
-        parts += [
-            'The same controller after further training (`--policy accurate`):',
             table(columns, rows),
         ]
     for tag, title, words in PLANS:

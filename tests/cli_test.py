@@ -578,7 +578,7 @@ class RolloutTest(CommandTest):
         ("'big' is not a size such as 640x480", GAPS, '--size', 'big'),
         ("'0' is not a positive integer", GAPS, '--steps', '0'),
         ("'x' is not a positive integer", GAPS, '--steps', 'x'),
-        ("unknown policy 'walk'; known: FILE.npz, accurate, clip, generalist, random, randomized, reference, scripted, zero", GAPS,
+        ("unknown policy 'walk'; known: FILE.npz, clip, generalist, random, randomized, reference, scripted, zero", GAPS,
          '--policy', 'walk'),
         ('the task PlanarImitation has no scripted policy; goal_navigation and soccer have one', GAPS, '--policy',
          'scripted', '--video', 'a.mp4'),

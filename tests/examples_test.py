@@ -32,7 +32,6 @@ import generalist
 import ppo
 import ppo_settings
 import share_gaits
-import train_accurate
 import train_all
 import train_randomized
 import tune_base_actions
@@ -447,52 +446,18 @@ class GeneralistTest(FolderTest):
             self.assertAlmostEqual(again['return'] / own, 1, delta=0.05)
 
 
-class AccurateTest(FolderTest):
-    """The footstep controller that lands more accurately."""
+class FootstepsTest(parameterized.TestCase):
+    """The shipped footstep controller."""
 
-    def test_a_short_run_continues_and_is_entered(self):
-        words = ['train_accurate.py', '--samples', '9000', '--runs', str(self.folder / 'runs')]
-        shipped = policies.reference(train_accurate.ID)
-        tiny = {
-            'num_envs': 20, 'horizon': 8, 'minibatch': 80, 'evaluate_every': 1e4, 'evaluation_episodes': 2,
-        }  # fmt: skip
-        first = {**ppo_settings.ACCURATELY, **tiny}
-        second = {**ppo_settings.MORE_ACCURATELY, **tiny, 'num_envs': 22}
-        trained = str(self.folder / 'trained')
-        with (
-            mock.patch.object(ppo_settings, 'ACCURATELY', first),
-            mock.patch.object(ppo_settings, 'MORE_ACCURATELY', second),
-            mock.patch.object(policies, 'reference', lambda *_: shipped),
-            mock.patch.object(train_all, 'EPISODES', 1),
-            mock.patch.dict(os.environ, {'TRL_SUITE_TRAINED': trained}),
-            mock.patch.object(sys, 'argv', words),
-            contextlib.redirect_stdout(io.StringIO()) as output,
-            contextlib.redirect_stderr(io.StringIO()),
-        ):
-            train_accurate.main()
-            entry = json.loads(train_accurate.place().read_text())
-            policy = policies.load(train_accurate.place().with_suffix('.npz'))
-        self.assertIn('of the maximum', output.getvalue())
-        self.assertGreaterEqual(policy.info['samples'], 18000)
-        self.assertEqual(entry['shipped_at'], policy.info['samples'])
-
-    def test_what_is_shipped_lands_closer_to_the_plan(self):
-        """With steps of 0.3 m within a third of the error of the controller it started from."""
-        if train_accurate.ID not in policies.available('accurate'):
-            self.skipTest('no policy is shipped')
-        entry = json.loads(train_accurate.place().read_text())
-        settings = ppo_settings.accurate_settings()
-        self.assertEqual(entry['settings'], json.loads(json.dumps(dataclasses.asdict(settings))))
-        row = evaluate_footsteps.row_for(train_accurate.ID, None)
-        options = evaluate_footsteps.CONDITIONS['straight, 0.3 m']
-        before, after = (
-            evaluate_footsteps.run(
-                row, policies.reference(train_accurate.ID, variant), 6, 1, 5.0, **options
-            )
-            for variant in ('', 'accurate')
-        )
-        self.assertEqual(after['survived'], 1.0)
-        self.assertLess(after['landing'], before['landing'] / 3)
+    @parameterized.parameters(('straight, 0.3 m', 0.05), ('straight, 0.7 m', 0.06), ('general', 0.08))
+    def test_it_lands_on_its_plan(self, condition, error):
+        id_ = evaluate_footsteps.ID
+        found = evaluate_footsteps.run(
+            evaluate_footsteps.row_for(id_, None), policies.reference(id_), 6, 1, 5.0,
+            **evaluate_footsteps.CONDITIONS[condition],
+        )  # fmt: skip
+        self.assertEqual(found['survived'], 1.0)
+        self.assertLess(found['landing'], error)
 
 
 class PageTest(absltest.TestCase):

@@ -77,8 +77,7 @@ def reference_policy(id: str, variant: str = '') -> policies.Policy:
     Args:
       id: id or alias of the environment.
       variant: 'randomized' for the policy that was trained in worlds and with sensors that vary,
-        'generalist' for a policy for all terrains of a character in PLAiD, 'accurate' for a
-        footstep controller with smaller landing errors;
+        'generalist' for a policy for all terrains of a character in PLAiD;
         `policies.available(variant)` lists the environments that have one.
 
     Raises:

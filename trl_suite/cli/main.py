@@ -116,7 +116,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
             '--policy', default=default, type=_policy_name, metavar='POLICY',
             help=f'{", ".join(acting.POLICIES)}, or an .npz file; reference: the shipped policy, randomized: '
             'one that was trained in worlds and with sensors that vary, generalist: one for all terrains of '
-            'a character, accurate: a footstep controller with smaller landing errors; which some environments have',
+            'a character; which some environments have',
         )  # fmt: skip
 
     def add_options(command: argparse.ArgumentParser) -> None:

@@ -97,7 +97,7 @@ from trl_suite.util.files import check_path, existing, load_arrays, replacing
 FORMAT = 'trl_suite policy'
 SHARED = 'shared.json'  # in trained/; see its README
 # Folders in trained/, with other policies of some environments.
-VARIANTS = 'randomized', 'generalist', 'accurate'
+VARIANTS = 'randomized', 'generalist'
 VERSION = 1
 # Key in the file -> dtype kinds, number of axes.
 _FIELDS = {
@@ -235,7 +235,7 @@ def reference(id: str, variant: str = '') -> Policy:
       id: id of the environment; `suite.reference_policy` also accepts aliases.
       variant: '', or one of `VARIANTS`, which some environments have in addition: 'randomized' is a
         policy that was trained in worlds and with sensors that vary, 'generalist' one for all
-        terrains of a character, 'accurate' a footstep controller with smaller landing errors.
+        terrains of a character.
 
     Raises:
       TypeError: the id is not a string.
