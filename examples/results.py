@@ -169,7 +169,7 @@ def oracle_rows() -> list[list[str]]:
 
 
 def fall_rows() -> list[list[str]]:
-    """Returns the shares of falls of PLAiD policies that noise prevents, by the time before the end."""
+    """Returns the shares of falls that noise prevents, by the time before the end."""
     path = resources.directory('trained') / 'oracle_falls.json'
     rows = []
     for id_, found in (json.loads(path.read_text()) if path.exists() else {}).items():
@@ -364,10 +364,11 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     rows = fall_rows()
     if rows:
         parts += [
-            '## Falls in PLAiD that other actions prevent',
+            '## Falls of tracking policies that other actions prevent',
             'Measured by `examples/oracle_falls.py`: the share of the falls of a policy that noise in its '
             'actions prevents, if it begins 0.25, 0.5, 1 and 1.5 s before the end, ends at the time of '
-            'the fall, and is tried 32 times. By the standard deviation of the noise, in units of the '
+            'the fall, and is tried 32 times; under pushes a fall is prevented if the walker has not fallen '
+            '2 s later, else if the character gets beyond its place. By the standard deviation of the noise, in units of the '
             'action: 0.001, which shows how many falls are a matter of chance; 0.15; and 0.5. Where noise '
             'prevents a fall, neither the clip nor the torque limits are the reason of the fall.',
             table(('environment', 'falls', '0.001', '0.15', '0.5'), rows),
