@@ -106,7 +106,12 @@ def measure(
             noise = std * rng.standard_normal(shape).repeat(HOLD, axis=0)[:back]
             states = [past[i][back - 1]] * copies.num_envs
             passed = prevented(
-                copies, states, None if condition else float(place), noise, round(AFTER * rate), policy
+                copies,
+                states,
+                None if condition else float(place),
+                noise,
+                round(AFTER * rate),
+                policy,
             )
             found[i, j] = passed.reshape(len(STDS), tries)
     some = found.any(3)
@@ -126,7 +131,9 @@ def measure(
 
 def main() -> None:
     parser = oracle_gaits.parser(__doc__.splitlines()[0], 32, 32, 'of each noise')
-    parser.add_argument('--condition', choices=CONDITIONS, default='', help='of a footstep controller')
+    parser.add_argument(
+        '--condition', choices=CONDITIONS, default='', help='of a footstep controller'
+    )
     arguments = parser.parse_args()
     path, condition = resources.directory('trained') / 'oracle_falls.json', arguments.condition
     oracle_gaits.measure_all(

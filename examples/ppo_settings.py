@@ -506,7 +506,11 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped2D_Walls_Terrain-v0', {'further': ({**LARGER_WALLS, 'gamma': 0.98},)}),
     (
         'PD_Dog2D_Gaps_Terrain-v0',
-        {'further': tuple({**own, 'stages': with_larger('gaps_humanoid')} for own in (MORE, AGAIN))},
+        {
+            'further': tuple(
+                {**own, 'stages': with_larger('gaps_humanoid')} for own in (MORE, AGAIN)
+            )
+        },
     ),
     (
         'PD_Raptor2D_Gaps_Terrain-v0',

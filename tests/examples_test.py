@@ -449,7 +449,9 @@ class GeneralistTest(FolderTest):
 class FootstepsTest(parameterized.TestCase):
     """The shipped footstep controller."""
 
-    @parameterized.parameters(('straight, 0.3 m', 0.05), ('straight, 0.7 m', 0.06), ('general', 0.08))
+    @parameterized.parameters(
+        ('straight, 0.3 m', 0.05), ('straight, 0.7 m', 0.06), ('general', 0.08)
+    )
     def test_it_lands_on_its_plan(self, condition, error):
         id_ = evaluate_footsteps.ID
         found = evaluate_footsteps.run(
