@@ -392,7 +392,8 @@ DRIBBLING = {
     'value_goes_on': True, 'averaged': 2e4, 'places': ('goal', 'ball'),
     'stages': evenly([*({'goal_reached': r} for r in (1.5, 1.0, 0.7)), {}]),
 }  # fmt: skip
-DRIBBLING_AGAIN = {  # after the footstep controller was trained further
+# After the footstep controller was trained further.
+ABOVE_ANOTHER = {
     'samples': 3.2e5, 'num_envs': 128, 'minibatch': 512, 'last_learning_rate': 3e-5, 'stages': (),
     'start_count': 1e6, 'value_first': 2e4, 'value_rate': 1e-3, 'evaluate_every': 8e4,
 }  # fmt: skip
@@ -566,10 +567,18 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_Terrain_*_Hard-v0', DIRECT),
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_Forest-v0', GUIDED),
-    ('PD_Biped3D_HLC_DynamicsObstacles-v0', {**MOVING, 'samples': 4e5, 'evaluate_every': 4e4}),
+    (
+        'PD_Biped3D_HLC_DynamicsObstacles-v0',
+        {
+            **MOVING,
+            'samples': 4e5,
+            'evaluate_every': 4e4,
+            'further': ({**ABOVE_ANOTHER, 'samples': 1.6e5, 'evaluate_every': 4e4},),
+        },
+    ),
     ('PD_Biped3D_HLC_Conveyors*', ON_BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
-    ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (DRIBBLING_AGAIN,)}),
+    ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (ABOVE_ANOTHER,)}),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place
 )
