@@ -52,6 +52,18 @@ BODY = (
 BIAS = 0.2  # of the output biases, relative to the other parameters
 
 
+def with_all_inputs(policy: policies.Policy) -> policies.Policy:
+    """Returns the policy with all columns of its observation as inputs; those without weights are 0."""
+    if policy.columns is None:
+        return policy
+    size = sum(size for _, size in policy.blocks)
+    first, *others = policy.weights
+    mean, std, weights = np.zeros(size), np.ones(size), np.zeros((size, first.shape[1]))
+    for whole, part in ((mean, policy.mean), (std, policy.std), (weights, first)):
+        whole[policy.columns] = part
+    return dataclasses.replace(policy, columns=None, mean=mean, std=std, weights=(weights, *others))
+
+
 class Tuning:
     """A controller with parameters that change its plan; 0: no change."""
 
@@ -59,12 +71,11 @@ class Tuning:
         """Makes parameters for the plan, and with `body` also for inputs from other blocks.
 
         Raises:
-          ValueError: the policy has no plan in its observation, or not all of its inputs.
+          ValueError: the policy has no plan in its observation.
         """
-        if 'plan' not in dict(policy.blocks) or policy.columns is not None:
-            raise ValueError(
-                f'{policy.id}: expected a footstep controller, with a block plan and all inputs'
-            )
+        if 'plan' not in dict(policy.blocks):
+            raise ValueError(f'{policy.id}: expected a footstep controller, with a block plan')
+        policy = with_all_inputs(policy)
         starts, start = {}, 0
         for name, size in policy.blocks:
             starts[name], start = start, start + size

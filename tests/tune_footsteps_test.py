@@ -54,18 +54,22 @@ class TuneFootstepsTest(parameterized.TestCase):
         tuning = tune_footsteps.Tuning(CONTROLLER)
         score = tune_footsteps.Score(2, 1, 1.5)
         level = score.parts[list(SOME).index('general')]
-        one, two = score.in_part(level, [CONTROLLER, tuning.changed(np.zeros(tuning.size))], (0,))
+        before = tune_footsteps.with_all_inputs(CONTROLLER)
+        one, two = score.in_part(level, [before, tuning.changed(np.zeros(tuning.size))], (0,))
         self.assertEqual(one, two)
         self.assertBetween(one, 1e-4, 0.2)
 
     def test_other_policies_are_refused(self):
-        columns = np.arange(len(CONTROLLER.mean))
-        for policy in (
-            policies.reference('PD_Biped3D_Imitate-v0'),
-            dataclasses.replace(CONTROLLER, columns=columns),
-        ):
-            with self.assertRaisesRegex(ValueError, f'{policy.id}: expected a footstep controller'):
-                tune_footsteps.Tuning(policy)
+        policy = policies.reference('PD_Biped3D_Imitate-v0')
+        with self.assertRaisesRegex(ValueError, f'{policy.id}: expected a footstep controller'):
+            tune_footsteps.Tuning(policy)
+
+    def test_inputs_that_were_removed_are_restored(self):
+        whole = tune_footsteps.with_all_inputs(CONTROLLER)
+        size = sum(size for _, size in CONTROLLER.blocks)
+        self.assertLen(whole.mean, size)
+        seen = np.random.default_rng(0).standard_normal((9, size))
+        np.testing.assert_allclose(whole(seen), CONTROLLER(seen), atol=1e-5)
 
     def test_a_fall_counts_as_misses_until_the_end(self):
         falls = dataclasses.replace(
@@ -113,8 +117,9 @@ class TuneFootstepsTest(parameterized.TestCase):
             ):
                 tune_footsteps.main()
             found = policies.load(path)
-        self.assertEqual(found.weights[0].shape, CONTROLLER.weights[0].shape)
-        self.assertFalse(np.array_equal(found.weights[0], CONTROLLER.weights[0]))
+        before = tune_footsteps.with_all_inputs(CONTROLLER)
+        self.assertEqual(found.weights[0].shape, before.weights[0].shape)
+        self.assertFalse(np.array_equal(found.weights[0], before.weights[0]))
         np.testing.assert_array_equal(found.weights[1], CONTROLLER.weights[1])
 
     def test_a_tuned_controller_is_entered(self):
