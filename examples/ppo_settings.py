@@ -350,7 +350,8 @@ STEPS_ON = {  # other terrains and plans; low learning rates, to avoid forgettin
     **FOOTSTEPS, 'samples': 1e6, 'stages': ACCURATE, 'start': 'PD_Biped3D_LLC_General_Step-v0',
     'start_count': 1e7, 'value_first': 1e5, 'learning_rate': 1e-4, 'last_learning_rate': 2e-5,
 }  # fmt: skip
-# Up and down the steps of a trail, in two runs.
+# Up and down the steps of a trail, in two runs. Those of the shipped policy started from the third run
+# of the footstep controller, before it was averaged with the second.
 ON_TRAILS = {
     **ACCURATELY, 'samples': 4e6, 'num_envs': 256, 'gamma': 0.98, 'averaged': 5e5,
     'start': 'PD_Biped3D_LLC_General_Step-v0',

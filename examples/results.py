@@ -388,7 +388,6 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             ),
         ]
     rows = footstep_rows()
-    columns = 'condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'
     if rows:
         parts += [
             '## Footstep tracking',
@@ -397,7 +396,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             'a foot lands. *General*: the plans of the environment, with sharp turns; *made from the root*: '
             'each plan is relative to position and heading of the root, as in the high-level environments; *pushes*: forces '
             'on the torso for 0.2 s every 3 s; *belts*: 2 m wide, 1 m apart.',
-            table(columns, rows),
+            table(
+                ('condition', 'episodes', 'survived', 'reward', 'landing', '90 %', 'heading'), rows
+            ),
         ]
     for tag, title, words in PLANS:
         rows = plan_rows(tag)

@@ -53,7 +53,7 @@ BIAS = 0.2  # of the output biases, relative to the other parameters
 
 
 def with_all_inputs(policy: policies.Policy) -> policies.Policy:
-    """Returns the policy with all columns of its observation as inputs; those without weights are 0."""
+    """Returns the policy with all columns of its observation as inputs; added ones have weights of 0."""
     if policy.columns is None:
         return policy
     size = sum(size for _, size in policy.blocks)
