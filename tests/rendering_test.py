@@ -121,9 +121,15 @@ class CameraTest(absltest.TestCase):
             self.place(physics, [0, -3, 0]), [0, -2 + cameras.MARGIN, 0], atol=1e-3
         )
 
-    def test_place_in_the_open_or_behind_the_wall_is_kept(self):
+    def test_place_closely_behind_a_wall_is_moved_in_front_of_it(self):
         physics = self.physics()
-        for at in ([0, -1, 0], [0, 3, 0], [0, -5, 0], [0, 0, 5]):
+        np.testing.assert_allclose(
+            self.place(physics, [0, -4.5, 0]), [0, -2 + cameras.MARGIN, 0], atol=1e-3
+        )
+
+    def test_place_in_the_open_or_far_behind_the_wall_is_kept(self):
+        physics = self.physics()
+        for at in ([0, -1, 0], [0, 3, 0], [0, -6, 0], [0, 0, 5]):
             np.testing.assert_array_equal(self.place(physics, at), at)
 
     def test_place_is_not_closer_than_the_smallest_distance(self):

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 FOLLOWING = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+HIDING = 1.5  # m; an obstacle that is so close to a camera, and before it, fills the picture
 MARGIN = 0.15  # m; between a camera and the surface that it would be behind
 NEAREST = 0.6  # m; a camera is not moved closer to the centre of mass than this
 WIDEST = 100.0  # degrees; vertical field of view of a camera that was moved
@@ -19,7 +20,7 @@ _MOST_HITS = 200  # surfaces along a ray
 
 @contextlib.contextmanager
 def outside_obstacles(physics: Any, camera_id: int) -> Iterator[None]:
-    """Moves a camera that is inside an obstacle towards the character, until the context ends.
+    """Moves a camera inside or closely behind an obstacle to the character, until the context ends.
 
     Only cameras that follow a body are moved. They keep their orientation, and their field of view
     grows so that the character keeps its size in the picture. The simulation is not affected.
@@ -45,7 +46,9 @@ def outside_obstacles(physics: Any, camera_id: int) -> Iterator[None]:
 def free_place(
     model: mujoco.MjModel, data: mujoco.MjData, body: int, place: np.ndarray
 ) -> np.ndarray:
-    """Returns the place closest to a camera, on the line to a body, that is in no other body's geom.
+    """Returns the place closest to a camera, on the line to a body, from which the body is visible.
+
+    Geoms of other bodies hide it if the camera is inside them, or less than `HIDING` behind them.
 
     Args:
       model: the model.
@@ -54,16 +57,19 @@ def free_place(
       place: place of the camera, (3,) m.
 
     Returns:
-      `place` if it is in no geom, (3,) m.
+      `place` if no geom hides the body, (3,) m.
     """
     centre = data.subtree_com[model.body_rootid[body]].copy()
     hits = _hits(model, data, body, centre, place)
-    # A line from outside to a place in a convex geom crosses its surface once, otherwise twice.
-    inside = {geom for geom, _ in hits if sum(other == geom for other, _ in hits) % 2}
-    if not inside:
-        return place
     length = float(np.linalg.norm(place - centre))
-    nearest = min(distance for geom, distance in hits if geom in inside) - MARGIN
+    # A line from outside to a place in a convex geom crosses its surface once, otherwise twice.
+    crossed = [geom for geom, _ in hits]
+    hiding = {
+        geom for geom, distance in hits if crossed.count(geom) % 2 or length - distance < HIDING
+    }
+    if not hiding:
+        return place
+    nearest = min(distance for geom, distance in hits if geom in hiding) - MARGIN
     return centre + (place - centre) * max(nearest, NEAREST) / length
 
 
