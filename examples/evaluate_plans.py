@@ -1,7 +1,7 @@
 """Evaluates navigation tasks: scripted and learnt footstep planning, and control without hierarchy.
 
     python examples/evaluate_plans.py                                      # all, both policies
-    python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 8
+    python examples/evaluate_plans.py PD_Biped3D_HLC_Soccer-v0 --policies scripted --episodes 32
 
 Measures the quantities reported in the DeepLoco paper, over whole episodes (200 s) with the seeds
 of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
@@ -29,7 +29,7 @@ from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
-EPISODES = 32
+EPISODES = 128
 POLICIES = ('scripted', 'reference')
 TAGS = ('hierarchical', 'flat_control')  # of the environments with goals
 SECONDS = 200.0  # of an episode without hierarchy

@@ -28,12 +28,12 @@ REACH, FINE, COARSE = (
     2,
 )  # half the map's side, m; height spacing, m; node spacing, heights
 LEVEL = 0.12  # m; largest height difference to the goal of level ground
-DISTANCE = 0.7  # m; distance from obstacles below which a path costs more
+DISTANCE = 0.85  # m; distance from obstacles below which a path costs more
 PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
 DETOUR = 1.02  # a straight line may cost this many times as much as the path that it replaces
 AHEAD = 4.0  # step lengths; distance of the next point on a trail
 PACE = 1.0  # m/s; assumed walking speed among moving boxes
-BEND, CLOSE = 0.35, 0.3  # rad, m; small steps for sharper turns or closer obstacles
+BEND, CLOSE = 0.35, 0.4  # rad, m; small steps for sharper turns or closer obstacles
 LOOKS = 33  # points on a straight line at which the cost is sampled
 BEYOND = 1.5  # assumed cost per m outside the map
 

@@ -257,8 +257,11 @@ def _rounded(weights: Iterable[np.ndarray]) -> tuple[np.ndarray, ...]:
 def measured(id_: str, folder: pathlib.Path, machine: str, begin: float) -> Run:
     """Evaluates a run; `begin` is the time of `time.monotonic` at its start."""
     curve = json.loads((folder / 'curve.json').read_text())
-    # With curriculum stages the last policy is used, because the curve does not measure all skills.
-    name = 'last' if curve['settings'].get('stages') else 'policy'
+    settings = curve['settings']
+    # The last policy is used with curriculum stages, because the curve does not measure all skills,
+    # and if it only imitates, because it has learnt from the most data.
+    imitates = settings.get('cloned', 0) >= settings['samples']
+    name = 'last' if settings.get('stages') or imitates else 'policy'
     policy = trimmed(policies.load(folder / f'{name}.npz'))
     episodes = GAIT_EPISODES if catalogue.BY_ID[id_].actuation == 'gait' else EPISODES
     found = evaluation.evaluate(id_, policy, episodes, SEED, num_threads=1)

@@ -33,7 +33,6 @@ from trl_suite.util import errors, files, resources
 from trl_suite.util.program import begin_script
 
 EPISODES = 64  # of each evaluation
-LONG = 50  # the same for planners, whose steps are whole footsteps
 CONDITIONS: dict[str, dict[str, Any]] = {
     'none': {},
     **{name: {'randomize': name, 'sensors': name} for name in ('mild', 'robot', 'harsh')},
@@ -69,13 +68,12 @@ def train(id_: str, seed: int, runs: pathlib.Path) -> None:
 def measure(id_: str) -> dict[str, Any]:
     """Evaluates where results are missing, and writes them; returns all results of an environment."""
     entry = json.loads(place(id_).read_text())
-    episodes = LONG if '_HLC_' in id_ else EPISODES
     for name, variant in (('evaluations', 'randomized'), ('before', '')):
         found = entry.setdefault(name, {})
         for condition, options in CONDITIONS.items():
             if condition not in found:
                 policy = policies.reference(id_, variant)
-                result = evaluation.evaluate(id_, policy, episodes, SEED, 1, options)
+                result = evaluation.evaluate(id_, policy, EPISODES, SEED, 1, options)
                 found[condition] = {key: result[key] for key in RESULTS}
                 write(entry)
     return entry
