@@ -125,6 +125,8 @@ def draw_randomized(path: pathlib.Path) -> None:
     figure, axes = plt.subplots(
         2, -(-len(ids) // 2), figsize=(11, 4.6), squeeze=False, layout='constrained'
     )
+    for axis in axes.flat[len(ids) :]:
+        axis.remove()
     for axis, id_ in zip(axes.flat, ids, strict=False):
         file = resources.directory('trained') / 'randomized' / f'{id_}.json'
         entry = json.loads(file.read_text())
