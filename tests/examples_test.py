@@ -218,6 +218,26 @@ class TuneTest(absltest.TestCase):
 
 
 class JobsTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ({}, 'policy'),
+        ({'stages': [[0.0, {}]]}, 'last'),
+        ({'cloned': 100.0}, 'last'),  # imitation only
+        ({'cloned': 60.0}, 'policy'),
+    )
+    def test_policy_of_a_run(self, settings, name):
+        folder = self.enterContext(tempfile.TemporaryDirectory())
+        curve = {'settings': {'samples': 100.0, **settings}}
+        pathlib.Path(folder, 'curve.json').write_text(json.dumps(curve))
+        for number, each in enumerate(('policy', 'last')):
+            policy = policies.reference('PD_Biped2D_Flat-v0')
+            info = {**policy.info, 'samples': number}
+            policies.save(
+                dataclasses.replace(policy, info=info), pathlib.Path(folder, f'{each}.npz')
+            )
+        with mock.patch.object(train_all.evaluation, 'evaluate', return_value={}):
+            run = train_all.measured('PD_Biped2D_Flat-v0', pathlib.Path(folder), '', 0.0)
+        self.assertEqual(run.entry['shipped_at'], ('policy', 'last').index(name))
+
     def test_every_environment_is_trained_but_for_most_gaits(self):
         ids = {id_ for id_, _ in train_all.jobs('*')}
         gaits = {id_ for id_, spec in catalogue.BY_ID.items() if spec.task_type == 'gait'}
