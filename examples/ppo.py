@@ -46,8 +46,8 @@ TEACHERS = {**evaluation.BASELINES, 'expert': expert}
 EVALUATION_SEED = 2**31  # used neither for training nor for published results
 OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # observation blocks with maps of the ground
+ACTIVATIONS = {'tanh': nn.Tanh, 'relu': nn.ReLU, 'elu': nn.ELU}
 LEAST_STD = 0.01  # lower bound, so that nearly constant observations are not amplified
-CLONING_RATE = 1e-3
 NEW_COUNT = 2e4  # sample count of the scales of inputs that the initial policy does not have
 
 
@@ -103,14 +103,56 @@ class Scales:
         return torch.from_numpy(scaled.astype(np.float32))
 
 
-def network(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
+class Maps(nn.Module):
+    """Convolutions over maps, the first inputs of a network; the other inputs follow the outputs.
+
+    Attributes:
+      shape: number, rows and columns of the maps.
+      line: number of inputs that form the maps.
+      outputs: number of outputs of the convolutions.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int, int], layers: Sequence[tuple[int, int, int]], activation: str
+    ) -> None:
+        """Makes layers with these numbers of filters, widths and strides."""
+        super().__init__()
+        self.shape, self.line = shape, int(np.prod(shape))
+        parts: list[nn.Module] = []
+        channels = shape[0]
+        for filters, width, stride in layers:
+            layer = nn.Conv2d(channels, filters, width, stride)
+            nn.init.orthogonal_(layer.weight, 2**0.5)
+            nn.init.zeros_(layer.bias)
+            parts += [layer, ACTIVATIONS[activation]()]
+            channels = filters
+        self.layers = nn.Sequential(*parts)
+        self.outputs = self.layers(torch.zeros(1, *shape)).numel()
+
+    @property
+    def filters(self) -> list[nn.Conv2d]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Conv2d)]
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        found = self.layers(x[:, : self.line].reshape(-1, *self.shape))
+        # Position by position, as in policies.
+        return torch.cat([found.permute(0, 2, 3, 1).flatten(1), x[:, self.line :]], 1)
+
+
+def network(
+    sizes: tuple[int, ...], last_gain: float, activation: str = 'tanh', maps: Maps | None = None
+) -> nn.Sequential:
+    """Returns a network with layers of these sizes; the first is the number of inputs."""
+    layers: list[nn.Module] = [] if maps is None else [maps]
+    first, *others = sizes
+    if maps is not None:
+        first += maps.outputs - maps.line
+    for i, (fan_in, fan_out) in enumerate(itertools.pairwise((first, *others))):
         linear = nn.Linear(fan_in, fan_out)
         last = i == len(sizes) - 2
         nn.init.orthogonal_(linear.weight, last_gain if last else 2**0.5)
         nn.init.zeros_(linear.bias)
-        layers += [linear] if last else [linear, nn.Tanh()]
+        layers += [linear] if last else [linear, ACTIVATIONS[activation]()]
     return nn.Sequential(*layers)
 
 
@@ -148,15 +190,36 @@ def visible(
     maps = [name for name in MAPS if name in blocks]
     if view is None or not maps:
         return None
-    lines, along = np.divmod(np.arange(spatial_ground.SAMPLES**2), spatial_ground.SAMPLES)
-    forward = np.linspace(*spatial_ground.AHEAD, spatial_ground.SAMPLES)[along]
-    aside = np.linspace(-spatial_ground.ASIDE, spatial_ground.ASIDE, spatial_ground.SAMPLES)[lines]
-    near = (forward <= view[0]) & (np.abs(aside) <= view[1])
+    near = np.logical_and.outer(*_near(view)).ravel()
     seen = np.ones(inputs, bool)
     for name in maps:
         part = blocks[name]
         seen[part] = np.tile(near, (part.stop - part.start) // len(near))
     return np.flatnonzero(seen)
+
+
+def _near(view: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rows and the columns of a map that are in the view, (SAMPLES,) bool each."""
+    ahead, aside = view or (np.inf, np.inf)
+    forward = np.linspace(*spatial_ground.AHEAD, spatial_ground.SAMPLES)
+    to_side = np.linspace(-spatial_ground.ASIDE, spatial_ground.ASIDE, spatial_ground.SAMPLES)
+    return np.abs(to_side) <= aside, forward <= ahead
+
+
+def map_shape(blocks: dict[str, slice], view: tuple[float, float] | None) -> tuple[int, int, int]:
+    """Returns number, rows and columns of the maps that are the first inputs.
+
+    Raises:
+      ValueError: there is none, or other blocks come before one.
+    """
+    size = sum(blocks[name].stop - blocks[name].start for name in MAPS if name in blocks)
+    ends = [blocks[name].stop for name in MAPS if name in blocks]
+    if not ends or max(ends) != size:
+        raise ValueError(
+            f'convolutions: the first observations are not maps of the ground: {", ".join(blocks)}'
+        )
+    rows, columns = (int(part.sum()) for part in _near(view))
+    return size // spatial_ground.SAMPLES**2, rows, columns
 
 
 def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
@@ -165,9 +228,20 @@ def mean_of(parts: Sequence[policies.Policy]) -> policies.Policy:
         name: np.mean([getattr(part, name) for part in parts], axis=0)
         for name in ('mean', 'std', 'log_std')
     }
-    for name in ('weights', 'biases'):
-        layers = zip(*(getattr(part, name) for part in parts), strict=True)
-        means[name] = tuple(np.mean(layer, axis=0) for layer in layers)
+
+    def mean(networks: Sequence[Any]) -> dict[str, Any]:
+        return {
+            name: tuple(
+                np.mean(layer, axis=0)
+                for layer in zip(*(getattr(each, name) for each in networks), strict=True)
+            )
+            for name in ('weights', 'biases')
+        }
+
+    means |= mean(parts)
+    maps = [part.convolution for part in parts if part.convolution is not None]
+    if maps:
+        means['convolution'] = dataclasses.replace(maps[-1], **mean(maps))
     return dataclasses.replace(parts[-1], **means)
 
 
@@ -195,6 +269,8 @@ class Trainer:
             )
         if unknown := s.landing_costs.keys() - set(LANDING_ERRORS):
             raise ValueError(errors.unknown('landing cost', min(unknown), LANDING_ERRORS))
+        if s.convolutions and not s.map_bound:
+            raise ValueError('convolutions: expected a map_bound, so that all maps have one scale')
         self.samples = 0
         self.begin_stage()
         self.mirror = getattr(self.environments.task, 'mirror', None) if s.mirrored else None
@@ -210,8 +286,14 @@ class Trainer:
         columns = visible(blocks, inputs, s.view)
         self.scales = Scales(blocks, inputs, columns, s.map_bound)
         inputs = inputs if columns is None else len(columns)
-        self.policy = network((inputs, *s.hidden, outputs), 0.01)
-        self.value = network((inputs, *s.hidden, 1), 1.0)
+
+        def made(last: int, gain: float) -> nn.Sequential:
+            maps = None
+            if s.convolutions:
+                maps = Maps(map_shape(blocks, s.view), s.convolutions, s.activation)
+            return network((inputs, *s.hidden, last), gain, s.activation, maps)
+
+        self.policy, self.value = made(outputs, 0.01), made(1, 1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(s.initial_std))))
         if initial is None and s.start and s.start not in TEACHERS:
             initial = policies.reference(s.start)
@@ -283,8 +365,11 @@ class Trainer:
         if not same:
             raise ValueError(f'{self.spec.id} has other actions than {other.id}')
         hidden = tuple(len(bias) for bias in other.biases[:-1])
-        if hidden != self.settings.hidden:
-            raise ValueError(f'hidden: {self.settings.hidden}, but {other.id} has {hidden}')
+        if (hidden, other.activation) != (self.settings.hidden, self.settings.activation):
+            raise ValueError(
+                f'hidden: {self.settings.hidden} {self.settings.activation}, but {other.id} has '
+                f'{hidden} {other.activation}'
+            )
         column = np.full(len(scales.mean), -1)  # indices in the other policy's observation
         offset = 0
         for name, size in other.blocks:
@@ -319,6 +404,7 @@ class Trainer:
         scales.square[known] = other.std[entry[known]] ** 2 + scales.mean[known] ** 2
         kept = slice(None) if scales.columns is None else scales.columns
         entry, gain = entry[kept], scales.gain[kept, None]
+        entry, gain = self.begin_filters(other, entry, gain)
         first = np.where((entry >= 0)[:, None], other.weights[0][entry] / gain, 0.0)
         layers = [layer for layer in self.policy if isinstance(layer, nn.Linear)]
         with torch.no_grad():
@@ -328,6 +414,44 @@ class Trainer:
                 layer.weight.copy_(torch.from_numpy(weight.T.copy()))
                 layer.bias.copy_(torch.from_numpy(bias.copy()))
             self.log_std.copy_(torch.from_numpy(other.log_std.copy()))
+
+    def begin_filters(
+        self, other: policies.Policy, entry: np.ndarray, gain: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Copies the convolutions of a policy, if there are any.
+
+        Args:
+          other: the policy.
+          entry: indices in the other network's inputs, of each input.
+          gain: gain of each input, (inputs, 1).
+
+        Returns:
+          Indices and gains of the inputs of the first layer after the convolutions.
+
+        Raises:
+          ValueError: the convolutions differ.
+        """
+        maps, theirs = self.policy[0], other.convolution
+        if theirs is None and not isinstance(maps, Maps):
+            return entry, gain
+        shapes = [] if theirs is None else [weight.shape for weight in theirs.weights]
+        own = list(maps.filters) if isinstance(maps, Maps) else []
+        same = shapes == [layer.weight.permute(2, 3, 1, 0).shape for layer in own]
+        line = 0 if theirs is None else theirs.line
+        if not same or theirs is None or not np.array_equal(entry[:line], np.arange(line)):
+            raise ValueError(f'convolutions: those of {other.id} have other maps or layers')
+        with torch.no_grad():
+            for i, (layer, weight, bias) in enumerate(
+                zip(own, theirs.weights, theirs.biases, strict=True)
+            ):
+                weight = weight / gain[0] if i == 0 else weight
+                layer.weight.copy_(torch.from_numpy(weight.transpose(3, 2, 0, 1).copy()))
+                layer.bias.copy_(torch.from_numpy(bias.copy()))
+        others = np.where(entry[line:] >= 0, entry[line:] - line + theirs.outputs, -1)
+        return (
+            np.concatenate([np.arange(theirs.outputs), others]),
+            np.concatenate([np.ones((theirs.outputs, 1)), gain[line:]]),
+        )
 
     def imitate(self, baseline: str, folder: pathlib.Path | None = None) -> None:
         """Trains the policy to imitate a baseline (behavioural cloning; in rounds: DAgger).
@@ -359,23 +483,28 @@ class Trainer:
                 ended = step.terminated | step.truncated
                 self.observation = environments.reset(ended) if ended.any() else step.observation
             self.scales.update(np.concatenate(seen[first:]))
-            self.fit(np.concatenate(seen), np.concatenate(labels))
+            self.fit(seen, labels)
             self.samples += (len(seen) - first) * s.num_envs
             if folder is not None and number < s.clonings - 1:
                 self.evaluate(folder, 0.0)
 
-    def fit(self, seen: np.ndarray, labels: np.ndarray) -> None:
-        """Fits the policy to actions (n, a) for observations (n, k)."""
-        inputs = self.scales(seen)
-        targets = torch.from_numpy(labels.astype(np.float32))
-        optimizer = torch.optim.Adam(self.policy.parameters(), CLONING_RATE)
-        for _ in range(self.settings.cloning_epochs):
+    def fit(self, seen: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> None:
+        """Fits the policy to actions (n, a) for observations (n, k), both given in parts."""
+        s = self.settings
+        inputs = torch.cat([self.scales(part) for part in seen])  # in parts, to save memory
+        targets = torch.from_numpy(np.concatenate(labels).astype(np.float32))
+        optimizer = torch.optim.Adam(self.policy.parameters(), s.cloning_rate)
+        schedule = torch.optim.lr_scheduler.LinearLR(
+            optimizer, 1.0, s.last_cloning_rate / s.cloning_rate, max(1, s.cloning_epochs - 1)
+        )
+        for _ in range(s.cloning_epochs):
             order = torch.from_numpy(self.random.permutation(len(inputs)))
-            for part in order.split(self.settings.minibatch):
+            for part in order.split(s.minibatch):
                 loss = (self.policy(inputs[part]) - targets[part]).square().mean()
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
+            schedule.step()
 
     def collect(self) -> dict[str, torch.Tensor]:
         """Steps all simulations `horizon` times; returns the samples, flattened."""
@@ -513,7 +642,22 @@ class Trainer:
         # The weights of inputs that were always 0 in training are still random: on a slope, where
         # such inputs are not 0, a policy that was trained on level ground would be disturbed.
         gain = np.where(self.scales.square == 0, 0.0, self.scales.gain)
-        weights[0] *= gain[:, None] if columns is None else gain[columns, None]
+        gain = gain if columns is None else gain[columns]
+        convolution, maps = None, network_[0]
+        if isinstance(maps, Maps):
+            filters = [
+                layer.weight.detach().permute(2, 3, 1, 0).numpy().copy() for layer in maps.filters
+            ]
+            filters[0] *= gain[0]
+            convolution = policies.Convolution(
+                line=maps.line,
+                strides=tuple(layer.stride[0] for layer in maps.filters),
+                weights=tuple(filters),
+                biases=tuple(layer.bias.detach().numpy().copy() for layer in maps.filters),
+                grid=maps.shape[1:],
+            )
+            gain = np.concatenate([np.ones(maps.outputs), gain[maps.line :]])
+        weights[0] *= gain[:, None]
         biases = [layer.bias.detach().numpy().copy() for layer in layers]
         return policies.Policy(
             id=self.spec.id,
@@ -529,7 +673,8 @@ class Trainer:
             clip=OBSERVATION_CLIP,
             weights=tuple(weights),
             biases=tuple(biases),
-            activation='tanh',
+            convolution=convolution,
+            activation=self.settings.activation,
             log_std=self.log_std.detach().numpy().copy(),
             info={
                 'seed': self.seed,

@@ -38,6 +38,9 @@ class Settings:
     )
     value_goes_on: bool = False  # whether the value network is trained after an update has stopped
     hidden: tuple[int, ...] = (256, 256)
+    activation: str = 'tanh'  # of all layers but the last, one of `ppo.ACTIVATIONS`
+    # Convolutions over the maps of the ground, with `map_bound`: filters, width and stride of each.
+    convolutions: tuple[tuple[int, int, int], ...] = ()
     initial_std: float = 0.2  # of actions in [-1, 1]
     bound_cost: float = 0.1  # coefficient of the squared excess of a mean action over 1
     gradient_norm: float = 0.5
@@ -82,6 +85,8 @@ class Settings:
     # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
     cloning_epochs: int = 30  # of each round, over all labels so far
+    cloning_rate: float = 1e-3  # learning rate of the first epoch of each round
+    last_cloning_rate: float = 1e-3  # reached by a linear decrease
     # First control steps after `start`, in which only the value is trained, and the learning rate
     # in them; None: the same as later. A value network that starts from random weights needs a
     # high rate, a good policy a low one.

@@ -59,6 +59,21 @@ def make_convolving(seed=0, size=0.6, **changes):
     )
 
 
+def make_seeing(seed=0, **changes):
+    """A policy with convolutions over two maps of 5 by 6, followed by 4 other inputs."""
+    rng = np.random.default_rng(seed)
+    shapes = (2, 3, 2, 4), (2, 1, 4, 3)  # positions: 5 x 6 -> 2 x 2 -> 1 x 2
+    maps = policies.Convolution(
+        line=60, strides=(2, 1), weights=[rng.normal(0, 0.4, shape) for shape in shapes],
+        biases=[rng.normal(0, 0.3, shape[-1]) for shape in shapes], grid=(5, 6),
+    )  # fmt: skip
+    sizes = (1 * 2 * 3 + 4, 6, 5, 2)
+    weights = [rng.normal(0, 0.6, pair) for pair in itertools.pairwise(sizes)]
+    return make(
+        seed, blocks=(('terrain', 60), ('pose', 4)), weights=weights, convolution=maps, **changes
+    )
+
+
 def plain(policy, observation):
     """The same in plain Python, one number after the other."""
     hidden = {
@@ -67,14 +82,42 @@ def plain(policy, observation):
         'elu': lambda x: x if x > 0 else float(np.exp(x)) - 1,
     }[policy.activation]
     line = policy.convolution
-    if line is not None:
+    if line is not None and line.origin is not None:
         relative = [float(o) - float(observation[line.origin]) for o in observation[: line.line]]
         observation = [*relative, *observation[line.line :]]
     x = [
         min(max((float(o) - float(m)) / float(s), -policy.clip), policy.clip)
         for o, m, s in zip(observation, policy.mean, policy.std, strict=True)
     ]
-    if line is not None:
+    if line is not None and line.grid is not None:
+        rows, columns = line.grid
+        maps = [x[i : i + rows * columns] for i in range(0, line.line, rows * columns)]
+        samples = [
+            [[each[row * columns + column] for each in maps] for column in range(columns)]
+            for row in range(rows)
+        ]
+        for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
+            height, width, channels, filters = weight.shape
+            samples = [
+                [
+                    [
+                        hidden(
+                            sum(
+                                samples[i + h][j + w][c] * float(weight[h, w, c, o])
+                                for h in range(height)
+                                for w in range(width)
+                                for c in range(channels)
+                            )
+                            + float(bias[o])
+                        )
+                        for o in range(filters)
+                    ]
+                    for j in range(0, len(samples[0]) - width + 1, stride)
+                ]
+                for i in range(0, len(samples) - height + 1, stride)
+            ]
+        x = [value for row in samples for place in row for value in place] + x[line.line :]
+    elif line is not None:
         samples = [[value] for value in x[: line.line]]
         for weight, bias, stride in zip(line.weights, line.biases, line.strides, strict=True):
             width, channels, filters = weight.shape
@@ -212,9 +255,32 @@ class ActTest(parameterized.TestCase):
             with self.subTest(message), self.assertRaisesRegex(ValueError, f'members: .*{message}'):
                 policies.ensemble(members)
 
-    def test_convolutions_do_not_depend_on_the_batch(self):
-        policy = make_convolving(layer_norm=True)
-        observations = np.random.default_rng(1).normal(0, 2, (67, 13))
+    @parameterized.parameters('tanh', 'relu')
+    def test_convolutions_over_maps(self, activation):
+        policy = make_seeing(activation=activation)
+        self.assertEqual(policy.convolution.outputs, 6)
+        observations = np.random.default_rng(1).normal(0, 1, (9, 64))
+        expected = [plain(policy, observation) for observation in observations]
+        np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
+        both = policies.ensemble([policy, policy])
+        self.assertLen(both.convolution.members, 2)
+        np.testing.assert_allclose(both.networks[0][0].weights[0], policy.convolution.weights[0])
+
+    @parameterized.parameters(
+        ((7, 6), r'grid: \(7, 6\) does not divide 60 inputs'),
+        ((60,), r'grid: \(60,\) does not divide'),
+        ((0, 6), r'grid: \(0, 6\) does not divide'),
+        ((5, 12), r'filter_0: has shape \(2, 3, 2, 4\); expected \(2, 3, 1, 4\)'),
+        ((30, 1), r'filter_0: 4 of width 2 x 3 and stride 2 on 30 x 1 positions'),
+    )
+    def test_malformed_maps_are_rejected(self, grid, message):
+        with self.assertRaisesRegex(ValueError, message):
+            dataclasses.replace(make_seeing().convolution, grid=grid)
+
+    @parameterized.parameters((make_convolving, 13), (make_seeing, 64))
+    def test_convolutions_do_not_depend_on_the_batch(self, made, inputs):
+        policy = made(layer_norm=True)
+        observations = np.random.default_rng(1).normal(0, 2, (67, inputs))
         together = policy(observations)
         for n in (1, 2, 3, 31):
             np.testing.assert_array_equal(policy(observations[-n:]), together[-n:])
@@ -488,6 +554,19 @@ class FileTest(FolderTest):
         self.assertEqual(path.read_bytes(), (self.folder / 'q.npz').read_bytes())
         for name in (*files._LINE, 'origin', 'filter_0', 'filter_bias_0', 'layer_norm'):
             self.assertRegex(files.__doc__, rf'\n    {name}\b')
+
+    def test_round_trip_of_maps(self):
+        for policy in (make_seeing(), policies.ensemble([make_seeing()] * 2)):
+            policies.save(policy, self.folder / 'p.npz')
+            again = policies.load(self.folder / 'p.npz')
+            self.assertEqual(again.convolution.grid, (5, 6))
+            observations = np.random.default_rng(1).normal(size=(9, 64))
+            np.testing.assert_array_equal(again(observations), policy(observations))
+        self.assertRegex(files.__doc__, r'\n    grid\b')
+        with np.load(self.folder / 'p.npz') as data:
+            np.savez(self.folder / 'p.npz', **{**data, 'grid': np.array([7, 6])})
+        with self.assertRaisesRegex(ValueError, "'line': grid: .* does not divide"):
+            policies.load(self.folder / 'p.npz')
 
     @parameterized.parameters(
         ({'line': None}, "'line': is missing"),

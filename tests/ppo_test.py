@@ -358,6 +358,64 @@ class RunTest(parameterized.TestCase):
             found = other.exported()(observation)
             self.assertEqual(np.allclose(found, policy(observation), atol=1e-4), same)
 
+    def test_policies_may_have_convolutions_over_maps(self):
+        settings = ppo_settings.Settings(
+            **TINY, map_bound=1.0, view=(6.0, 3.6), activation='relu', mirrored=True,
+            convolutions=((4, 4, 2), (6, 3, 1)),
+        )  # fmt: skip
+        id_ = 'PD_Biped3D_HLC_DynamicsObstacles-v0'
+        trainer = ppo.Trainer(id_, 0, settings, 1)
+        trainer.learn(trainer.collect())
+        policy, observation = trainer.exported(), trainer.observation
+        # 32 points on 11 m: 20 ahead and 20 across, in two maps; 9 x 9 positions, then 7 x 7.
+        self.assertEqual((policy.convolution.line, policy.convolution.grid), (800, (20, 20)))
+        self.assertEqual(policy.convolution.outputs, 7 * 7 * 6)
+        seen, left = trainer.seen(observation)
+        with torch.no_grad():
+            inside = trainer.policy(trainer.scales(seen)).numpy()
+        inside = trainer.mirror.unmirror_action(inside, left)
+        np.testing.assert_allclose(policy(observation), np.clip(inside, -1, 1), atol=1e-5)
+        mean = ppo.mean_of([policy, policy])
+        np.testing.assert_allclose(mean(observation), policy(observation), atol=1e-5)
+        # Inputs that have not varied would not be copied.
+        policy = dataclasses.replace(policy, std=np.maximum(policy.std, 0.02))
+        other = ppo.Trainer(id_, 1, settings, 1, policy)
+        np.testing.assert_allclose(other.exported()(observation), policy(observation), atol=1e-4)
+        for changes in (
+            {'convolutions': ((4, 4, 2),)}, {'convolutions': ()}, {'view': (6.0, 3.0)},
+            {'map_bound': 2.0},
+        ):  # fmt: skip
+            with (
+                self.subTest(changes),
+                self.assertRaisesRegex(ValueError, 'convolutions: those of'),
+            ):
+                ppo.Trainer(id_, 1, dataclasses.replace(settings, **changes), 1, policy)
+
+    @parameterized.parameters(
+        ('PD_Biped3D_HLC_LargeBlocks-v0', {}, 'expected a map_bound'),
+        (FLAT, {'map_bound': 1.0}, 'not maps of the ground: pose'),
+    )
+    def test_convolutions_need_maps(self, id_, changes, message):
+        settings = ppo_settings.Settings(**TINY, convolutions=((4, 4, 2),), **changes)
+        with self.assertRaisesRegex(ValueError, f'convolutions: .*{message}'):
+            ppo.Trainer(id_, 0, settings, 1)
+
+    def test_the_rate_of_imitation_falls(self):
+        settings = ppo_settings.Settings(
+            **TINY, start='scripted', cloned=64, cloning_epochs=3, cloning_rate=1e-2,
+            last_cloning_rate=1e-3,
+        )  # fmt: skip
+        trainer = ppo.Trainer('PD_Biped3D_HLC_Soccer-v0', 0, settings, 1)
+        step, rates = torch.optim.Adam.step, []
+
+        def counted(optimizer):
+            rates.append(optimizer.param_groups[0]['lr'])
+            return step(optimizer)
+
+        with mock.patch.object(torch.optim.Adam, 'step', counted):
+            trainer.imitate('scripted')
+        np.testing.assert_allclose(rates, np.repeat([1e-2, 5.5e-3, 1e-3], 2))
+
     def test_a_run_may_start_by_imitating_a_baseline(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))

@@ -14,19 +14,21 @@ from trl_suite.policies import checks
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Convolution:
-    """1-D convolutions over a line, the first l inputs of a network, such as ground heights.
+    """Convolutions over the first l inputs of a network: ground heights along a line, or maps.
 
-    The outputs replace the line, position by position, before the other inputs.
+    The outputs replace these inputs, position by position, before the other inputs.
 
     Attributes:
-      line: number of inputs that form the line, l.
-      strides: strides of each layer, in positions of its input.
-      weights: per layer (width, channels, filters), float32 and read-only, as all arrays; the first
-        has one channel, each other as many channels as the previous layer has filters. Of the m
-        networks of an ensemble, (m, width, channels, filters).
+      line: number of these inputs, l.
+      strides: strides of each layer along each axis, in positions of its input.
+      weights: per layer (width, channels, filters), float32 and read-only, as all arrays; on a grid
+        (height, width, channels, filters). The first has one channel, or as many as there are maps,
+        each other as many channels as the previous layer has filters. Of the m networks of an
+        ensemble, (m, width, channels, filters) or (m, height, width, channels, filters).
       biases: per layer (filters,), or (m, filters).
       origin: index of the input that is subtracted from those of the line, such as the root's
         height, before normalisation; None for none.
+      grid: rows and columns of the maps, which follow each other, row by row; None for a line.
       outputs: number of outputs: positions times filters of the last layer.
       members: the convolutions of each network of an ensemble; or only this one.
 
@@ -39,6 +41,7 @@ class Convolution:
     weights: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
     biases: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
     origin: int | None = None
+    grid: tuple[int, int] | None = None
     outputs: int = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -53,25 +56,38 @@ class Convolution:
                 f'strides: {layers} layers with {len(self.weights)} weights and '
                 f'{len(self.biases)} biases'
             )
-        weights, biases, positions, channels = [], [], self.line, 1
-        stack = checks.stack('filter_0', self.weights[0], 3)
+        positions: tuple[int, ...] = (self.line,)
+        if self.grid is not None:
+            positions = tuple(map(int, self.grid))
+            put('grid', positions)
+            if len(positions) != 2 or min(positions) < 1 or self.line % np.prod(positions):
+                raise ValueError(
+                    f'grid: {positions} does not divide {self.line} inputs into maps of rows and '
+                    'columns'
+                )
+        channels, axes = self.line // int(np.prod(positions) or 1), len(positions)
+        weights, biases = [], []
+        stack = checks.stack('filter_0', self.weights[0], axes + 2)
         for i, stride in enumerate(self.strides):
-            width, _, filters = (0, 0, 0, *np.shape(self.weights[i]))[-3:]
-            shape = width, channels, filters
+            *window, _, filters = ((0,) * (axes + 2) + np.shape(self.weights[i]))[-axes - 2 :]
+            shape = *window, channels, filters
             weights.append(checks.array(f'filter_{i}', self.weights[i], (*stack, *shape)))
             biases.append(checks.array(f'filter_bias_{i}', self.biases[i], (*stack, filters)))
-            if stride < 1 or not 1 <= width <= positions or not filters:
+            fits = all(1 <= w <= p for w, p in zip(window, positions, strict=True))
+            if stride < 1 or not fits or not filters:
                 raise ValueError(
-                    f'filter_{i}: {filters} of width {width} and stride {stride} on {positions} positions'
+                    f'filter_{i}: {filters} of width {" x ".join(map(str, window))} and stride '
+                    f'{stride} on {" x ".join(map(str, positions))} positions'
                 )
-            positions, channels = (positions - width) // stride + 1, filters
+            positions = tuple((p - w) // stride + 1 for w, p in zip(window, positions, strict=True))
+            channels = filters
         put('weights', tuple(weights))
         put('biases', tuple(biases))
-        put('outputs', positions * channels)
+        put('outputs', int(np.prod(positions)) * channels)
 
     @functools.cached_property
     def members(self) -> tuple[Convolution, ...]:
-        if self.weights[0].ndim == 3:
+        if self.weights[0].ndim == (3 if self.grid is None else 4):
             return (self,)
         arrays = zip(zip(*self.weights, strict=True), zip(*self.biases, strict=True), strict=True)
         return tuple(dataclasses.replace(self, weights=w, biases=b) for w, b in arrays)
@@ -92,11 +108,27 @@ class Convolution:
 
     def __call__(self, x: np.ndarray, activation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Maps normalised inputs (n, c) to outputs and other inputs, (n, outputs + c - l)."""
-        line = x[:, : self.line, None]
+        positions = self.grid or (self.line,)
+        maps = x[:, : self.line].reshape(len(x), -1, np.prod(positions)).swapaxes(1, 2)
         for weight, bias, stride in zip(self.weights, self.biases, self.strides, strict=True):
-            width, channels, filters = weight.shape
-            places = np.add.outer(np.arange(0, line.shape[1] - width + 1, stride), np.arange(width))
-            windows = line[:, places].reshape(len(x), len(places), width * channels)
+            *window, _, filters = weight.shape
+            places = _windows(positions, tuple(window), stride)
+            windows = maps[:, places].reshape(len(x), len(places), -1)
             # One product per simulation, so that results do not depend on the batch size.
-            line = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
-        return np.concatenate([line.reshape(len(x), -1), x[:, self.line :]], axis=1)
+            maps = activation(np.matmul(windows, weight.reshape(-1, filters)) + bias)
+            positions = tuple((p - w) // stride + 1 for w, p in zip(window, positions, strict=True))
+        return np.concatenate([maps.reshape(len(x), -1), x[:, self.line :]], axis=1)
+
+
+@functools.cache
+def _windows(positions: tuple[int, ...], window: tuple[int, ...], stride: int) -> np.ndarray:
+    """Returns the indices of the positions in each window, (windows, positions in a window)."""
+    axes = [
+        np.add.outer(np.arange(0, size - width + 1, stride), np.arange(width))
+        for size, width in zip(positions, window, strict=True)
+    ]
+    if len(axes) == 1:
+        return axes[0]
+    rows, columns = axes
+    places = rows[:, None, :, None] * positions[1] + columns[None, :, None, :]
+    return places.reshape(len(rows) * len(columns), -1)

@@ -54,13 +54,17 @@ and, if it selects one of b actions, as mixtures of experts do:
                                there are b a more, row by row, those of this row are added, and the
                                sum is clipped to [-1, 1]
 
-and, if the first l inputs form a line, e.g. of ground heights, to which C convolutions are applied;
-their outputs, position by position, and then the other c - l inputs are the inputs of layer 0:
+and, if the first l inputs form a line, e.g. of ground heights, or maps, to which C convolutions are
+applied; their outputs, position by position, and then the other c - l inputs are the inputs of
+layer 0:
 
     line           int ()    l
+    grid           int (2,)  rows and columns of the maps, which follow each other, row by row; absent
+                             for a line
     strides        int (C,)  of each layer
-    filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters); channel 0 of the
-                             first is the line; window (positions, channels) @ filter
+    filter_0 ...   float     of layer i = 0 ... C - 1, (width, channels, filters), for maps (height,
+                             width, channels, filters); the channel of the first is the line, or the
+                             channels are the maps; window (positions, channels) @ filter
     filter_bias_0  float     (filters,); the activation is that of the hidden layers
     origin         int ()    optional: index of the input that is subtracted from each input of
                              the line before the normalisation, such as the height of the root
@@ -113,6 +117,7 @@ _MIRROR = {
 _SIDES = {'phase': ('iu', 0), 'feet': ('iu', 1)}  # one of them
 _OPTIONAL = {'places': ('iu', 2), 'columns': ('iu', 1), 'choices': ('f', 2)}
 _LINE = {'line': ('iu', 0), 'strides': ('iu', 1)}
+_LINE_OPTIONAL = {'origin': ('iu', 0), 'grid': ('iu', 1)}
 
 
 def save(policy: Policy, path: str | os.PathLike[str]) -> None:
@@ -147,8 +152,8 @@ def save(policy: Policy, path: str | os.PathLike[str]) -> None:
             fields[f'mirror_{name}'] = value.astype(np.float32) if kind == 'f' else value
     if policy.convolution is not None:
         fields |= {name: getattr(policy.convolution, name) for name in _LINE}
-        if policy.convolution.origin is not None:
-            fields['origin'] = policy.convolution.origin
+        given = {name: getattr(policy.convolution, name) for name in _LINE_OPTIONAL}
+        fields |= {name: value for name, value in given.items() if value is not None}
         layers = zip(policy.convolution.weights, policy.convolution.biases, strict=True)
         for i, (weight, bias) in enumerate(layers):
             fields[f'filter_{i}'], fields[f'filter_bias_{i}'] = weight, bias
@@ -192,9 +197,9 @@ def load(path: str | os.PathLike[str]) -> Policy:
             fields['mirror'] = Mirror(**{**parts, side: parts[side].tolist()})
         if any(name in archive for name in _LINE):
             line = {name: read(name, *_LINE[name]).tolist() for name in _LINE}
-            if 'origin' in archive:
-                line['origin'] = read('origin', 'iu', 0).tolist()
-            filters = read.layers('filter', len(line['strides']), 3)
+            for name in [name for name in _LINE_OPTIONAL if name in archive]:
+                line[name] = read(name, *_LINE_OPTIONAL[name]).tolist()
+            filters = read.layers('filter', len(line['strides']), 4 if 'grid' in line else 3)
             read.field = 'line'
             fields['convolution'] = Convolution(weights=filters[0], biases=filters[1], **line)
         if 'layer_norm' in archive:
