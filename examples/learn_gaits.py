@@ -141,7 +141,10 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         **GENERALIST, **STARTED, 'start': 'FSM_Raptor2D_Terrain_Mixed-v0',
         'also': ('FSM_Raptor2D_*',), 'num_envs': 70, 'members': 4,
     },
-    'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {**GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',)},
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
+        **GENERALIST, **SCRATCH, 'also': ('FSM_Biped2D_*',), 'num_envs': 72, 'samples': 491520,
+        'members': 4,
+    },
     'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},
     # A hopper must choose its hops four cycles, or 9 m, ahead.
     'FSM_Hopper2D_Terrain_Mixed-v0': {

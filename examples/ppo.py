@@ -299,7 +299,8 @@ class Trainer:
             initial = policies.reference(s.start)
         if initial is not None:
             self.begin_with(initial)
-        self.begun = not s.start or initial is not None
+        self.again = s.imitates_again and initial is not None
+        self.begun = not s.start or (initial is not None and not self.again)
         self.has_start = bool(s.start) or initial is not None
         self.networks = [self.policy, self.value]
         self.average: swa_utils.AveragedModel | None = None
@@ -474,7 +475,7 @@ class Trainer:
                 action = teacher(self.observation)
                 seen.append(observation.copy())
                 labels.append(self.mirror.unmirror_action(action, left) if self.mirror else action)
-                if number > 0:
+                if number > 0 or self.again:
                     with torch.no_grad():
                         action = self.policy(self.scales(observation)).numpy()
                     action = self.mirror.unmirror_action(action, left) if self.mirror else action

@@ -84,6 +84,8 @@ class Settings:
     # Rounds of imitation. After the first round the policy selects the actions, and the teacher
     # only labels the observations (DAgger, Ross et al. 2011, arXiv:1011.0686).
     clonings: int = 1
+    # Whether a further run imitates, too; its initial policy selects the actions from the first round.
+    imitates_again: bool = False
     cloning_epochs: int = 30  # of each round, over all labels so far
     cloning_rate: float = 1e-3  # learning rate of the first epoch of each round
     last_cloning_rate: float = 1e-3  # reached by a linear decrease
@@ -394,7 +396,23 @@ GUIDED = {
 IMITATING = {**GUIDED, 'hidden': (512, 256), 'cloning_epochs': 20}
 AMONG_BLOCKS = {**IMITATING, 'samples': 3.6e5, 'cloned': 3.6e5, 'evaluation_episodes': 64}
 AMONG_PILLARS = {**AMONG_BLOCKS, 'samples': 3e5, 'cloned': 3e5, 'clonings': 5}
+# Convolutions over the maps, ReLU and a falling learning rate follow the expert more closely.
+SEEING = {
+    **GUIDED, 'hidden': (256, 256), 'activation': 'relu',
+    'convolutions': ((16, 3, 1), (32, 3, 2), (32, 3, 2)), 'clonings': 4, 'cloning_epochs': 8,
+    'last_cloning_rate': 2e-5, 'averaged': 0.0,
+}  # fmt: skip
+ON_A_TRAIL = {**SEEING, 'samples': 2.4e5, 'cloned': 2.4e5}
 MOVING = {**GUIDED, 'map_bound': 1.0, 'cloning_epochs': 8}  # m/s
+AMONG_MOVING = {
+    **SEEING, 'samples': 3.2e5, 'cloned': 3.2e5, 'map_bound': 1.0, 'view': (6.0, 3.6),
+    'further': (
+        {
+            'samples': 1.6e5, 'cloned': 1.6e5, 'clonings': 2, 'imitates_again': True,
+            'start_count': 1e9, 'cloning_rate': 3e-4,
+        },
+    ),
+}  # fmt: skip
 ON_BELTS = {**MOVING, 'samples': 1.2e5, 'cloned': 6e4, 'value_first': 8e4}
 # A goal so large that a kicked ball comes to rest in it, then smaller goals.
 DRIBBLING = {
@@ -578,17 +596,10 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_LargeBlocks-v0', AMONG_BLOCKS),
     ('PD_Biped3D_HLC_Forest-v0', AMONG_PILLARS),
-    (
-        'PD_Biped3D_HLC_DynamicsObstacles-v0',
-        {
-            **MOVING,
-            'samples': 4e5,
-            'evaluate_every': 4e4,
-            'further': ({**ABOVE_ANOTHER, 'samples': 1.6e5, 'evaluate_every': 4e4},),
-        },
-    ),
+    ('PD_Biped3D_HLC_DynamicsObstacles-v0', AMONG_MOVING),
     ('PD_Biped3D_HLC_Conveyors*', ON_BELTS),
     ('PD_Biped3D_HLC_PathFollowing*', GUIDED),
+    ('PD_Biped3D_HLC_PathFollowing-v0', ON_A_TRAIL),
     ('PD_Biped3D_HLC_Soccer-v0', {**DRIBBLING, 'further': (ABOVE_ANOTHER,)}),
     ('FSM_*', CYCLES),
     ('FSM_Raptor2D_*', {'initial_std': 0.05}),  # with more noise it learns to step in place

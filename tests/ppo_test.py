@@ -445,6 +445,27 @@ class RunTest(parameterized.TestCase):
         np.testing.assert_allclose(seen[0][:half], seen[1][:half], atol=1e-6)
         self.assertGreater(np.abs(seen[0][half] - seen[1][half]).max(), 1e-3)
 
+    def test_a_further_run_may_imitate_again(self):
+        """Its initial policy selects the actions from the beginning."""
+        id_ = 'PD_Biped3D_HLC_LargeBlocks-v0'
+        settings = ppo_settings.Settings(
+            **TINY, start='scripted', cloned=160, imitates_again=True, initial_std=1e-9
+        )
+        first = ppo.Trainer(id_, 0, settings, 1)
+        self.assertFalse(first.begun)
+        first.imitate('scripted')
+        # Inputs that have not varied would not be copied.
+        policy = dataclasses.replace(first.exported(), std=np.maximum(first.exported().std, 0.02))
+        plain = dataclasses.replace(settings, imitates_again=False)
+        self.assertTrue(ppo.Trainer(id_, 0, plain, 1, policy).begun)
+        again = ppo.Trainer(id_, 0, settings, 1, policy)
+        self.assertFalse(again.begun)
+        expected = again.exported()(again.observation)
+        with mock.patch.object(again.environments, 'step', wraps=again.environments.step) as step:
+            again.imitate('scripted')
+        self.assertEqual(again.samples, 160)
+        np.testing.assert_allclose(step.call_args_list[0].args[0], expected, atol=1e-4)
+
     def test_policies_are_evaluated_between_rounds(self):
         settings = ppo_settings.Settings(
             **TINY, start='scripted', cloned=160, clonings=2, averaged=100.0
