@@ -61,7 +61,6 @@ ROW = '{:40} {:>4}  {:20} {:>7} {:>6} {:>8}'  # a row of the table of runs
 MEMORY = 1.5e9  # bytes of memory that Ray reserves for a run
 GAITS = (  # gait environments that are trained by default
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
-    'FSM_Biped2D_Terrain_Gaps-v0',
     'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
