@@ -79,4 +79,4 @@ def distil(
             trainer.observation = environments.reset(ended) if ended.any() else step.observation
         if len(part):
             trainer.scales.update(np.concatenate(seen[-len(part) :]))
-            trainer.fit(np.concatenate(seen), np.concatenate(labels))
+            trainer.fit(seen, labels)

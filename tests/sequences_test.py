@@ -638,7 +638,9 @@ class BaselinesTest(parameterized.TestCase):
         labels = []
         size = len(environments.action_map)
         experts = [lambda o, a=a: np.full((len(o), size), a) for a in (0.5, -2.0)]
-        learner.trainer.fit = lambda seen, actions: labels.append((len(seen), actions))
+        learner.trainer.fit = lambda seen, actions: labels.append(
+            (sum(map(len, seen)), np.concatenate(actions))
+        )
         plaid.distil(learner.trainer, environments, experts, 600, rounds=3)
         self.assertEqual([count for count, _ in labels], [200, 400, 600])
         each = labels[-1][1].reshape(-1, 2, 4, size)
