@@ -28,7 +28,6 @@ REACH, FINE, COARSE = (
     2,
 )  # half the map's side, m; height spacing, m; node spacing, heights
 LEVEL = 0.12  # m; largest height difference to the goal of level ground
-# The shipped policy among moving boxes imitated an expert with 0.7 m, and 0.3 m for `CLOSE`.
 DISTANCE = 0.85  # m; distance from obstacles below which a path costs more
 PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
 DETOUR = 1.02  # a straight line may cost this many times as much as the path that it replaces
