@@ -269,6 +269,8 @@ class Trainer:
             )
         if unknown := s.landing_costs.keys() - set(LANDING_ERRORS):
             raise ValueError(errors.unknown('landing cost', min(unknown), LANDING_ERRORS))
+        if s.activation not in ACTIVATIONS:
+            raise ValueError(errors.unknown('activation', s.activation, ACTIVATIONS))
         if s.convolutions and not s.map_bound:
             raise ValueError('convolutions: expected a map_bound, so that all maps have one scale')
         self.samples = 0

@@ -400,6 +400,11 @@ class RunTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, f'convolutions: .*{message}'):
             ppo.Trainer(id_, 0, settings, 1)
 
+    def test_an_unknown_activation_is_rejected(self):
+        settings = ppo_settings.Settings(**TINY, activation='rely')
+        with self.assertRaisesRegex(ValueError, "unknown activation 'rely'.*'relu'"):
+            ppo.Trainer(FLAT, 0, settings, 1)
+
     def test_the_rate_of_imitation_falls(self):
         settings = ppo_settings.Settings(
             **TINY, start='scripted', cloned=64, cloning_epochs=3, cloning_rate=1e-2,
