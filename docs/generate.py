@@ -207,15 +207,19 @@ def strip(spec: catalogue.EnvSpec, environment: Any) -> str:
     )
 
 
-def begun(settings: Mapping[str, Any]) -> str:
-    """Returns how the policy of a run was initialised."""
+EXPERTS = {
+    'expert': 'an expert with a map (`examples/expert.py`)',
+    'joint_expert': 'planned footsteps and the controller that tracks them (`examples/joint_expert.py`)',
+}
+
+
+def begun(settings: Mapping[str, Any], unit: str) -> str:
+    """Returns how the policy of a run was initialised; `unit`: what its samples are."""
     start = settings['start']
     if start in catalogue.BY_ID:
         return f'[{start}]({start}.md)'
-    copied = f'for {settings["cloned"] / 1e6:.2g} million plans'
-    if start == 'expert':
-        return f'imitation of an expert with a map (`examples/expert.py`) {copied}'
-    return f'imitation of `--policy {start}` {copied}'
+    imitated = EXPERTS.get(start, f'`--policy {start}`')
+    return f'imitation of {imitated} for {settings["cloned"] / 1e6:.2g} million {unit}'
 
 
 def observing(spec: catalogue.EnvSpec) -> list[tuple[str, str]]:
@@ -260,7 +264,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
         *([('policy saved after', after)] if taken < 0.99 * samples else []),
-        *([('initial policy', begun(run['settings']))] if run['settings'].get('start') else []),
+        *([('initial policy', begun(run['settings'], unit))] if run['settings'].get('start') else []),
         *observing(spec),
         ('machine', run['machine']),
     )  # fmt: skip

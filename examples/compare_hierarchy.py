@@ -42,7 +42,9 @@ MEASURES = {  # key, factor and label of what counts in each task
 KINDS = ('with hierarchy', 'without')
 # Both learn from scratch or from a walk only: no demonstrations, curricula or averages of weights.
 COMMON: dict[str, Any] = {'stages': (), 'averaged': 0.0, 'stages_averaged': 1}
-STARTS: tuple[dict[str, Any], ...] = ({'start': ''}, {})
+OWN: tuple[dict[str, Any], ...] = (
+    {'start': '', 'activation': 'tanh', 'convolutions': ()}, ppo_settings.FROM_A_WALK,
+)  # fmt: skip
 QUARTERS = 4
 EPISODES, SEED = 32, 0
 _MARKS = '<!-- hierarchy, written by examples/compare_hierarchy.py -->', '<!-- /hierarchy -->'
@@ -61,7 +63,7 @@ def train(
         return found
     id_ = TASKS[task][kind]
     folder.mkdir(parents=True, exist_ok=True)
-    trainer = ppo.Trainer(id_, seed, ppo_settings.settings_for(id_, **COMMON, **STARTS[kind]), 1)
+    trainer = ppo.Trainer(id_, seed, ppo_settings.settings_for(id_, **COMMON, **OWN[kind]), 1)
     each = trainer.environments.control_timestep / CONTROL_TIMESTEP  # control steps of a sample
     trainer.settings = dataclasses.replace(trainer.settings, samples=control_steps / each)
     for i, path in enumerate(found):

@@ -10,6 +10,7 @@ baseline.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -32,10 +33,16 @@ DISTANCE = 0.85  # m; distance from obstacles below which a path costs more
 PRICE, WALL = 8.0, 60.0  # largest extra cost per m near an obstacle; extra cost per m inside one
 DETOUR = 1.02  # a straight line may cost this many times as much as the path that it replaces
 AHEAD = 4.0  # step lengths; distance of the next point on a trail
+# The same where every goal on the trail is followed by the next one, and the share of the goal's
+# distance from the centre line by which the point is shifted.
+PAST, SHIFT = 3.0, 0.5
 PACE = 1.0  # m/s; assumed walking speed among moving boxes
 BEND, CLOSE = 0.35, 0.4  # rad, m; small steps for sharper turns or closer obstacles
 LOOKS = 33  # points on a straight line at which the cost is sampled
 BEYOND = 1.5  # assumed cost per m outside the map
+
+
+Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Map:
@@ -96,11 +103,14 @@ class Map:
         return there[np.flatnonzero(best)[-1] if best.any() else 0]
 
 
-def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) -> np.ndarray:
+def on_trail(
+    trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float, *, beyond: bool = False
+) -> np.ndarray:
     """Returns the point of a trail `ahead` m closer to a goal, relative to `place`, (2,) m.
 
     The point is on the centre line.
-    If the goal is nearer than `ahead`, the point is the one nearest to the goal.
+    If the goal is nearer than `ahead`, the point is the one nearest to the goal, or, with `beyond`,
+    lies past it.
     """
     length = np.linalg.norm(trail.end - trail.start, axis=1)
     way = (trail.end - trail.start) / length[:, None]
@@ -112,23 +122,29 @@ def on_trail(trail: Trail, place: np.ndarray, goal: np.ndarray, ahead: float) ->
         return begin[gaps.argmin()] + along[gaps.argmin()]
 
     here, there = nearest(place), nearest(goal)
-    on = here + np.clip(there - here, -ahead, ahead)
+    on = here + (ahead if beyond else np.clip(there - here, -ahead, ahead))
     corners = np.concatenate([trail.start, trail.end[-1:]])
-    return np.array([np.interp(on, begin, corner) for corner in corners.T]) - place
+
+    def centre(along: float) -> np.ndarray:
+        return np.array([np.interp(along, begin, corner) for corner in corners.T])
+
+    if beyond and there > here:
+        return centre(on) - place + SHIFT * (goal - centre(there))
+    return centre(on) - place
 
 
-def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
-    """Makes an expert policy, like the functions in `evaluation.BASELINES`.
+def planner(task: Any, step_length: float, action_map: Any, *, beyond: bool = False) -> Planner:
+    """Makes an expert that plans footsteps for a task with goals.
 
-    Raises:
-      ValueError: the actions of the task are not footstep plans, or the task has a ball.
+    Args:
+      task: a task of a 3D walker with goals, on a `SpatialArena`.
+      step_length: step length of a plan, m.
+      action_map: map of plans to actions.
+      beyond: whether to walk past the next goal on a trail, since the one after it is farther on.
+
+    Returns:
+      A function from simulations (k,) and their stance feet (k,) to actions (k, 5).
     """
-    task = environments.task
-    if not isinstance(task, HierarchicalNavigation) or task.ball or task.interface != 'plan':
-        raise ValueError(
-            f'the expert does not support the task {type(task).__name__}; expected: a high-level task '
-            "with the interface 'plan' and without a ball"
-        )
     map_, arena = Map(), task.arena
     moves = arena.surroundings.capacity.movers > 0
 
@@ -152,23 +168,40 @@ def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray
         gap = np.abs(map_.places[:, None] - then) - s.half_size[env_id][near]
         return np.linalg.norm(np.maximum(gap, 0), axis=2).min(1, initial=REACH)
 
-    def policy(observation: np.ndarray) -> np.ndarray:
+    def plan(env_ids: np.ndarray, stance: np.ndarray) -> np.ndarray:
         found = task.figure.measure()
-        root, goal = found.root[:, :2], task.goal[:, :2]
+        root, heading = found.root[env_ids, :2], found.heading[env_ids]
         off, length = np.empty_like(root), np.ones(len(root))
-        for env_id, place in enumerate(root):
-            trail = arena.grounds[env_id].layout.trail
+        for k, (env_id, place) in enumerate(zip(env_ids.tolist(), root, strict=True)):
+            goal, trail = task.goal[env_id, :2], arena.grounds[env_id].layout.trail
             if trail is not None:
-                off[env_id] = on_trail(trail, place, goal[env_id], AHEAD * task.step_length)
+                ahead = step_length * (PAST if beyond else AHEAD)
+                off[k] = on_trail(trail, place, goal, ahead, beyond=beyond)
                 continue
             free = apart(env_id, place) if moves else level(env_id, place)
             cost = 1 + PRICE * np.maximum(0, 1 - free / DISTANCE) ** 2 + WALL * (free <= 0)
-            off[env_id] = map_.aim(cost, goal[env_id] - place)
-            bend = rewards.wrap(np.arctan2(off[env_id, 1], off[env_id, 0]) - found.heading[env_id])
+            off[k] = map_.aim(cost, goal - place)
+            bend = rewards.wrap(np.arctan2(off[k, 1], off[k, 0]) - heading[k])
             careful = abs(bend) > BEND or free[map_.middle] < CLOSE
-            length[env_id] = CAUTIOUS if careful else 1.0
-        way = rewards.wrap(np.arctan2(off[:, 1], off[:, 0]) - found.heading)
-        plan = scripted.steps(way, task.step_length * length, task.stance, task.step_length)
-        return np.clip(task.action_map.action(plan), -1, 1)
+            length[k] = CAUTIOUS if careful else 1.0
+        way = rewards.wrap(np.arctan2(off[:, 1], off[:, 0]) - heading)
+        footsteps = scripted.steps(way, step_length * length, stance, step_length)
+        return np.clip(action_map.action(footsteps), -1, 1)
 
-    return policy
+    return plan
+
+
+def expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
+    """Makes an expert policy, like the functions in `evaluation.BASELINES`.
+
+    Raises:
+      ValueError: the actions of the task are not footstep plans, or the task has a ball.
+    """
+    task = environments.task
+    if not isinstance(task, HierarchicalNavigation) or task.ball or task.interface != 'plan':
+        raise ValueError(
+            f'the expert does not support the task {type(task).__name__}; expected: a high-level task '
+            "with the interface 'plan' and without a ball"
+        )
+    plan = planner(task, task.step_length, task.action_map)
+    return lambda observation: plan(task.world.all_ids, task.stance)

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 import tqdm
 from expert import expert
+from joint_expert import joint_expert
 from ppo_settings import Settings, settings_for
 from several import LANDING_ERRORS, Several
 from torch import nn
@@ -42,7 +43,7 @@ from trl_suite.util import errors
 from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
-TEACHERS = {**evaluation.BASELINES, 'expert': expert}
+TEACHERS = {**evaluation.BASELINES, 'expert': expert, 'joint_expert': joint_expert}
 EVALUATION_SEED = 2**31  # used neither for training nor for published results
 OBSERVATION_CLIP = 10.0  # in standard deviations
 MAPS = ('terrain', 'surface')  # observation blocks with maps of the ground
@@ -351,7 +352,13 @@ class Trainer:
         own = dict(options)
         spec = dataclasses.replace(self.spec, terrain=own.pop('terrain', self.spec.terrain))
         return VectorEnvironment(
-            spec, number, self.threads, seed, autoreset='disabled', task_kwargs=own
+            spec,
+            number,
+            self.threads,
+            seed,
+            autoreset='disabled',
+            task_kwargs=own,
+            step_limit=self.settings.step_limit or -1,
         )
 
     def enter(self, environments: VectorEnvironment | Several) -> None:
@@ -475,7 +482,7 @@ class Trainer:
             while len(seen) * s.num_envs < s.cloned * (number + 1) / s.clonings:
                 observation, left = self.seen(self.observation)
                 action = teacher(self.observation)
-                seen.append(observation.copy())
+                seen.append(observation.astype(np.float32))  # half the memory
                 labels.append(self.mirror.unmirror_action(action, left) if self.mirror else action)
                 if number > 0 or self.again:
                     with torch.no_grad():

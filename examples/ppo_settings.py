@@ -99,6 +99,7 @@ class Settings:
     further: tuple[dict[str, Any], ...] = ()
     # The final policy has the mean weights of the policies of this number of last runs.
     runs_averaged: int = 1
+    step_limit: int = 0  # of episodes in training; 0: that of the environment
     enough: float = np.inf  # end when two evaluations in a row reach this share of the maximum
     evaluate_every: float = 1e5  # control steps
     evaluation_episodes: int = 32
@@ -453,12 +454,23 @@ LARGER_WALLS = {**AGAIN, 'samples': 1.5e6, 'stages': with_larger('walls_humanoid
 NO_STEPS_IN_PLACE = {'gamma': 0.98, 'least_share': {'com': 0.25}, 'patience': 1.0}
 ENOUGH = {'enough': 0.95}
 WALKS_ON = {'start': 'PD_Biped3D_Imitate-v0', **ENOUGH}
-# The same tasks without footstep planning: starts from the walk, and learns navigation.
-DIRECT = {
-    'samples': 1e7, 'gamma': 0.97, 'averaged': 5e5, 'view': (6.0, 3.0), 'evaluate_every': 2e5,
-    'start': 'PD_Biped3D_Imitate-v0', 'start_count': 1e6, 'value_goes_on': True, 'map_bound': 0.3,
-    'learning_rate': 2e-4,
+# The same tasks without hierarchy: PPO from the walk, for comparison (`compare_hierarchy.py`).
+FROM_A_WALK = {
+    'num_envs': 64, 'hidden': (256, 256), 'activation': 'tanh', 'convolutions': (), 'gamma': 0.97,
+    'view': (6.0, 3.0), 'map_bound': 0.3, 'places': (), 'start': 'PD_Biped3D_Imitate-v0',
+    'start_count': 1e6, 'value_goes_on': True, 'learning_rate': 2e-4, 'initial_std': 0.15,
+    'step_limit': 0,
 }  # fmt: skip
+# The shipped policies imitate planned footsteps and the controller that tracks them, by DAgger in
+# episodes of a minute, without PPO.
+DIRECT = {
+    'samples': 8e5, 'start': 'joint_expert', 'cloned': 8e5, 'clonings': 5, 'cloning_epochs': 6,
+    'last_cloning_rate': 2e-5, 'num_envs': 128, 'step_limit': 1800, 'hidden': (512, 256),
+    'activation': 'relu', 'convolutions': ((8, 5, 2), (16, 3, 2)), 'view': (6.0, 3.6),
+    'map_bound': 0.3, 'places': ('goal',), 'initial_std': 0.08, 'gamma': 0.97, 'start_count': 1e6,
+    'value_goes_on': True, 'learning_rate': 2e-4, 'evaluate_every': 2e5,
+}  # fmt: skip
+DIRECT_DRIBBLING = {'convolutions': (), 'view': None, 'map_bound': 0.0, 'places': ('goal', 'ball')}
 ROUGH = ('Hills', 'Ramp', 'Stairs', 'Steps', 'Rough')
 # By the pattern of an id; later entries have precedence.
 OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -593,6 +605,7 @@ OVERRIDES: tuple[tuple[str, dict[str, Any]], ...] = (
     ('PD_Biped3D_LLC_Symetric_Step-v0', {**SHORTER, 'mirrored': False}),
     ('PD_Biped3D_FULL_Imitate-Steps-v0', {**FOOTSTEPS, **SHORTER}),
     ('PD_Biped3D_Terrain_*_Hard-v0', DIRECT),
+    ('PD_Biped3D_Terrain_Soccer_Hard-v0', DIRECT_DRIBBLING),
     ('PD_Biped3D_HLC_*', PLANS),
     ('PD_Biped3D_HLC_LargeBlocks-v0', AMONG_BLOCKS),
     ('PD_Biped3D_HLC_Forest-v0', AMONG_PILLARS),

@@ -40,8 +40,9 @@ PLANS = (  # tag, title, text
     (
         'flat_control',
         '## The same tasks without hierarchy',
-        'Measured by the same program in episodes of the same length, although these policies were '
-        'trained in episodes of 8.5 s. Their reward differs: it includes imitation of the clip. Goals '
+        'Measured by the same program in episodes of the same length. The policies imitate planned '
+        'footsteps and the controller that tracks them; results of policies that PPO trained: '
+        '[findings](findings.md#without-hierarchy). The reward includes imitation of the clip. Goals '
         'are reached within 0.5 m instead of 1 m, and on the trail they are one segment of 2 m ahead '
         'instead of up to ten segments; in soccer, speed is towards the ball.',
     ),
@@ -277,7 +278,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         'high-level environments 200 s), *distance* the mean in m, *minutes* the wall time of the run. '
         '*Initial policy*: the policy from which training started, whose samples are not included; or the '
         'policy that was imitated first, whose samples are included: `scripted` is the hand-written '
-        'policy, `expert` an [expert with a map](../examples/expert.py). The page of an environment says '
+        'policy, `expert` an [expert with a map](../examples/expert.py), `joint_expert` planned footsteps and the '
+        '[controller that tracks them](../examples/joint_expert.py). The page of an environment says '
         'whether its policy was saved at the end of the imitation, or later. '
         f'Machine: {machines}; one thread per run, with up to five runs and other work at the same time, '
         'so that wall times are only a rough guide.',

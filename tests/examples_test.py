@@ -29,6 +29,7 @@ import evaluate_footsteps
 import evaluate_plans
 import expert
 import generalist
+import joint_expert
 import ppo
 import ppo_settings
 import share_gaits
@@ -609,6 +610,14 @@ class ExpertTest(parameterized.TestCase):
             aim = expert.on_trail(trail, np.array(place), np.array(goal), ahead)
             np.testing.assert_allclose(aim + place, expected, atol=1e-9)
 
+    def test_past_a_goal_on_a_trail(self):
+        """The point is farther on, shifted sideways with a goal that is still ahead."""
+        trail = SimpleNamespace(start=np.array([[0.0, 0.0]]), end=np.array([[9.0, 0.0]]))
+        place = np.array([2.0, 0.3])
+        for goal, expected in (((2.5, 0.4), (3.5, 0.2)), ((1.0, 0.4), (3.5, 0.0))):
+            aim = expert.on_trail(trail, place, np.array(goal), 1.5, beyond=True)
+            np.testing.assert_allclose(aim + place, expected, atol=1e-9)
+
     def test_a_path_on_a_map(self):
         map_ = expert.Map()
         x, y = map_.places.T
@@ -652,6 +661,52 @@ class ExpertTest(parameterized.TestCase):
             observation = environments.reset(ended) if ended.any() else step.observation
         self.assertLessEqual(fell, 1)
         self.assertGreater(speed.mean(), 0.6)
+
+
+class JointExpertTest(parameterized.TestCase):
+    """The expert for tasks without hierarchy."""
+
+    @parameterized.parameters('Trail', 'Blocks', 'Soccer')
+    def test_walks_on(self, name):
+        """10 s of 8 episodes: at most one fall, and goals reached or the ball approached."""
+        environments = VectorEnvironment(
+            f'PD_Biped3D_Terrain_{name}_Hard-v0',
+            8,
+            0,
+            seed=3,
+            autoreset='disabled',
+            step_limit=None,
+        )
+        policy, observation = joint_expert.joint_expert(environments), environments.reset()
+        fell, distance = 0, np.zeros(8)
+        for _ in range(300):
+            action = policy(observation)
+            self.assertEqual(action.shape, (8, len(environments.action_map)))
+            step = environments.step(action)
+            fell += step.terminated.sum()
+            distance = np.maximum(distance, step.info['distance'])
+            observation = (
+                environments.reset(step.terminated) if step.terminated.any() else step.observation
+            )
+        self.assertLessEqual(fell, 1)
+        self.assertGreater(distance.mean(), 1.0 if name == 'Soccer' else 5.0)
+
+    def test_plans_again_after_a_reset(self):
+        """A policy that has seen other episodes acts in a new one as a new policy does."""
+        environments = VectorEnvironment(
+            'PD_Biped3D_Terrain_Soccer_Hard-v0', 2, 0, seed=3, autoreset='disabled'
+        )
+        used, observation = joint_expert.joint_expert(environments), environments.reset()
+        for _ in range(20):
+            observation = environments.step(used(observation)).observation
+        observation = environments.reset()
+        fresh = joint_expert.joint_expert(environments)
+        np.testing.assert_array_equal(used(observation), fresh(observation))
+
+    def test_rejects_unsupported_tasks(self):
+        environments = VectorEnvironment('PD_Biped3D_HLC_Forest-v0', 1, 1, seed=0)
+        with self.assertRaisesRegex(ValueError, 'the joint expert does not support the task'):
+            joint_expert.joint_expert(environments)
 
 
 if __name__ == '__main__':
