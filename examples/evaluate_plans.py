@@ -7,8 +7,9 @@ Measures the quantities reported in the DeepLoco paper, over whole episodes (200
 of `evaluation.evaluate`: the normalised cumulative reward (0 after a fall), the shares of episodes
 without a fall, in total and in the first minute, speed towards the goal, goals per minute (not in
 soccer), distance along a trail, the share of time with the ball at its goal, and falls per
-kilometre. Environments without hierarchy have no scripted policy; their episodes are as long as the
-others. Writes the results to trained/plans.json.
+kilometre. `expert` is the expert that policies imitate, for footsteps (not in soccer) or joint targets.
+Environments without hierarchy have no scripted policy; their episodes are as long as the others.
+Writes the results to trained/plans.json.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from expert import expert
+from joint_expert import joint_expert
 
 from trl_suite import policies
 from trl_suite.registry import catalogue
@@ -30,7 +33,7 @@ from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 EPISODES = 128
-POLICIES = ('scripted', 'reference')
+POLICIES = ('scripted', 'reference', 'expert')
 TAGS = ('hierarchical', 'flat_control')  # of the environments with goals
 SECONDS = 200.0  # of an episode without hierarchy
 SEGMENT = 2.0  # m; of a trail
@@ -103,10 +106,25 @@ def run(id_: str, make: Callable[[VectorEnvironment], Any], episodes: int, seed:
     }  # fmt: skip
 
 
+def maker(id_: str, name: str) -> Callable[[VectorEnvironment], Any] | None:
+    """Returns a function that makes one of `POLICIES`; None if the environment does not have it."""
+    spec = catalogue.BY_ID[id_]
+    planned = 'hierarchical' in spec.tags
+    if name == 'scripted':
+        return scripted if planned else None
+    if name == 'expert':
+        return joint_expert if not planned else None if spec.task_type == 'soccer' else expert
+    try:
+        policy = policies.reference(id_)
+    except FileNotFoundError:
+        return None
+    return lambda environments: policy
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('pattern', nargs='?', default='PD_Biped3D_*', help='of ids')
-    parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES)
+    parser.add_argument('--policies', nargs='+', choices=POLICIES, default=POLICIES[:2])
     parser.add_argument('--episodes', type=int, default=EPISODES)
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()
@@ -121,15 +139,9 @@ def main() -> None:
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     for id_ in ids:
         for name in arguments.policies:
-            make = scripted
-            if name == 'scripted' and 'hierarchical' not in catalogue.BY_ID[id_].tags:
+            make = maker(id_, name)
+            if make is None:
                 continue
-            if name == 'reference':
-                try:
-                    policy = policies.reference(id_)
-                except FileNotFoundError:
-                    continue
-                make = lambda _, policy=policy: policy  # noqa: E731
             result = run(id_, make, arguments.episodes, arguments.seed)
             found.setdefault(id_, {})[name] = result
             print(id_, name, {k: round(v, 3) for k, v in result.items()}, flush=True)
