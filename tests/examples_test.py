@@ -593,6 +593,16 @@ class PlansTest(absltest.TestCase):
         self.assertAlmostEqual(found['seconds'] * 60, round(found['seconds'] * 60), 6)
         self.assertLess(found['reward'], found['seconds'] / evaluate_plans.SECONDS)
 
+    def test_policies_of_tasks(self):
+        planned, direct = 'PD_Biped3D_HLC_Forest-v0', 'PD_Biped3D_Terrain_Forest_Hard-v0'
+        for id_, name, expected in (
+            (planned, 'expert', expert.expert),
+            (direct, 'expert', joint_expert.joint_expert),
+            (direct, 'scripted', None),
+            ('PD_Biped3D_HLC_Soccer-v0', 'expert', None),  # its footsteps have no expert
+        ):
+            self.assertIs(evaluate_plans.maker(id_, name), expected)
+
 
 class ExpertTest(parameterized.TestCase):
     """The expert for footstep plans."""

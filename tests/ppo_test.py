@@ -421,6 +421,12 @@ class RunTest(parameterized.TestCase):
             trainer.imitate('scripted')
         np.testing.assert_allclose(rates, np.repeat([1e-2, 5.5e-3, 1e-3], 2))
 
+    def test_episodes_in_training_may_have_their_own_limit(self):
+        for limit, expected in ((0, 256), (7, 7)):
+            settings = ppo_settings.Settings(**TINY, step_limit=limit)
+            trainer = ppo.Trainer('PD_Biped2D_Flat-v0', 0, settings, threads=1)
+            self.assertEqual(trainer.environments.step_limit, expected)
+
     def test_a_run_may_start_by_imitating_a_baseline(self):
         id_ = 'PD_Biped3D_HLC_Soccer-v0'
         settings = ppo_settings.Settings(**TINY, start='scripted', cloned=160, view=(6.0, 3.0))
