@@ -14,6 +14,7 @@ import numpy as np
 from expert import planner
 
 from trl_suite import policies
+from trl_suite.motion import quaternion
 from trl_suite.tasks.components import rewards
 from trl_suite.tasks.components.footstep_plan import PLAN_SIZE
 from trl_suite.tasks.navigation.direct import DirectNavigation
@@ -22,12 +23,6 @@ from trl_suite.tasks.navigation.plan_actions import STEP_LENGTH, plan_action_map
 from trl_suite.vector import VectorEnvironment
 
 DRIBBLING = 'PD_Biped3D_HLC_Soccer-v0'
-
-
-def rotated(angle: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vectors rotated to the left by an angle, rad."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return cosine * x - sine * y, sine * x + cosine * y
 
 
 def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.ndarray]:
@@ -66,11 +61,10 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
         planned = footsteps.action_offset + footsteps.action_scale * action
         root, yaw = found.root[env_ids], found.heading[env_ids]
         for which in range(2):
-            ahead, left = planned[:, 2 * which], planned[:, 2 * which + 1]
-            x, y = rotated(yaw, ahead, left)
-            x, y = x + root[:, 0], y + root[:, 1]
-            z = task.arena.height(x[:, None], y[:, None], env_ids)[:, 0]
-            landing[env_ids, which] = np.stack([x, y, z], axis=1)
+            place = root[:, :2] + quaternion.turned(planned[:, 2 * which : 2 * which + 2], yaw)
+            landing[env_ids, which, :2] = place
+            height = task.arena.height(place[:, :1], place[:, 1:], env_ids)
+            landing[env_ids, which, 2] = height[:, 0]
         heading[env_ids] = yaw + planned[:, 4]
 
     def policy(observation: np.ndarray) -> np.ndarray:
@@ -84,10 +78,10 @@ def joint_expert(environments: VectorEnvironment) -> Callable[[np.ndarray], np.n
         parts |= {'contact': found.contact, 'plan': np.zeros((n, PLAN_SIZE))}
         for which in range(2):
             foot = stance if which else 1 - stance
-            away = landing[:, which] - found.feet[everyone, foot]
+            away = landing[:, which, :2] - found.feet[everyone, foot, :2]
             slot = 6 * which + 3 * foot
-            x, y = rotated(-found.heading, away[:, 0], away[:, 1])
-            parts['plan'][everyone, slot], parts['plan'][everyone, slot + 1] = x, y
+            ahead, left = quaternion.turned(away, -found.heading).T
+            parts['plan'][everyone, slot], parts['plan'][everyone, slot + 1] = ahead, left
             parts['plan'][everyone, slot + 2] = landing[:, which, 2] - found.under
         parts['plan'][:, -1] = rewards.wrap(heading - found.heading)
         action = controller(np.concatenate([parts[name] for name in observed], axis=1))
