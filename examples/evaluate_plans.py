@@ -113,7 +113,9 @@ def maker(id_: str, name: str) -> Callable[[VectorEnvironment], Any] | None:
     if name == 'scripted':
         return scripted if planned else None
     if name == 'expert':
-        return joint_expert if not planned else None if spec.task_type == 'soccer' else expert
+        if not planned:
+            return joint_expert
+        return None if spec.task_type == 'soccer' else expert
     try:
         policy = policies.reference(id_)
     except FileNotFoundError:

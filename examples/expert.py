@@ -41,7 +41,6 @@ BEND, CLOSE = 0.35, 0.4  # rad, m; small steps for sharper turns or closer obsta
 LOOKS = 33  # points on a straight line at which the cost is sampled
 BEYOND = 1.5  # assumed cost per m outside the map
 
-
 Planner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -109,8 +108,8 @@ def on_trail(
     """Returns the point of a trail `ahead` m closer to a goal, relative to `place`, (2,) m.
 
     The point is on the centre line.
-    If the goal is nearer than `ahead`, the point is the one nearest to the goal, or, with `beyond`,
-    lies past it.
+    If the goal is nearer than `ahead`, the point is the one nearest to the goal. With `beyond` it is
+    always `ahead` m further along the trail, and is shifted sideways with a goal that is still ahead.
     """
     length = np.linalg.norm(trail.end - trail.start, axis=1)
     way = (trail.end - trail.start) / length[:, None]

@@ -33,8 +33,8 @@ PLANS = (  # tag, title, text
         'hierarchical',
         '## Planning footsteps',
         'Measured by `examples/evaluate_plans.py` in whole episodes of 200 s, seed 0, with the scripted '
-        'and the reference policy, and of some with the expert that was imitated. *Reward*: normalised cumulative reward, 0 after a fall. *Speed*: '
-        'towards the goal (soccer: of the ball), m/s. *Trail*: median distance along the trail, m. *Ball '
+        'and the reference policy, and of some with the expert that was imitated. *Reward*: normalised '
+        'cumulative reward, 0 after a fall. *Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: median distance along the trail, m. *Ball '
         'at goal*: share of the time.',
     ),
     (

@@ -678,7 +678,7 @@ class JointExpertTest(parameterized.TestCase):
 
     @parameterized.parameters('Trail', 'Blocks', 'Soccer')
     def test_walks_on(self, name):
-        """10 s of 8 episodes: at most one fall, and goals reached or the ball approached."""
+        """10 s of 8 episodes: at most one fall, and the walkers leave their start."""
         environments = VectorEnvironment(
             f'PD_Biped3D_Terrain_{name}_Hard-v0',
             8,
