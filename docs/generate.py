@@ -245,13 +245,14 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         return ''
     run = next(run for run in found['runs'] if run['seed'] == found['shipped'])
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
-    unit, searched = task_type(spec).samples, 'cycles' in run['settings']
+    settings, unit = run['settings'], task_type(spec).samples
+    first, searched = settings.get('first', settings), 'cycles' in settings
     trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
     if searched:
         trained = f'{samples:g} decisions, each of which simulates all base actions'
         after = f'{taken:g} decisions'
-    if taken < run['settings'].get('cloned', 0) + run['settings'].get('evaluate_every', 0) / 2:
+    if taken < settings.get('cloned', 0) + settings.get('evaluate_every', 0) / 2:
         after += ', at the end of the imitation'
     seeds = len(found['runs'])
     gait = task_type(spec).score == 'distance'
@@ -264,15 +265,17 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
         *([('policy saved after', after)] if taken < 0.99 * samples else []),
-        *([('initial policy', begun(run['settings'], unit))] if run['settings'].get('start') else []),
+        *([('of these with PPO', f'the last {settings["samples"] / 1e6:.2g} million')] if first is not settings else []),
+        *([('initial policy', begun(first, unit))] if first.get('start') else []),
         *observing(spec),
         ('machine', run['machine']),
     )  # fmt: skip
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''
+    noise = 'without noise' if first is settings else 'with PPO of actions drawn at random'
     return (
         f'## The shipped policy\n\n{table(("", ""), facts)}\n\n'
         f'{picture("Learning curve", gallery.curve_path(spec.id))}\n\n'
-        f'*{"Distance" if gait else "Return"} during training, without noise{more}. All policies: [Results](../results.md).*'
+        f'*{"Distance" if gait else "Return"} during training, {noise}{more}. All policies: [Results](../results.md).*'
     )
 
 

@@ -418,7 +418,7 @@ class Learner:
         Raises:
           ValueError: its inputs or its base actions differ.
         """
-        line, weights, biases = policy.networks[0]
+        line, *_ = policy.networks[0]
         if line is None or not np.array_equal(policy.columns, self.columns):
             raise ValueError(
                 f'the network of {policy.id} has other inputs; expected one that learn_gaits.py trained'
@@ -430,19 +430,25 @@ class Learner:
                 f'{policy.id} selects among other base actions than this environment has'
             )
         self.mean, self.std = policy.mean.astype(float), policy.std.astype(float)
-        parts = [*self.network.filters, *self.network.hidden, self.network.last]
+        self.copy_weights(policy, 0, self.network)
+        self.target.load_state_dict(self.network.state_dict())
+
+    def copy_weights(self, policy: policies.Policy, member: int, network: Network) -> None:
+        """Copies the weights of one network of a policy that this program has trained."""
+        line, weights, biases = policy.networks[member]
+        assert line is not None
+        parts = [*network.filters, *network.hidden, network.last]
         weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in weights)]
         biases = [*line.biases, *biases]
         count = len(self.choices)
         with torch.no_grad():
-            if self.network.actors is not None and weights[-1].shape[0] > count:
-                self.network.actors.weight.copy_(torch.tensor(weights[-1][count:]))
-                self.network.actors.bias.copy_(torch.tensor(biases[-1][count:]))
+            if network.actors is not None and weights[-1].shape[0] > count:
+                network.actors.weight.copy_(torch.tensor(weights[-1][count:]))
+                network.actors.bias.copy_(torch.tensor(biases[-1][count:]))
             weights[-1], biases[-1] = weights[-1][:count], biases[-1][:count]
             for part, weight, bias in zip(parts, weights, biases, strict=True):
                 part.weight.copy_(torch.tensor(weight))
                 part.bias.copy_(torch.tensor(bias))
-        self.target.load_state_dict(self.network.state_dict())
 
     def seen(self, observation: np.ndarray) -> torch.Tensor:
         """Returns the networks' inputs for columns of observations."""
@@ -492,22 +498,13 @@ class Learner:
 
     def collect(self) -> None:
         """Runs one cycle in every simulation, and adds the transitions to the replay."""
-        s, simulations = self.settings, self.simulations
+        s = self.settings
         action, before = self.act(), self.observation[:, self.columns].astype(np.float16)
-        for i, past in enumerate(self.past):
-            past.append(simulations.get_state(i))
         taken = self.choices[action.number]
         if s.actors:
             taken = taken + action.change
-        reward, fell, distance = simulations.step(taken)
-        self.samples += s.num_envs
-        reward = reward + s.alive * ~fell
-        after, fresh = simulations.observation[:, self.columns].astype(np.float16), []
-        counted = np.stack([distance - self.travelled, fell], 1)[self.greedy]
-        np.add.at(self.tally, simulations.group[self.greedy], counted)
-        self.travelled = np.where(fell, 0.0, distance)
-        self.tried[1] += 1
-        self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
+        reward, fell, seen = self.run(taken)
+        after = seen[:, self.columns].astype(np.float16)
         for i, chain in enumerate(self.chains):
             each_action = Action(int(action.number[i]), action.change[i], bool(action.noisy[i]))
             chain.append((before[i], each_action, float(reward[i])))
@@ -516,6 +513,25 @@ class Learner:
                 discount = 0.0 if fell[i] else s.gamma ** len(chain)
                 self.replay.add(chain[0][0], chain[0][1], value, discount, after[i])
                 del chain[0]
+
+    def run(self, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Runs one cycle in every simulation; after a fall, returns to an earlier state or resets.
+
+        Returns:
+          The rewards, (n,); whether there was a fall, (n,); and the observations before simulations
+          returned to an earlier state, (n, size).
+        """
+        s, simulations = self.settings, self.simulations
+        for i, past in enumerate(self.past):
+            past.append(simulations.get_state(i))
+        reward, fell, distance = simulations.step(taken)
+        self.samples += s.num_envs
+        after, fresh = simulations.observation, []
+        counted = np.stack([distance - self.travelled, fell], 1)[self.greedy]
+        np.add.at(self.tally, simulations.group[self.greedy], counted)
+        self.travelled = np.where(fell, 0.0, distance)
+        self.tried[1] += 1
+        self.tried[0, self.tried[1] > s.back[1] + s.retry_cycles] = 0
         for i in np.flatnonzero(fell).tolist():
             if self.go_back(i):
                 continue
@@ -525,6 +541,7 @@ class Learner:
         if fresh:
             simulations.reset(fresh)
         self.observation = simulations.observation
+        return reward + s.alive * ~fell, fell, after
 
     def go_back(self, env_id: int) -> bool:
         """Restores the state some cycles before a fall; returns whether it did."""
@@ -695,8 +712,8 @@ class Learner:
         self.curve.append(point)
         return point
 
-    def save(self, folder: pathlib.Path) -> None:
-        """Writes checkpoint, curve and policy."""
+    def get_state(self) -> dict[str, Any]:
+        """Returns all that a checkpoint holds."""
         state = {name: getattr(self, name) for name in _STATE}
         state |= {name: getattr(self, name).state_dict() for name in _PARTS}
         state |= {name: getattr(self, name).get_state() for name in ('replay', 'simulations')}
@@ -708,7 +725,11 @@ class Learner:
         ]
         state['settings'] = dataclasses.asdict(self.settings)
         state['random'] = self.random.bit_generator.state
-        checkpoints.save(state, folder / 'checkpoint.pt')
+        return state
+
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes checkpoint, curve and policy."""
+        checkpoints.save(self.get_state(), folder / 'checkpoint.pt')
         self.write_curve(folder)
         policies.save(self.exported(), folder / 'last.npz')
 
@@ -724,6 +745,10 @@ class Learner:
         state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
         if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
             raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        self.set_state(state)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restores the state returned by `get_state` of a run with these settings."""
         empty = self.past
         for name in _STATE:
             setattr(self, name, state[name])

@@ -266,8 +266,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         '# Results',
         f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments. This page is '
         f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
-        'run of `examples/ppo.py`, or of `examples/search_gaits.py` or `examples/learn_gaits.py` for gait '
-        'environments, with the settings in its JSON file; `examples/train_all.py` repeats them. Of '
+        'run of `examples/ppo.py`, or for gait environments of `examples/search_gaits.py`, '
+        '`examples/learn_gaits.py` or `examples/refine_gaits.py`, with the settings in its JSON file; `examples/train_all.py` repeats them. Of '
         'several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
         '[comparison with the papers](findings.md).',
         f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes that were '
@@ -313,7 +313,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which are truncated after '
             f'{terrainrl.STEP_LIMIT} cycles; the mean with its 95 % interval; speed in m/s. *Decisions*: with '
             '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
-            '`examples/learn_gaits.py`, simulated cycles.',
+            '`examples/learn_gaits.py` and `examples/refine_gaits.py`, simulated cycles.',
             table(
                 (
                     'environment',

@@ -7,7 +7,7 @@
     python examples/train_all.py --ray                 # on all cores, or on those of a cluster
 
 Each run is `examples/ppo.py` on one thread, or for gait environments (FSM_...)
-`examples/learn_gaits.py` or `examples/search_gaits.py`. A run that uses the policy of another
+`examples/learn_gaits.py`, `examples/refine_gaits.py` or `examples/search_gaits.py`. A run that uses the policy of another
 environment, as initial policy or as footstep controller, starts after the runs of that environment.
 Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
 into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
@@ -44,6 +44,7 @@ import checkpoints
 import learn_gaits
 import numpy as np
 import ppo
+import refine_gaits
 import search_gaits
 import tqdm
 
@@ -76,6 +77,10 @@ LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.p
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
 )  # fmt: skip
 
+REFINED = (  # of these, environments whose policies refine_gaits.py improves
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
+)
+
 
 def compared(spec: catalogue.EnvSpec) -> bool:
     """Returns whether an environment is part of the comparison of actuation models."""
@@ -106,12 +111,15 @@ def program(id_: str) -> ModuleType:
     """Returns the program that trains an environment."""
     if catalogue.BY_ID[id_].actuation != 'gait':
         return ppo
+    if id_ in REFINED:
+        return refine_gaits
     return learn_gaits if id_ in LEARNT else search_gaits
 
 
 def start_of(id_: str) -> str | None:
     """Returns the initial policy of the training of an environment, if any."""
-    return getattr(program(id_).settings_for(id_), 'start', None)
+    own = program(id_).settings_for(id_)
+    return getattr(getattr(own, 'first', own), 'start', None)
 
 
 def needed(id_: str) -> list[str]:
@@ -135,8 +143,12 @@ def entries(id_: str) -> list[dict[str, Any]]:
     runs = json.loads(path.read_text())['runs']
     default = json.loads(json.dumps(dataclasses.asdict(program(id_).Settings())))
     for run in runs:  # new settings get their defaults, removed ones are dropped
-        own = run['settings']
-        run['settings'] = {name: own.get(name, value) for name, value in default.items()}
+        run['settings'] = own = {
+            name: run['settings'].get(name, value) for name, value in default.items()
+        }
+        if 'first' in default:
+            first = default['first'].items()
+            own['first'] = {name: own['first'].get(name, value) for name, value in first}
     return runs
 
 

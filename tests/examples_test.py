@@ -533,9 +533,25 @@ class TrimTest(absltest.TestCase):
             ('PD_Biped2D_Flat-v0', 'ppo'),
             ('FSM_Hopper2D_Terrain_Gaps-v0', 'search_gaits'),
             ('FSM_Dog2D_Terrain_Mixed-v0', 'learn_gaits'),
+            ('FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'refine_gaits'),
         ):
             self.assertEqual(train_all.program(id_).__name__, program)
             self.assertIn('samples', train_all.settings(id_))
+
+    def test_old_entries_get_new_settings(self):
+        id_ = 'FSM_Biped2D_Terrain_Slopes_Mixed-v0'
+        settings = train_all.settings(id_)
+        old = {**settings, 'first': dict(settings['first']), 'removed': 1}
+        del old['retry'], old['first']['members']
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / f'{id_}.json'
+            path.write_text(json.dumps({'id': id_, 'shipped': 1, 'runs': [{'settings': old}]}))
+            with mock.patch.dict('os.environ', TRL_SUITE_TRAINED=folder):
+                [run] = train_all.entries(id_)
+        default = train_all.refine_gaits.Settings()
+        expected = {**settings, 'retry': default.retry}
+        expected['first'] = {**settings['first'], 'members': default.first.members}
+        self.assertEqual(run['settings'], expected)
 
 
 class ProgramsTest(parameterized.TestCase):

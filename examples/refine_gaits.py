@@ -1,0 +1,315 @@
+"""Improves a policy that selects base actions of a gait, with PPO, in one file, on the CPU.
+
+    python examples/refine_gaits.py FSM_Biped2D_Terrain_Slopes_Mixed-v0 --seed 1 --threads 1
+    python examples/refine_gaits.py FSM_Goat2D_Terrain_Cliffs-v0 --start FSM_Goat2D_Terrain_Cliffs-v0
+
+Q-learning (`learn_gaits.py`) levels off: what decides about a fall are small differences between
+estimated values. PPO (Schulman et al. 2017) begins with its networks: their mean values, times
+`sharpness`, are the logits of the base actions. It then learns from what these actions really lead
+to. The policy selects the action with the largest logit, and its files are those of `learn_gaits.py`.
+
+After a fall most simulations return to a state a few cycles earlier, as in `learn_gaits.py`; these
+returns end a trajectory, and the actions after them are those of the policy.
+
+Without `--start` the policy is first learnt by `learn_gaits.py`, with the settings of the
+environment, in the folder OUTPUT/ID/seed_S/first. Writes into OUTPUT/ID/seed_S: `checkpoint.pt`
+(everything; the same command continues from it with identical results, and with a larger
+`--samples` for longer), `curve.json` (settings, learning curve) and `policy.npz`.
+Needs `pip install 'trl_suite[train]'`.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pathlib
+import time
+from typing import Any
+
+import checkpoints
+import learn_gaits
+import numpy as np
+import ppo
+import ppo_settings
+import torch
+import tqdm
+from torch import nn
+
+from trl_suite import policies
+from trl_suite.util.program import begin_script
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of a run, besides environment and seed."""
+
+    # Of the run of `learn_gaits.py` whose policy is improved.
+    first: learn_gaits.Settings = dataclasses.field(default_factory=learn_gaits.Settings)
+    start: str = ''  # environment, or file, of the initial policy instead; '': none
+    # Ids, or patterns of ids, of further environments of the character; all have as many simulations.
+    also: tuple[str, ...] = ()
+    samples: float = 3e5  # cycles
+    num_envs: int = 64
+    horizon: int = 64  # cycles of each simulation between two updates
+    sharpness: float = 4.0  # logits per unit of value
+    epochs: int = 4
+    minibatch: int = 1024
+    learning_rate: float = 5e-5
+    last_learning_rate: float = 2e-5  # reached by a linear decrease
+    value_rate: float = 3e-4  # learning rate of the value network
+    value_first: int = 3  # first updates, in which only the value is trained
+    value_epochs: int = 12  # of these updates
+    gamma: float = 0.95  # per cycle
+    lambda_: float = 0.95
+    clip: float = 0.2
+    kl: float = 0.02  # an update of the policy stops at this divergence
+    gradient_norm: float = 0.5
+    greedy: float = 0.34  # share of simulations that do not return to earlier states
+    retry: float = 0.5  # probability that the others do after a fall
+    retries: int = 6  # largest number of returns in a row
+    back: tuple[int, int] = (1, 5)  # smallest and largest number of cycles, before the last one
+    write_every: float = 16384  # cycles
+    evaluate_every: float = 32768  # cycles
+
+
+# Environments that are easy for their generalist take no part.
+HARD = ('Mixed', 'Walls', 'Gaps', 'Cliffs')
+OVERRIDES: dict[str, dict[str, Any]] = {
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
+        'also': tuple(f'FSM_Biped2D_Terrain_{name}-v0' for name in HARD), 'num_envs': 75,
+    },
+}  # fmt: skip
+VALUE_SCALE = 5.0  # outputs of the value network are multiplied by it
+# Settings that may change when a run is continued.
+_CHANGEABLE = 'samples', 'write_every', 'evaluate_every'
+_PARTS = 'policy', 'value', 'policy_optimizer', 'value_optimizer'
+
+
+def settings_for(id_: str, **changes: Any) -> Settings:
+    """The settings of an environment."""
+    own = ppo_settings.matching(id_, OVERRIDES.items())
+    return Settings(**{'first': learn_gaits.settings_for(id_), **own, **changes})
+
+
+class Batch(dict[str, torch.Tensor]):
+    """What an update learns from: seen (n, size), action, log_probability, advantage, reward_sum (n,)."""
+
+
+class Refiner:
+    """One run: simulations as in Q-learning, the policy, the value and the progress."""
+
+    def __init__(
+        self, id_: str, seed: int, settings: Settings, threads: int, initial: policies.Policy
+    ) -> None:
+        self.settings, s = settings, settings
+        own = dataclasses.replace(
+            s.first, also=s.also, num_envs=s.num_envs, start='', capacity=1, greedy=s.greedy,
+            retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
+        )  # fmt: skip
+        self.learner = learner = learn_gaits.Learner(id_, seed, own, threads)
+        learner.begin_with(initial)
+        networks = [copy.deepcopy(learner.network) for _ in initial.networks]
+        for number, network in enumerate(networks):
+            learner.copy_weights(initial, number, network)
+        self.policy = nn.ModuleList(networks)
+        self.value = copy.deepcopy(networks[0])
+        self.value.last = nn.Linear(self.value.last.in_features, 1)
+        nn.init.zeros_(self.value.last.weight)
+        nn.init.zeros_(self.value.last.bias)
+        self.policy_optimizer = torch.optim.Adam(self.policy.parameters(), s.learning_rate)
+        self.value_optimizer = torch.optim.Adam(self.value.parameters(), s.value_rate)
+
+    @property
+    def samples(self) -> int:
+        """Number of cycles so far."""
+        return self.learner.samples
+
+    def log_probabilities(self, seen: torch.Tensor) -> torch.Tensor:
+        """Returns the logarithms of the probabilities of all base actions, (n, b)."""
+        values = sum(network(seen) for network in self.policy) / len(self.policy)
+        return torch.log_softmax(self.settings.sharpness * values, 1)
+
+    def estimate(self, seen: torch.Tensor) -> torch.Tensor:
+        """Returns the estimated sums of future rewards, (n,)."""
+        return VALUE_SCALE * self.value(seen)[:, 0]
+
+    def seen(self) -> torch.Tensor:
+        """Returns the networks' inputs for the current observations."""
+        return self.learner.seen(self.learner.observation[:, self.learner.columns])
+
+    @torch.no_grad()
+    def collect(self) -> Batch:
+        """Runs `horizon` cycles, and returns advantages by GAE (Schulman et al. 2016)."""
+        s, learner, parts = self.settings, self.learner, []
+        n = s.num_envs
+        for _ in range(s.horizon):
+            seen = self.seen()
+            likely = self.log_probabilities(seen)
+            below = likely.exp().cumsum(1).numpy()
+            drawn = learner.random.random((n, 1)) * below[:, -1:]
+            number = np.minimum((below < drawn).sum(1), below.shape[1] - 1)
+            reward, fell, _ = learner.run(learner.choices[number])
+            action = torch.from_numpy(number)
+            own = likely.gather(1, action[:, None])[:, 0]
+            parts.append((seen, action, own, self.estimate(seen), torch.tensor(reward), fell))
+        following, advantage, sums = self.estimate(self.seen()), torch.zeros(n), []
+        for _, _, _, value, reward, fell in reversed(parts):
+            goes_on = torch.from_numpy(~fell)
+            error = reward.float() + s.gamma * goes_on * following - value
+            advantage = error + s.gamma * s.lambda_ * goes_on * advantage
+            following = value
+            sums.append((advantage, advantage + value))
+        seen, action, likely, *_ = zip(*parts, strict=True)
+        advantages, reward_sums = zip(*reversed(sums), strict=True)
+        whole = seen, action, likely, advantages, reward_sums
+        names = 'seen', 'action', 'log_probability', 'advantage', 'reward_sum'
+        return Batch(zip(names, map(torch.cat, whole), strict=True))
+
+    def learn(self, batch: Batch) -> None:
+        """Updates value and policy."""
+        s, learner = self.settings, self.learner
+        only_value = learner.updates < s.value_first
+        share = min(1.0, self.samples / s.samples)
+        rate = s.learning_rate + share * (s.last_learning_rate - s.learning_rate)
+        for group in self.policy_optimizer.param_groups:
+            group['lr'] = rate
+        advantage = batch['advantage']
+        batch['advantage'] = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        for _ in range(s.value_epochs if only_value else s.epochs):
+            order = torch.from_numpy(learner.random.permutation(len(advantage)))
+            for picked in order.split(s.minibatch):
+                b = {name: value[picked] for name, value in batch.items()}
+                loss = (self.estimate(b['seen']) - b['reward_sum']).square().mean()
+                _descend(loss, self.value_optimizer)
+                learner.loss = float(loss.detach())
+                if only_value:
+                    continue
+                likely = self.log_probabilities(b['seen'])
+                likely = likely.gather(1, b['action'][:, None])[:, 0]
+                change = likely - b['log_probability']
+                if float(-change.detach().mean()) > s.kl:
+                    only_value = True  # in the rest of this update
+                    continue
+                ratio = change.exp()
+                gain = torch.minimum(
+                    ratio * b['advantage'],
+                    ratio.clamp(1 - s.clip, 1 + s.clip) * b['advantage'],
+                )
+                self.policy_optimizer.zero_grad()
+                (-gain.mean()).backward()
+                nn.utils.clip_grad_norm_(self.policy.parameters(), s.gradient_norm)
+                self.policy_optimizer.step()
+        learner.updates += 1
+
+    def advance(self) -> None:
+        """Collects, and updates the networks."""
+        begin, seconds = time.process_time(), self.learner.seconds
+        batch = self.collect()
+        middle = time.process_time()
+        self.learn(batch)
+        seconds['simulation'] += middle - begin
+        seconds['learning'] += time.process_time() - middle
+
+    def exported(self) -> policies.Policy:
+        """Returns the policy without PyTorch."""
+        networks = copy.deepcopy(self.policy).requires_grad_(False)
+        if len(networks) > 1:
+            self.learner.members = list(networks)
+        else:
+            self.learner.target = networks[0]
+        return self.learner.exported()
+
+    def get_state(self) -> dict[str, Any]:
+        """Returns all that a checkpoint holds."""
+        state = {name: getattr(self, name).state_dict() for name in _PARTS}
+        self.exported()
+        return {
+            **state, 'learner': self.learner.get_state(),
+            'settings': dataclasses.asdict(self.settings),
+        }  # fmt: skip
+
+    def restore(self, folder: pathlib.Path) -> None:
+        """Restores the run from its checkpoint."""
+        state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
+        if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
+            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
+        self.learner.set_state(state['learner'])
+
+    def write(self, folder: pathlib.Path, before: list[dict[str, Any]], threads: int) -> None:
+        """Writes curve and policy; the curve continues that of the first run, `before`."""
+        done = before[-1]['samples'] if before else 0
+        points = [{**point, 'samples': point['samples'] + done} for point in self.learner.curve]
+        checkpoints.write_curve(
+            folder, self.learner.environments.spec.id, self.learner.seed, self.settings, threads,
+            [*before, *points], environments=self.learner.ids,
+        )  # fmt: skip
+        policy = self.exported()
+        info = {**policy.info, 'samples': self.samples + done}
+        policies.save(dataclasses.replace(policy, info=info), folder / 'policy.npz')
+
+
+def _descend(loss: torch.Tensor, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+
+
+def initial_policy(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int
+) -> tuple[policies.Policy, list[dict[str, Any]]]:
+    """Returns the initial policy, and its learning curve if it is learnt here."""
+    if settings.start:
+        shipped = settings.start in policies.available()
+        return (policies.reference if shipped else policies.load)(settings.start), []
+    curve = learn_gaits.train(id_, seed, settings.first, folder / 'first', threads)
+    return policies.load(folder / 'first' / 'policy.npz'), curve
+
+
+def train(
+    id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int = 0
+) -> list[dict[str, Any]]:
+    """Trains to the end, from the checkpoint in `folder` if there is one; returns the curve.
+
+    Raises:
+      ValueError: the checkpoint is damaged, or has other settings; only those in `_CHANGEABLE` may
+        differ.
+      RuntimeError: another process trains in the folder.
+    """
+    with checkpoints.only_run(folder):
+        torch.set_num_threads(1)
+        initial, before = initial_policy(id_, seed, settings, folder, threads)
+        refiner, s = Refiner(id_, seed, settings, threads, initial), settings
+        if (folder / 'checkpoint.pt').exists():
+            refiner.restore(folder)
+        with tqdm.tqdm(total=int(s.samples), initial=refiner.samples, unit='cycle') as bar:
+            bar.set_description(id_)
+            while refiner.samples < s.samples:
+                begin = refiner.samples
+                refiner.advance()
+                bar.update(refiner.samples - begin)
+                ends = refiner.samples >= s.samples
+                if ends or refiner.samples // s.evaluate_every > begin // s.evaluate_every:
+                    point = refiner.learner.evaluate()
+                    bar.set_postfix(distance=f'{point.get("distance", np.nan):.1f} m')
+                    refiner.write(folder, before, threads)
+                if ends or refiner.samples // s.write_every > begin // s.write_every:
+                    checkpoints.save(refiner.get_state(), folder / 'checkpoint.pt')
+        refiner.write(folder, before, threads)
+        return [*before, *refiner.learner.curve]
+
+
+def main() -> None:
+    id_, seed, changes, folder, threads = ppo.command_line(
+        __doc__.splitlines()[0], 'cycles', {'start': {}}
+    )
+    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
+        if 'distance' in point:
+            print(f'{point["samples"]:9} {point["distance"]:.1f} m')
+    print(folder / 'policy.npz')
+
+
+if __name__ == '__main__':
+    begin_script()
+    main()
