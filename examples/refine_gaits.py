@@ -77,7 +77,10 @@ HARD = ('Mixed', 'Walls', 'Gaps', 'Cliffs')
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
         'also': tuple(f'FSM_Biped2D_Terrain_{name}-v0' for name in HARD), 'num_envs': 75,
+        'samples': 624e3, 'last_learning_rate': 2.5e-5, 'kl': 0.0225,
     },
+    'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 2.5e5, 'retry': 0.7},
+    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 1.2e5, 'num_envs': 48},
 }  # fmt: skip
 VALUE_SCALE = 5.0  # outputs of the value network are multiplied by it
 # Settings that may change when a run is continued.

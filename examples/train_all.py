@@ -78,8 +78,9 @@ LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.p
 )  # fmt: skip
 
 REFINED = (  # of these, environments whose policies refine_gaits.py improves
-    'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
-)
+    'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
+    'FSM_Goat2D_Terrain_Cliffs-v0',
+)  # fmt: skip
 
 
 def compared(spec: catalogue.EnvSpec) -> bool:
