@@ -15,7 +15,7 @@ import io
 import json
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,25 @@ def load(path: pathlib.Path) -> dict[str, Any]:
             f'{path}: the checkpoint contains {other[1] if other else "other objects"}; '
             f'expected arrays, numbers and strings; {remedy}'
         ) from None
+
+
+def load_run(
+    folder: pathlib.Path, settings: Any, changeable: Collection[str] = ()
+) -> dict[str, Any]:
+    """Returns the state in the checkpoint of a run.
+
+    Args:
+      folder: of the run; the file is `checkpoint.pt`.
+      settings: settings with which the run continues, a dataclass.
+      changeable: names of settings that may differ from those in the checkpoint.
+
+    Raises:
+      ValueError: as `load`, or the checkpoint has other settings.
+    """
+    state, own = load(folder / 'checkpoint.pt'), dataclasses.asdict(settings)
+    if {**state['settings'], **{name: own[name] for name in changeable}} != own:
+        raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+    return state
 
 
 @contextlib.contextmanager

@@ -325,14 +325,26 @@ class Simulations:
             environments.set_state(each)
 
 
+def initial_policy(start: str) -> policies.Policy:
+    """Returns the shipped policy of an environment, or the policy in a file."""
+    return (policies.reference if start in policies.available() else policies.load)(start)
+
+
 def environments_of(id_: str, settings: Settings) -> list[str]:
-    """Returns the ids of all environments of a run; its own comes first."""
+    """Returns the ids of all environments of a run; its own comes first.
+
+    Raises:
+      ValueError: a pattern matches no id, or an environment has no gait.
+    """
     ids = [id_]
     for pattern in settings.also:
         found = fnmatch.filter(catalogue.BY_ID, pattern)
         if not found:
             raise ValueError(errors.unknown('environment', pattern, catalogue.BY_ID))
         ids += [other for other in found if other != id_ or pattern == id_]
+    for other in ids:
+        if catalogue.BY_ID[other].actuation != 'gait':
+            raise ValueError(f'{other} has no gait; expected an environment FSM_...')
     return ids
 
 
@@ -374,8 +386,7 @@ class Learner:
         )
         self.expert = policies.reference(id_) if id_ in policies.available() else None
         if s.start:
-            shipped = s.start in policies.available()
-            self.expert = (policies.reference if shipped else policies.load)(s.start)
+            self.expert = initial_policy(s.start)
             self.begin_with(self.expert)
         self.samples = self.updates = 0
         self.renewed = 0  # number of samples when the policy last learnt with a falling rate
@@ -742,10 +753,7 @@ class Learner:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
-        if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
-            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
-        self.set_state(state)
+        self.set_state(checkpoints.load_run(folder, self.settings, _CHANGEABLE))
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores the state returned by `get_state` of a run with these settings."""
@@ -812,15 +820,20 @@ def _train(
     return learner.curve
 
 
+def report(curve: list[dict[str, Any]], folder: pathlib.Path) -> None:
+    """Prints a learning curve, and where the policy is."""
+    for point in curve:
+        if 'distance' in point:
+            print(f'{point["samples"]:9} {point["distance"]:.1f} m')
+    print(folder / 'policy.npz')
+
+
 def main() -> None:
     further = {'action': {'choices': ACTIONS}, 'members': {'type': int}}
     id_, seed, changes, folder, threads = ppo.command_line(
         __doc__.splitlines()[0], 'cycles', further
     )
-    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        if 'distance' in point:
-            print(f'{point["samples"]:9} {point["distance"]:.1f} m')
-    print(folder / 'policy.npz')
+    report(train(id_, seed, settings_for(id_, **changes), folder, threads), folder)
 
 
 if __name__ == '__main__':

@@ -763,9 +763,7 @@ class Trainer:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        state = checkpoints.load(folder / 'checkpoint.pt')
-        if state['settings'] != dataclasses.asdict(self.settings):
-            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        state = checkpoints.load_run(folder, self.settings)
         for name in _STATE:
             setattr(self, name, state[name])
         self.set_learnt(state)

@@ -77,10 +77,10 @@ HARD = ('Mixed', 'Walls', 'Gaps', 'Cliffs')
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
         'also': tuple(f'FSM_Biped2D_Terrain_{name}-v0' for name in HARD), 'num_envs': 75,
-        'samples': 624e3, 'last_learning_rate': 2.5e-5, 'kl': 0.0225,
+        'samples': 624e3, 'last_learning_rate': 2.5e-5, 'kl': 0.0225, 'evaluate_every': 24e3,
     },
-    'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 2.5e5, 'retry': 0.7},
-    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 1.2e5, 'num_envs': 48},
+    'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 2.5e5, 'retry': 0.7, 'evaluate_every': 12288},
+    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 1.2e5, 'num_envs': 48, 'evaluate_every': 12288},
 }  # fmt: skip
 VALUE_SCALE = 5.0  # outputs of the value network are multiplied by it
 # Settings that may change when a run is continued.
@@ -94,17 +94,23 @@ def settings_for(id_: str, **changes: Any) -> Settings:
     return Settings(**{'first': learn_gaits.settings_for(id_), **own, **changes})
 
 
-class Batch(dict[str, torch.Tensor]):
-    """What an update learns from: seen (n, size), action, log_probability, advantage, reward_sum (n,)."""
-
-
 class Refiner:
     """One run: simulations as in Q-learning, the policy, the value and the progress."""
 
     def __init__(
         self, id_: str, seed: int, settings: Settings, threads: int, initial: policies.Policy
     ) -> None:
+        """Begins with a policy of `learn_gaits.py`.
+
+        Raises:
+          ValueError: the policy does not fit the environment, actors change the base actions, or an
+            environment has no gait.
+        """
         self.settings, s = settings, settings
+        if s.first.actors:
+            raise ValueError(
+                f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
+            )
         own = dataclasses.replace(
             s.first, also=s.also, num_envs=s.num_envs, start='', capacity=1, greedy=s.greedy,
             retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
@@ -141,34 +147,38 @@ class Refiner:
         return self.learner.seen(self.learner.observation[:, self.learner.columns])
 
     @torch.no_grad()
-    def collect(self) -> Batch:
-        """Runs `horizon` cycles, and returns advantages by GAE (Schulman et al. 2016)."""
-        s, learner, parts = self.settings, self.learner, []
-        n = s.num_envs
-        for _ in range(s.horizon):
-            seen = self.seen()
-            likely = self.log_probabilities(seen)
-            below = likely.exp().cumsum(1).numpy()
-            drawn = learner.random.random((n, 1)) * below[:, -1:]
-            number = np.minimum((below < drawn).sum(1), below.shape[1] - 1)
-            reward, fell, _ = learner.run(learner.choices[number])
-            action = torch.from_numpy(number)
-            own = likely.gather(1, action[:, None])[:, 0]
-            parts.append((seen, action, own, self.estimate(seen), torch.tensor(reward), fell))
-        following, advantage, sums = self.estimate(self.seen()), torch.zeros(n), []
-        for _, _, _, value, reward, fell in reversed(parts):
-            goes_on = torch.from_numpy(~fell)
-            error = reward.float() + s.gamma * goes_on * following - value
-            advantage = error + s.gamma * s.lambda_ * goes_on * advantage
-            following = value
-            sums.append((advantage, advantage + value))
-        seen, action, likely, *_ = zip(*parts, strict=True)
-        advantages, reward_sums = zip(*reversed(sums), strict=True)
-        whole = seen, action, likely, advantages, reward_sums
-        names = 'seen', 'action', 'log_probability', 'advantage', 'reward_sum'
-        return Batch(zip(names, map(torch.cat, whole), strict=True))
+    def collect(self) -> dict[str, torch.Tensor]:
+        """Runs `horizon` cycles of all simulations.
 
-    def learn(self, batch: Batch) -> None:
+        Returns:
+          One row for each of these cycles: what the networks have seen, the number of the base action,
+          its log-probability, its advantage by GAE, and the target of the value.
+        """
+        s, learner = self.settings, self.learner
+        shape = s.horizon, s.num_envs
+        seen, likely, number, fell = [], [], np.zeros(shape, int), np.zeros(shape, bool)
+        reward, values = np.zeros(shape), np.zeros((s.horizon + 1, s.num_envs))
+        for t in range(s.horizon):
+            seen.append(self.seen())
+            likely.append(self.log_probabilities(seen[-1]))
+            values[t] = self.estimate(seen[-1]).numpy()
+            below = likely[-1].exp().cumsum(1).numpy()
+            drawn = learner.random.random((s.num_envs, 1)) * below[:, -1:]
+            number[t] = np.minimum((below < drawn).sum(1), below.shape[1] - 1)
+            reward[t], fell[t], _ = learner.run(learner.choices[number[t]])
+        values[-1] = self.estimate(self.seen()).numpy()
+        following = np.where(fell, 0.0, values[1:])
+        advantage = ppo.advantages(reward, values[:-1], following, fell, s.gamma, s.lambda_)
+        action = torch.from_numpy(number.ravel())
+        return {
+            'seen': torch.cat(seen),
+            'action': action,
+            'log_probability': torch.cat(likely).gather(1, action[:, None])[:, 0],
+            'advantage': torch.from_numpy(advantage.astype(np.float32)).flatten(),
+            'target': torch.from_numpy((advantage + values[:-1]).astype(np.float32)).flatten(),
+        }
+
+    def learn(self, batch: dict[str, torch.Tensor]) -> None:
         """Updates value and policy."""
         s, learner = self.settings, self.learner
         only_value = learner.updates < s.value_first
@@ -182,8 +192,10 @@ class Refiner:
             order = torch.from_numpy(learner.random.permutation(len(advantage)))
             for picked in order.split(s.minibatch):
                 b = {name: value[picked] for name, value in batch.items()}
-                loss = (self.estimate(b['seen']) - b['reward_sum']).square().mean()
-                _descend(loss, self.value_optimizer)
+                loss = (self.estimate(b['seen']) - b['target']).square().mean()
+                self.value_optimizer.zero_grad()
+                loss.backward()
+                self.value_optimizer.step()
                 learner.loss = float(loss.detach())
                 if only_value:
                     continue
@@ -224,18 +236,15 @@ class Refiner:
 
     def get_state(self) -> dict[str, Any]:
         """Returns all that a checkpoint holds."""
-        state = {name: getattr(self, name).state_dict() for name in _PARTS}
-        self.exported()
         return {
-            **state, 'learner': self.learner.get_state(),
+            **{name: getattr(self, name).state_dict() for name in _PARTS},
+            'learner': self.learner.get_state(),
             'settings': dataclasses.asdict(self.settings),
-        }  # fmt: skip
+        }
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from its checkpoint."""
-        state, own = checkpoints.load(folder / 'checkpoint.pt'), dataclasses.asdict(self.settings)
-        if {**state['settings'], **{name: own[name] for name in _CHANGEABLE}} != own:
-            raise ValueError(f'{folder} holds a run with other settings: {state["settings"]}')
+        state = checkpoints.load_run(folder, self.settings, _CHANGEABLE)
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
         self.learner.set_state(state['learner'])
@@ -253,19 +262,12 @@ class Refiner:
         policies.save(dataclasses.replace(policy, info=info), folder / 'policy.npz')
 
 
-def _descend(loss: torch.Tensor, optimizer: torch.optim.Optimizer) -> None:
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()
-
-
-def initial_policy(
+def first_policy(
     id_: str, seed: int, settings: Settings, folder: pathlib.Path, threads: int
 ) -> tuple[policies.Policy, list[dict[str, Any]]]:
     """Returns the initial policy, and its learning curve if it is learnt here."""
     if settings.start:
-        shipped = settings.start in policies.available()
-        return (policies.reference if shipped else policies.load)(settings.start), []
+        return learn_gaits.initial_policy(settings.start), []
     curve = learn_gaits.train(id_, seed, settings.first, folder / 'first', threads)
     return policies.load(folder / 'first' / 'policy.npz'), curve
 
@@ -282,7 +284,7 @@ def train(
     """
     with checkpoints.only_run(folder):
         torch.set_num_threads(1)
-        initial, before = initial_policy(id_, seed, settings, folder, threads)
+        initial, before = first_policy(id_, seed, settings, folder, threads)
         refiner, s = Refiner(id_, seed, settings, threads, initial), settings
         if (folder / 'checkpoint.pt').exists():
             refiner.restore(folder)
@@ -307,10 +309,8 @@ def main() -> None:
     id_, seed, changes, folder, threads = ppo.command_line(
         __doc__.splitlines()[0], 'cycles', {'start': {}}
     )
-    for point in train(id_, seed, settings_for(id_, **changes), folder, threads):
-        if 'distance' in point:
-            print(f'{point["samples"]:9} {point["distance"]:.1f} m')
-    print(folder / 'policy.npz')
+    curve = train(id_, seed, settings_for(id_, **changes), folder, threads)
+    learn_gaits.report(curve, folder)
 
 
 if __name__ == '__main__':

@@ -73,10 +73,10 @@ class RefineTest(parameterized.TestCase):
         falls = iter(np.array([[False] * 4, [True, False, False, False], [False] * 4]))
         refiner.learner.run = lambda taken: (next(rewards), next(falls), None)
         batch = refiner.collect()  # the initial value is 0 everywhere
-        sums = batch['reward_sum'].reshape(3, 4)
+        sums = batch['target'].reshape(3, 4)
         np.testing.assert_allclose(sums[:, 0], [1 + 0.5 * 2, 2, 4])  # after the fall, another one
         np.testing.assert_allclose(sums[:, 1], [1 + 0.5 * 2 + 0.25 * 4, 2 + 0.5 * 4, 4])
-        np.testing.assert_allclose(batch['advantage'], batch['reward_sum'])
+        np.testing.assert_allclose(batch['advantage'], batch['target'])
 
     def test_it_selects_what_pays_more_often(self):
         refiner, _ = make(num_envs=8, value_first=0, learning_rate=1e-3, kl=1.0, horizon=16)
@@ -126,6 +126,22 @@ class RefineTest(parameterized.TestCase):
             with self.assertRaisesRegex(ValueError, 'other settings'):
                 other = dataclasses.replace(settings, gamma=0.9)
                 refine_gaits.train(HOPPER, 1, other, folders[0], 1)
+
+    def test_other_actions_and_environments_are_refused(self):
+        actors = dataclasses.replace(FIRST, action='both')
+        with self.assertRaisesRegex(ValueError, "'both'; expected 'discrete'"):
+            make(first=actors)
+        with self.assertRaisesRegex(ValueError, 'PD_Biped2D_Flat-v0 has no gait'):
+            refine_gaits.train(
+                'PD_Biped2D_Flat-v0',
+                1,
+                SMALL,
+                pathlib.Path(self.enterContext(tempfile.TemporaryDirectory())),
+                1,
+            )
+        initial = policies.reference('FSM_Dog2D_Terrain_Mixed-v0')
+        with self.assertRaisesRegex(ValueError, 'FSM_Dog2D_Terrain_Mixed-v0'):
+            refine_gaits.Refiner(HOPPER, 1, SMALL, 1, initial)
 
     def test_a_run_begins_with_a_file(self):
         _, initial = make()
