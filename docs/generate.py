@@ -271,7 +271,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ('machine', run['machine']),
     )  # fmt: skip
     more = f'; grey: the other {seeds - 1} seeds' if seeds > 1 else ''
-    noise = 'without noise' if first is settings else 'with PPO of actions drawn at random'
+    noise = 'without noise' if first is settings else 'with PPO of the actions it draws'
     return (
         f'## The shipped policy\n\n{table(("", ""), facts)}\n\n'
         f'{picture("Learning curve", gallery.curve_path(spec.id))}\n\n'

@@ -34,8 +34,8 @@ PLANS = (  # tag, title, text
         '## Planning footsteps',
         'Measured by `examples/evaluate_plans.py` in whole episodes of 200 s, seed 0, with the scripted '
         'and the reference policy, and of some with the expert that was imitated. *Reward*: normalised '
-        'cumulative reward, 0 after a fall. *Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: median distance along the trail, m. *Ball '
-        'at goal*: share of the time.',
+        'cumulative reward, 0 after a fall. *Speed*: towards the goal (soccer: of the ball), m/s. *Trail*: '
+        'median distance along the trail, m. *Ball at goal*: share of the time.',
     ),
     (
         'flat_control',
@@ -267,8 +267,8 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         f'A policy is shipped for {len(policies.available())} of {len(catalogue.BY_ID)} environments. This page is '
         f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
         'run of `examples/ppo.py`, or for gait environments of `examples/search_gaits.py`, '
-        '`examples/learn_gaits.py` or `examples/refine_gaits.py`, with the settings in its JSON file; `examples/train_all.py` repeats them. Of '
-        'several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
+        '`examples/learn_gaits.py` or `examples/refine_gaits.py`, with the settings in its JSON file; '
+        '`examples/train_all.py` repeats them. Of several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
         '[comparison with the papers](findings.md).',
         f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes that were '
         'used neither for training nor for the selection of a policy during training; the results '

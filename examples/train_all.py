@@ -7,8 +7,9 @@
     python examples/train_all.py --ray                 # on all cores, or on those of a cluster
 
 Each run is `examples/ppo.py` on one thread, or for gait environments (FSM_...)
-`examples/learn_gaits.py`, `examples/refine_gaits.py` or `examples/search_gaits.py`. A run that uses the policy of another
-environment, as initial policy or as footstep controller, starts after the runs of that environment.
+`examples/learn_gaits.py`, `examples/refine_gaits.py` or `examples/search_gaits.py`. A run that uses
+the policy of another environment, as initial policy or as footstep controller, starts after the runs
+of that environment.
 Interrupted runs continue from their checkpoints in RUNS. Finished runs are evaluated and entered
 into `trained/ID.json` (settings, learning curve, evaluation), and the best policy of an environment
 becomes `trained/ID.npz`. Runs that have been entered with the same settings are not repeated.
