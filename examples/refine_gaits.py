@@ -6,7 +6,9 @@
 Q-learning (`learn_gaits.py`) levels off: what decides about a fall are small differences between
 estimated values. PPO (Schulman et al. 2017) begins with its networks: their mean values, times
 `sharpness`, are the logits of the base actions. It then learns from what these actions really lead
-to. The policy selects the action with the largest logit, and its files are those of `learn_gaits.py`.
+to. The policy that is written selects the action with the largest logit. Its weights are a moving
+average of those of all updates (setting `averaged`), in which their random changes cancel. Its files
+are those of `learn_gaits.py`.
 
 After a fall most simulations return to a state a few cycles earlier, as in `learn_gaits.py`; these
 returns end a trajectory, and the actions after them are those of the policy.
@@ -34,6 +36,7 @@ import ppo_settings
 import torch
 import tqdm
 from torch import nn
+from torch.optim import swa_utils
 
 from trl_suite import policies
 from trl_suite.util.program import begin_script
@@ -64,6 +67,7 @@ class Settings:
     clip: float = 0.2
     kl: float = 0.02  # an update of the policy stops at this divergence
     gradient_norm: float = 0.5
+    averaged: float = 1e5  # cycles over which the weights of the policy are averaged; 0: not
     greedy: float = 0.34  # share of simulations that do not return to earlier states
     retry: float = 0.5  # probability that the others do after a fall
     retries: int = 6  # largest number of returns in a row
@@ -72,20 +76,37 @@ class Settings:
     evaluate_every: float = 32768  # cycles
 
 
-# Environments that are easy for their generalist take no part.
-HARD = ('Mixed', 'Walls', 'Gaps', 'Cliffs')
+def _terrains(character: str, *names: str) -> tuple[str, ...]:
+    """Returns the ids of gait environments."""
+    return tuple(f'FSM_{character}_Terrain_{name}-v0' for name in names)
+
+
+# Environments that are easy for a policy for many terrains take no part in its training.
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
-        'also': tuple(f'FSM_Biped2D_Terrain_{name}-v0' for name in HARD), 'num_envs': 75,
-        'samples': 624e3, 'last_learning_rate': 2.5e-5, 'kl': 0.0225, 'evaluate_every': 24e3,
+        'also': _terrains('Biped2D', 'Mixed', 'Walls', 'Gaps', 'Cliffs'), 'num_envs': 75,
+        'samples': 1.624e6, 'last_learning_rate': 1e-5, 'kl': 0.0225, 'averaged': 2e5,
+        'evaluate_every': 49152,
     },
-    'FSM_Raptor2D_Terrain_Mixed-v0': {'samples': 2.5e5, 'retry': 0.7, 'evaluate_every': 12288},
-    'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 1.2e5, 'num_envs': 48, 'evaluate_every': 12288},
+    'FSM_Dog2D_Terrain_Mixed-v0': {
+        'also': _terrains('Dog2D', 'Gaps', 'Slopes_Walls'), 'num_envs': 66, 'samples': 1.98e5,
+        'last_learning_rate': 3e-5, 'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
+    },
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
+        'also': _terrains('Dog2D', 'Cliffs', 'Narrow_Gaps'), 'num_envs': 66, 'samples': 3.5e5,
+        'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
+    },
+    'FSM_Raptor2D_Terrain_Mixed-v0': {
+        'samples': 2.5e5, 'retry': 0.7, 'averaged': 0.0, 'evaluate_every': 12288,
+    },
+    'FSM_Goat2D_Terrain_Cliffs-v0': {
+        'samples': 1.2e5, 'num_envs': 48, 'averaged': 0.0, 'evaluate_every': 12288,
+    },
 }  # fmt: skip
 VALUE_SCALE = 5.0  # outputs of the value network are multiplied by it
 # Settings that may change when a run is continued.
 _CHANGEABLE = 'samples', 'write_every', 'evaluate_every'
-_PARTS = 'policy', 'value', 'policy_optimizer', 'value_optimizer'
+_PARTS = 'policy', 'average', 'value', 'policy_optimizer', 'value_optimizer'
 
 
 def settings_for(id_: str, **changes: Any) -> Settings:
@@ -121,6 +142,10 @@ class Refiner:
         for number, network in enumerate(networks):
             learner.copy_weights(initial, number, network)
         self.policy = nn.ModuleList(networks)
+        decay = max(0.0, 1 - s.num_envs * s.horizon / s.averaged) if s.averaged else 0.0
+        self.average = swa_utils.AveragedModel(
+            self.policy, multi_avg_fn=swa_utils.get_ema_multi_avg_fn(decay)
+        )
         self.value = copy.deepcopy(networks[0])
         self.value.last = nn.Linear(self.value.last.in_features, 1)
         nn.init.zeros_(self.value.last.weight)
@@ -214,6 +239,7 @@ class Refiner:
                 (-gain.mean()).backward()
                 nn.utils.clip_grad_norm_(self.policy.parameters(), s.gradient_norm)
                 self.policy_optimizer.step()
+        self.average.update_parameters(self.policy)
         learner.updates += 1
 
     def advance(self) -> None:
@@ -227,7 +253,7 @@ class Refiner:
 
     def exported(self) -> policies.Policy:
         """Returns the policy without PyTorch."""
-        networks = copy.deepcopy(self.policy).requires_grad_(False)
+        networks = copy.deepcopy(self.average.module).requires_grad_(False)
         if len(networks) > 1:
             self.learner.members = list(networks)
         else:

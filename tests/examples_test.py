@@ -532,7 +532,7 @@ class TrimTest(absltest.TestCase):
         for id_, program in (
             ('PD_Biped2D_Flat-v0', 'ppo'),
             ('FSM_Hopper2D_Terrain_Gaps-v0', 'search_gaits'),
-            ('FSM_Dog2D_Terrain_Mixed-v0', 'learn_gaits'),
+            ('FSM_Hopper2D_Terrain_Mixed-v0', 'learn_gaits'),
             ('FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'refine_gaits'),
         ):
             self.assertEqual(train_all.program(id_).__name__, program)

@@ -103,7 +103,23 @@ class RefineTest(parameterized.TestCase):
         refiner.advance()
         self.assertTrue((refiner.log_probabilities(seen).detach() != before).any())
 
-    @parameterized.parameters({}, {'also': (WALLS,)})
+    @parameterized.parameters(0.0, 64.0)
+    def test_the_weights_that_are_written_may_be_an_average(self, averaged):
+        refiner, _ = make(value_first=0, averaged=averaged)
+
+        def weights():
+            return refiner.policy[0].last.weight.detach().numpy().copy()
+
+        refiner.advance()
+        first, expected = weights(), weights()
+        for _ in range(3):  # 32 cycles each
+            refiner.advance()
+            expected += (0.5 if averaged else 1.0) * (weights() - expected)
+        self.assertTrue((weights() != first).any())
+        _, written, _ = refiner.exported().networks[0]
+        np.testing.assert_allclose(written[-1], expected.T, rtol=1e-5, atol=1e-7)
+
+    @parameterized.parameters({}, {'also': (WALLS,), 'averaged': 96.0})
     def test_a_run_writes_its_policy_and_resumes_exactly(self, **changes):
         curves = []
         with tempfile.TemporaryDirectory() as name:
