@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 import ppo
 import tqdm
+from tune_gait import nudged, position
 
 from trl_suite import policies, suite
 from trl_suite.util import files, resources
@@ -47,12 +48,6 @@ NOISE = 0.3  # standard deviation of random parameters, in units of the action
 NUDGE = 1e-3  # standard deviation of changes of joint angles, rad
 KINDS = 'base', 'random', 'nudged'
 Act = Callable[[np.ndarray], np.ndarray]
-
-
-def position(environments: VectorEnvironment) -> np.ndarray:
-    """Returns the positions of the roots along the ground, (n,) m."""
-    task = environments.task
-    return task.world.qpos[:, int(task.figure.pose_qpos[0])].copy()
 
 
 def falls(
@@ -81,21 +76,6 @@ def falls(
                     environments.reset([i])
             observation = environments.task.observation.copy()
     return [list(each) for each in past], position(environments)
-
-
-def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray) -> dict[str, Any]:
-    """Returns the state of a simulation with changed joint angles.
-
-    Args:
-      copies: environments of this kind.
-      state: the state.
-      change: changes of the angles of the joints, without the root, (j,) rad.
-    """
-    world = state['world'][0].copy()
-    qpos = world[1 : 1 + copies.task.world.qpos.shape[1]]  # time precedes the positions
-    joints = np.delete(np.arange(len(qpos)), copies.task.figure.pose_qpos[:3])
-    qpos[joints] += change
-    return {**state, 'world': [world]}
 
 
 def prevented(

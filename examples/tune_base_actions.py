@@ -3,6 +3,7 @@
     python examples/tune_base_actions.py biped2d_simbicon --terrain gaps walls steps --seed 1
     python examples/tune_base_actions.py goat --terrain cliffs_rugged --alone
     python examples/tune_base_actions.py goat --enter tuned cliffs_rugged_1 climb0_075
+    python examples/tune_base_actions.py hopper --steady 1.4 --generations 60
     python examples/tune_base_actions.py hopper --score mixed_hopper
 
 For each terrain, in the order given, the gaits found so far run over it until they fall, and the
@@ -15,6 +16,11 @@ are those in states that were not used by the search.
 
 With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
 travelled, divided by the distance at the target speed.
+
+With `--steady LENGTH` a gait is searched for with cycles of at least this length whose landing place
+depends as little as possible on the state, so that a policy can foresee it: after `SETTLED` cycles on
+flat ground the joint angles (and slides) of copies of a simulation are changed at random, and the
+score is high where the copies are still close together one to `AHEAD` cycles later.
 
 Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
 gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`. `--score`
@@ -48,6 +54,9 @@ STATES, VALIDATION = 32, 64  # numbers of states for the search, and for the sto
 STARTS = 6  # number of noisy starts with `--alone`
 FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
 FRICTION = 0.81
+# With `--steady`: cycles before and after the change; starts and copies of each; standard deviation of
+# the change, rad (slides: m); spread that counts as none, m; tolerance of the speed, m/s.
+SETTLED, AHEAD, COPIES, CHANGE, CLOSE, SPEED_TOLERANCE = 4, 3, 4, 0.02, 3e-3, 0.6
 DIGITS = 4
 HAND = 'by hand'  # how sets were found that no search has found
 
@@ -210,6 +219,84 @@ def complement(
     return chosen, obstacles.scores(np.array([*known, chosen]), fresh[1])
 
 
+def steadiness(
+    bench: tune_gait.Bench, vectors: np.ndarray, length: float, seeds: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Measures how much the places depend on the state that gaits (m, P) reach on flat ground.
+
+    Args:
+      bench: at least m * starts * COPIES simulations.
+      vectors: the gaits, (m, P).
+      length: smallest desired length of a cycle, m.
+      seeds: seeds of the starts, (starts,).
+
+    Returns:
+      The scores, (m,); and figures of each gait: `upright`, the share of simulations that have not
+      fallen, (m,); `spread`, the mean standard deviation of the copies' places after each cycle since
+      the change, (m, AHEAD) m; `length` of the cycles, (m,) m; and `speed`, (m,) m/s.
+    """
+    environments, shape = bench.environments, (len(vectors), len(seeds), COPIES)
+    going = np.arange(np.prod(shape))
+    action = np.zeros((environments.num_envs, len(bench.gait.actions)))
+    change = vectors - bench.action_offset
+    each = (change / bench.action_scale)[:, bench.gait.actions]
+    action[going] = np.repeat(each, len(seeds) * COPIES, 0)
+    environments.reset(seed=np.resize(np.repeat(seeds, COPIES), environments.num_envs).tolist())
+    places, duration = np.full((AHEAD + 1, len(going)), np.nan), np.zeros(len(going))
+    for cycle in range(SETTLED + AHEAD + 1):
+        if cycle >= SETTLED:
+            places[cycle - SETTLED, going] = tune_gait.position(environments)[going]
+        if cycle == SETTLED:
+            rng = np.random.default_rng(seeds)
+            joints = environments.task.world.qpos.shape[1] - 3
+            for i in going.tolist():
+                state = environments.get_state([i])
+                new = tune_gait.nudged(environments, state, rng.normal(0, CHANGE, joints))
+                environments.set_state(new, [i])
+        if cycle == SETTLED + AHEAD or not len(going):
+            break
+        step = environments.step(action, going)
+        if cycle >= SETTLED:
+            duration[going] += bench.task.state.duration[going]
+        going = going[~(step.terminated | step.truncated)[going]]
+    whole = np.isfinite(places[-1])
+    # A simulation that has fallen counts as 1 m away.
+    spread = np.where(whole, places - places[0], 0.0)[1:].reshape(AHEAD, *shape).std(3)
+    spread[:, ~whole.reshape(shape).all(2)] = 1.0
+    distance = np.where(whole, places[-1] - places[0], 0.0).reshape(len(vectors), -1).sum(1)
+    count = np.maximum(whole.reshape(len(vectors), -1).sum(1), 1)
+    duration = np.where(whole, duration, 0.0).reshape(len(vectors), -1).sum(1)
+    figures = {
+        'upright': whole.reshape(len(vectors), -1).mean(1), 'spread': spread.mean(2).T,
+        'length': distance / count / AHEAD, 'speed': distance / np.maximum(duration, 1e-9),
+    }  # fmt: skip
+    away = np.abs(figures['speed'] - bench.gait.target_speed)
+    score = -np.log10(figures['spread'] + CLOSE).mean(1) - 3 * (1 - figures['upright'])
+    score -= 2 * np.maximum(0, length - figures['length'])
+    return score - 0.3 * np.maximum(0, away - SPEED_TOLERANCE), figures
+
+
+def steady(
+    gait: Parameters, start: np.ndarray, arguments: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Searches for a steady gait; returns it (P,), and figures of it and of the start."""
+    rows = max(arguments.population, FINALISTS + 1) * 2 * STARTS * COPIES
+    bench = tune_gait.Bench(gait.character, rows, gait.action_offset)
+
+    def measured(vectors: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return steadiness(bench, vectors, arguments.steady, rng.integers(2**32, size=2 * STARTS))
+
+    found = search(lambda vectors: measured(vectors)[0], start, gait, arguments, rng)
+    chosen = found[measured(found)[0].argmax()]
+    score, figures = measured(np.array([start, chosen]))
+    bench.environments.close()
+    return chosen, {
+        name: {key: np.round(value[row], 3).tolist() for key, value in figures.items()}
+        | {'score': round(float(score[row]), 3)}
+        for row, name in enumerate(('start', 'found'))
+    }
+
+
 def score(obstacles: Obstacles, terrain: str, rng: np.random.Generator) -> pathlib.Path:
     """Writes the scores of the base actions that are sets chosen by hand, in states before falls."""
     gait = obstacles.gait
@@ -269,6 +356,9 @@ def main() -> None:
     )
     parser.add_argument('--alone', action='store_true', help='repeat the gait')
     parser.add_argument(
+        '--steady', type=float, metavar='LENGTH', help='search for a gait with such cycles, m'
+    )
+    parser.add_argument(
         '--start', nargs='+', help='sets, or numbers of base actions; default: action 0'
     )
     parser.add_argument('--seed', type=int, default=1)
@@ -307,6 +397,18 @@ def main() -> None:
 
     known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
     rng = np.random.default_rng(arguments.seed)
+    if arguments.steady is not None:
+        began = time.process_time()
+        chosen, figures = steady(gait, known[0], arguments, rng)
+        record = {
+            'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
+            'seed': arguments.seed, 'generations': arguments.generations,
+            'population': arguments.population, 'sd': arguments.sd, **figures,
+            'cpu_seconds': round(time.process_time() - began),
+        }  # fmt: skip
+        stored['steady'] = {'vector': chosen.tolist(), 'tuning': record}
+        print(record)
+        files.write_json(stored, path)
     for terrain in arguments.terrain:
         began = time.process_time()
         print(gait.character, terrain, flush=True)

@@ -155,6 +155,27 @@ class Bench:
         return Runs(horizon, upright, elapsed, distance, cycles)
 
 
+def position(environments: VectorEnvironment) -> np.ndarray:
+    """Returns the positions of the roots along the ground, (n,) m."""
+    task = environments.task
+    return task.world.qpos[:, int(task.figure.pose_qpos[0])].copy()
+
+
+def nudged(copies: VectorEnvironment, state: dict[str, Any], change: np.ndarray) -> dict[str, Any]:
+    """Returns the state of a simulation with changed joint angles.
+
+    Args:
+      copies: environments of this kind.
+      state: the state.
+      change: changes of the angles of the joints, without the root, (j,) rad.
+    """
+    world = state['world'][0].copy()
+    qpos = world[1 : 1 + copies.task.world.qpos.shape[1]]  # time precedes the positions
+    joints = np.delete(np.arange(len(qpos)), copies.task.figure.pose_qpos[:3])
+    qpos[joints] += change
+    return {**state, 'world': [world]}
+
+
 def vector_of(gait: Parameters, start: str | None) -> np.ndarray:
     """Returns the parameters of a set by name, of a base action by number, or of action 0."""
     if start is None:
