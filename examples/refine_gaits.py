@@ -93,7 +93,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'last_learning_rate': 3e-5, 'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
     },
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
-        'also': _terrains('Dog2D', 'Cliffs', 'Narrow_Gaps'), 'num_envs': 66, 'samples': 3.5e5,
+        'also': _terrains('Dog2D', 'Cliffs', 'Narrow_Gaps'), 'num_envs': 66, 'samples': 7e5,
         'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
     },
     'FSM_Raptor2D_Terrain_Mixed-v0': {
