@@ -146,9 +146,10 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'members': 4,
     },
     'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},
-    # A hopper must choose its hops four cycles, or 9 m, ahead.
+    # A hopper must choose its hops some cycles ahead. All of its base actions are safe for one cycle.
     'FSM_Hopper2D_Terrain_Mixed-v0': {
         **GENERALIST, **SCRATCH, 'also': ('FSM_Hopper2D_*',), 'num_envs': 70, 'view': 10.0,
+        'samples': 131072, 'renew_every': 65536, 'expert_cycles': 65536, 'expert_epsilon': 1.0,
     },
 }  # fmt: skip
 CHOICE_ERROR = 1e-5  # largest difference of equal base actions, which files hold as float32

@@ -99,6 +99,11 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Raptor2D_Terrain_Mixed-v0': {
         'samples': 2.5e5, 'retry': 0.7, 'averaged': 0.0, 'evaluate_every': 12288,
     },
+    'FSM_Hopper2D_Terrain_Mixed-v0': {
+        'also': _terrains('Hopper2D', 'Gaps', 'Slopes_Mixed', 'Walls', 'Mixed_Easy'), 'num_envs': 80,
+        'samples': 5e5, 'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225,
+        'evaluate_every': 24576,
+    },
     'FSM_Goat2D_Terrain_Cliffs-v0': {
         'samples': 1.2e5, 'num_envs': 48, 'averaged': 0.0, 'evaluate_every': 12288,
     },

@@ -81,7 +81,7 @@ LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.p
 REFINED = (  # of these, environments whose policies refine_gaits.py improves
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
     'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
 )  # fmt: skip
 
 

@@ -36,6 +36,7 @@ import share_gaits
 import train_all
 import train_randomized
 import tune_base_actions
+import tune_gait
 
 
 class CompareActionsTest(FolderTest):
@@ -210,12 +211,53 @@ class TuneTest(absltest.TestCase):
         ):
             obstacles = tune_base_actions.Obstacles(gait, 'mixed_hopper', gait.base_actions[0], 2)
             tune_base_actions.score(obstacles, 'mixed_hopper', np.random.default_rng(0))
-        chosen = {name for name, _, _ in gait.blends} - {'run', 'big_hop'}
-        self.assertEqual(set(written['tuning']), chosen)
+        self.assertEqual(set(written['tuning']), {name for name, _, _ in gait.blends} - {'run'})
+        self.assertEqual(written['tuning'].pop('steady')['search'], 'steady')
         for each in written['tuning'].values():
             self.assertBetween(each['alone'], 0, each['set_after'])
             self.assertBetween(each['set_before'], each['default'], each['set_after'])
             self.assertLessEqual(each['set_after'], 1)
+
+    def test_a_steady_gait_lands_where_it_is_expected(self):
+        gait, seeds = controllers.load('hopper'), np.arange(6)
+        vectors = np.array([gait.sets['run'], gait.sets['steady'], gait.sets['foot_back']])
+        rows = len(vectors) * len(seeds) * tune_base_actions.COPIES
+        bench = tune_gait.Bench('hopper', rows, gait.action_offset)
+        score, figures = tune_base_actions.steadiness(bench, vectors, 1.4, seeds)
+        self.assertEqual(figures['spread'].shape, (3, tune_base_actions.AHEAD))
+        np.testing.assert_array_less(2 * figures['spread'][1, 1:], figures['spread'][0, 1:])
+        self.assertGreater(score[1], score[0])
+        self.assertEqual(figures['upright'][:2].tolist(), [1, 1])
+        self.assertLess(figures['upright'][2], 1)  # this action is not one to repeat
+        self.assertLess(score[2], score[0])
+        longer, again = tune_base_actions.steadiness(bench, vectors, 3.0, seeds)
+        np.testing.assert_array_equal(again['length'], figures['length'])
+        expected = (
+            score - 2 * (3.0 - figures['length']) + 2 * np.maximum(0, 1.4 - figures['length'])
+        )
+        np.testing.assert_allclose(longer, expected)
+
+    def test_base_actions_of_the_hopper_differ_in_the_length_of_a_hop(self):
+        gait = controllers.load('hopper')
+        names = [f'shorter_{n}' for n in range(5, 0, -1)] + ['steady']
+        names += [f'longer_{n}' for n in range(1, 6)]
+        bench = tune_gait.Bench('hopper', len(names), gait.action_offset)
+        environments = bench.environments
+
+        def actions(vectors):
+            places = gait.actions
+            return (vectors - gait.action_offset)[:, places] / bench.action_scale[places]
+
+        environments.reset(seed=[3] * len(names))
+        for _ in range(6):
+            environments.step(actions(np.tile(gait.sets['steady'], (len(names), 1))))
+        before = tune_gait.position(environments)
+        np.testing.assert_array_equal(before, before[0])
+        environments.step(actions(np.array([gait.sets[name] for name in names])))
+        length = tune_gait.position(environments) - before
+        np.testing.assert_array_less(0.02, np.diff(length))
+        self.assertLess(length[0], 0.6)
+        self.assertGreater(length[-1], 2.2)
 
 
 class JobsTest(parameterized.TestCase):
@@ -532,7 +574,7 @@ class TrimTest(absltest.TestCase):
         for id_, program in (
             ('PD_Biped2D_Flat-v0', 'ppo'),
             ('FSM_Hopper2D_Terrain_Gaps-v0', 'search_gaits'),
-            ('FSM_Hopper2D_Terrain_Mixed-v0', 'learn_gaits'),
+            ('FSM_Raptor2D_Terrain_Slopes_Mixed-v0', 'learn_gaits'),
             ('FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'refine_gaits'),
         ):
             self.assertEqual(train_all.program(id_).__name__, program)
