@@ -146,7 +146,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'members': 4,
     },
     'FSM_Goat2D_Terrain_Cliffs-v0': {'samples': 65536, 'members': 4},
-    # A hopper must choose its hops some cycles ahead. All of its base actions are safe for one cycle.
+    # A hopper chooses its hops some cycles ahead. On flat ground each base action is safe for a cycle.
     'FSM_Hopper2D_Terrain_Mixed-v0': {
         **GENERALIST, **SCRATCH, 'also': ('FSM_Hopper2D_*',), 'num_envs': 70, 'view': 10.0,
         'samples': 131072, 'renew_every': 65536, 'expert_cycles': 65536, 'expert_epsilon': 1.0,

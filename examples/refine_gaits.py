@@ -147,10 +147,9 @@ class Refiner:
         for number, network in enumerate(networks):
             learner.copy_weights(initial, number, network)
         self.policy = nn.ModuleList(networks)
-        decay = max(0.0, 1 - s.num_envs * s.horizon / s.averaged) if s.averaged else 0.0
-        self.average = swa_utils.AveragedModel(
-            self.policy, multi_avg_fn=swa_utils.get_ema_multi_avg_fn(decay)
-        )
+        cycles = s.num_envs * s.horizon
+        average = swa_utils.get_ema_multi_avg_fn(1 - cycles / max(s.averaged, cycles))
+        self.average = swa_utils.AveragedModel(self.policy, multi_avg_fn=average)
         self.value = copy.deepcopy(networks[0])
         self.value.last = nn.Linear(self.value.last.in_features, 1)
         nn.init.zeros_(self.value.last.weight)

@@ -79,11 +79,6 @@ class Obstacles:
         flat.environments.close()
         self.usual = USUAL * (self.lead + AFTER) * runs.distance.sum() / runs.cycles.sum()
 
-    def actions(self, vectors: np.ndarray) -> np.ndarray:
-        """Returns the actions that set parameters (..., P)."""
-        places = self.gait.actions
-        return (vectors - self.gait.action_offset)[..., places] / self.bench.action_scale[places]
-
     def collect(
         self, vectors: np.ndarray, count: int, rng: np.random.Generator
     ) -> list[dict[str, Any]]:
@@ -99,7 +94,7 @@ class Obstacles:
             for i in ids.tolist():
                 past[i] = [*past[i], environments.get_state([i])][-BACK:]
             chosen = rng.integers(len(vectors), size=len(ids)) * (rng.random(len(ids)) < OTHERS)
-            action[ids] = self.actions(vectors[chosen])
+            action[ids] = self.bench.actions(vectors[chosen])
             step = environments.step(action, ids)
             ended = step.terminated | step.truncated
             for i in ids[ended[ids]].tolist():
@@ -120,15 +115,15 @@ class Obstacles:
             going = np.arange(len(part) * count)
             for i in going.tolist():
                 environments.set_state(states[i % count], [i])
-            begin = self.position(going)
+            begin = tune_gait.position(environments)[going]
             reached = begin.copy()
             candidate, default = np.zeros((2, environments.num_envs, len(self.gait.actions)))
-            candidate[going] = np.repeat(self.actions(part), count, axis=0)
-            default[:] = self.actions(self.default)
+            candidate[going] = np.repeat(self.bench.actions(part), count, axis=0)
+            default[:] = self.bench.actions(self.default)
             for cycle in range(self.lead + AFTER):
                 step = environments.step(candidate if cycle < self.lead else default, going)
                 going = going[~(step.terminated | step.truncated)[going]]
-                reached[going] = self.position(going)
+                reached[going] = tune_gait.position(environments)[going]
                 if not len(going):
                     break
             share = np.clip((reached - begin) / self.usual, 0, 1)
@@ -146,11 +141,6 @@ class Obstacles:
             runs = self.bench.run(vectors[part], seeds[part], HORIZON, np.full(rows, FRICTION))
             found.append(runs.distance / (HORIZON * self.gait.target_speed))
         return np.clip(np.concatenate(found)[:n], 0, 1).reshape(shape)
-
-    def position(self, env_ids: np.ndarray) -> np.ndarray:
-        """Returns the positions of the roots along the ground, (m,) m."""
-        task = self.bench.task
-        return task.world.qpos[env_ids, int(task.figure.pose_qpos[0])]
 
 
 def search(
@@ -238,9 +228,7 @@ def steadiness(
     environments, shape = bench.environments, (len(vectors), len(seeds), COPIES)
     going = np.arange(np.prod(shape))
     action = np.zeros((environments.num_envs, len(bench.gait.actions)))
-    change = vectors - bench.action_offset
-    each = (change / bench.action_scale)[:, bench.gait.actions]
-    action[going] = np.repeat(each, len(seeds) * COPIES, 0)
+    action[going] = np.repeat(bench.actions(vectors), len(seeds) * COPIES, 0)
     environments.reset(seed=np.resize(np.repeat(seeds, COPIES), environments.num_envs).tolist())
     places, duration = np.full((AHEAD + 1, len(going)), np.nan), np.zeros(len(going))
     for cycle in range(SETTLED + AHEAD + 1):
@@ -376,6 +364,8 @@ def main() -> None:
     )
     parser.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
     arguments = parser.parse_args()
+    if arguments.steady is not None and not 0 < arguments.steady < np.inf:
+        parser.error(f'argument --steady: {arguments.steady}; expected a length above 0 m')
     gait = controllers.load(arguments.character)
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / f'{gait.character}.json'

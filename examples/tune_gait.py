@@ -116,6 +116,11 @@ class Bench:
         task.rules.options.action_scale[:] = self.action_scale[self.gait.actions]
         self.frictions = np.array([model.geom_friction[:, 0].max() for model in task.world.models])
 
+    def actions(self, vectors: np.ndarray) -> np.ndarray:
+        """Returns the actions that set parameters (..., P)."""
+        places = self.gait.actions
+        return (vectors - self.action_offset)[..., places] / self.action_scale[places]
+
     def run(
         self, vectors: np.ndarray, seeds: np.ndarray, horizon: float, friction: np.ndarray
     ) -> Runs:
@@ -133,8 +138,7 @@ class Bench:
             world.set_const(env_id)
         self.frictions = np.array(friction, float)
         self.environments.reset(seed=[int(seed) for seed in seeds])
-        places = self.gait.actions
-        actions = (vectors - self.action_offset)[:, places] / self.action_scale[places]
+        actions = self.actions(vectors)
         root = task.figure.links[0]
         start = world.subtree_com[:, root, 0].copy()
         elapsed, distance = np.zeros((2, count))

@@ -243,17 +243,12 @@ class TuneTest(absltest.TestCase):
         names += [f'longer_{n}' for n in range(1, 6)]
         bench = tune_gait.Bench('hopper', len(names), gait.action_offset)
         environments = bench.environments
-
-        def actions(vectors):
-            places = gait.actions
-            return (vectors - gait.action_offset)[:, places] / bench.action_scale[places]
-
         environments.reset(seed=[3] * len(names))
         for _ in range(6):
-            environments.step(actions(np.tile(gait.sets['steady'], (len(names), 1))))
+            environments.step(bench.actions(np.tile(gait.sets['steady'], (len(names), 1))))
         before = tune_gait.position(environments)
         np.testing.assert_array_equal(before, before[0])
-        environments.step(actions(np.array([gait.sets[name] for name in names])))
+        environments.step(bench.actions(np.array([gait.sets[name] for name in names])))
         length = tune_gait.position(environments) - before
         np.testing.assert_array_less(0.02, np.diff(length))
         self.assertLess(length[0], 0.6)
