@@ -43,6 +43,7 @@ import ppo
 import ppo_settings
 import torch
 import tqdm
+import tune_gait
 from torch import nn
 
 from trl_suite import characters, evaluation, policies
@@ -70,6 +71,8 @@ class Settings:
     expert_cycles: float = 8e3
     expert_epsilon: float = 0.15  # share of random actions in these cycles
     begin: float = 2e3  # cycles before learning begins; they determine the observation scales
+    # Names of sets of the character within the action range, to select from besides the base actions.
+    gaits: tuple[str, ...] = ()
     action: str = 'discrete'  # one of `ACTIONS`
     noise: float = 0.15  # standard deviation of the actors' noise
     noise_share: float = 0.25  # share of actions with noise, if there are actors
@@ -369,7 +372,11 @@ class Learner:
             ]
         )
         parameters = environments.task.gait.parameters
-        self.choices = parameters.action(parameters.base_actions)
+        further = [tune_gait.vector_of(parameters, name) for name in s.gaits]
+        self.choices = parameters.action(np.array([*parameters.base_actions, *further]))
+        if np.abs(self.choices).max() > 1 + CHOICE_ERROR:
+            raise ValueError(f'gaits: {s.gaits}; expected sets within the action range')
+        self.choices = self.choices.clip(-1, 1)
         if s.action == 'continuous':
             self.choices = self.choices[:1]
         ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
@@ -425,18 +432,19 @@ class Learner:
     def begin_with(self, policy: policies.Policy) -> None:
         """Copies the weights and scales of a policy that this program has trained.
 
-        Of an ensemble, they are those of its first network.
+        Of an ensemble, they are those of its first network. The policy may lack the last gaits.
 
         Raises:
-          ValueError: its inputs or its base actions differ.
+          ValueError: its inputs differ, or it selects among other gaits.
         """
         line, *_ = policy.networks[0]
         if line is None or not np.array_equal(policy.columns, self.columns):
             raise ValueError(
                 f'the network of {policy.id} has other inputs; expected one that learn_gaits.py trained'
             )
-        if policy.choices.shape != self.choices.shape or (
-            np.abs(policy.choices - self.choices).max() > CHOICE_ERROR
+        known = self.choices[: len(policy.choices)]
+        if policy.choices.shape != known.shape or (
+            np.abs(policy.choices - known).max() > CHOICE_ERROR
         ):
             raise ValueError(
                 f'{policy.id} selects among other base actions than this environment has'
@@ -446,13 +454,21 @@ class Learner:
         self.target.load_state_dict(self.network.state_dict())
 
     def copy_weights(self, policy: policies.Policy, member: int, network: Network) -> None:
-        """Copies the weights of one network of a policy that this program has trained."""
+        """Copies the weights of one network of a policy that this program has trained.
+
+        The value of a gait that the policy lacks is the mean of the others.
+        """
         line, weights, biases = policy.networks[member]
         assert line is not None
         parts = [*network.filters, *network.hidden, network.last]
         weights = [*(w.transpose(2, 1, 0) for w in line.weights), *(w.T for w in weights)]
         biases = [*line.biases, *biases]
-        count = len(self.choices)
+        count = len(policy.choices)
+        if lacking := len(self.choices) - count:
+            for parameters in (weights, biases):
+                mean = parameters[-1][:count].mean(0, keepdims=True)
+                parameters[-1] = np.concatenate([parameters[-1][:count], mean.repeat(lacking, 0)])
+            count += lacking
         with torch.no_grad():
             if network.actors is not None and weights[-1].shape[0] > count:
                 network.actors.weight.copy_(torch.tensor(weights[-1][count:]))

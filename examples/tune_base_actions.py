@@ -17,6 +17,10 @@ are those in states that were not used by the search.
 With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
 travelled, divided by the distance at the target speed.
 
+With `--within` only gaits that an action can set are searched for. A policy can select them without
+a change of the base actions, and so of the action range: `--add` stores them in the character's file, and
+`learn_gaits.py` reads them with its setting `gaits`.
+
 With `--steady LENGTH` a gait is searched for with cycles of at least this length whose landing place
 depends as little as possible on the state, so that a policy can foresee it: after `SETTLED` cycles on
 flat ground the joint angles (and slides) of copies of a simulation are changed at random, and the
@@ -158,7 +162,7 @@ def search(
         result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
         result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
-        return result
+        return gait.vector(gait.action(result).clip(-1, 1)) if arguments.within else result
 
     options = {
         'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
@@ -331,8 +335,25 @@ def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathli
     ]
     used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
     used.add(data['action_offset'])
+    used |= {name for name, record in data['tuning'].items() if record.get('within')}
     for part in ('sets', 'tuning'):
         data[part] = {name: value for name, value in data[part].items() if name in used}
+    return tune_gait.write(character, data)
+
+
+def add(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
+    """Stores gaits that a search within the action range has found.
+
+    Raises:
+      ValueError: there is no such gait.
+    """
+    data = tune_gait.stored(character)
+    within = [name for name, record in found.items() if record['tuning'].get('within')]
+    for name in names:
+        if name not in within:
+            raise ValueError(errors.unknown('gait within the action range', name, within))
+        data['sets'][name] = found[name]['vector']
+        data.setdefault('tuning', {})[name] = found[name]['tuning']
     return tune_gait.write(character, data)
 
 
@@ -343,6 +364,7 @@ def main() -> None:
         '--terrain', nargs='+', default=[], help='terrains; one gait is searched for each'
     )
     parser.add_argument('--alone', action='store_true', help='repeat the gait')
+    parser.add_argument('--within', action='store_true', help='search within the action range')
     parser.add_argument(
         '--steady', type=float, metavar='LENGTH', help='search for a gait with such cycles, m'
     )
@@ -362,6 +384,9 @@ def main() -> None:
         metavar='SET',
         help='sets, or numbers of base actions of the original, that become the base actions',
     )
+    parser.add_argument(
+        '--add', nargs='+', metavar='SET', help='sets, found with --within, that are stored'
+    )
     parser.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
     arguments = parser.parse_args()
     if arguments.steady is not None and not 0 < arguments.steady < np.inf:
@@ -373,6 +398,10 @@ def main() -> None:
 
     if arguments.enter:
         print(enter(gait.character, stored, arguments.enter))
+        return
+
+    if arguments.add:
+        print(add(gait.character, stored, arguments.add))
         return
 
     if arguments.score:
@@ -393,7 +422,8 @@ def main() -> None:
         record = {
             'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
             'seed': arguments.seed, 'generations': arguments.generations,
-            'population': arguments.population, 'sd': arguments.sd, **figures,
+            'population': arguments.population, 'sd': arguments.sd,
+            **({'within': True} if arguments.within else {}), **figures,
             'cpu_seconds': round(time.process_time() - began),
         }  # fmt: skip
         stored['steady'] = {'vector': chosen.tolist(), 'tuning': record}
@@ -412,6 +442,7 @@ def main() -> None:
             'terrain': terrain, 'search': tune.__name__,
             'seed': arguments.seed, 'generations': arguments.generations,
             'population': arguments.population, 'sd': arguments.sd,
+            **({'within': True} if arguments.within else {}),
             'default': round(float(scores[0].mean()), 3),
             'set_before': round(float(scores[:-1].max(0).mean()), 3),
             'alone': round(float(scores[-1].mean()), 3),

@@ -218,6 +218,48 @@ class TuneTest(absltest.TestCase):
             self.assertBetween(each['set_before'], each['default'], each['set_after'])
             self.assertLessEqual(each['set_after'], 1)
 
+    def test_gaits_within_the_action_range_are_stored_and_kept(self):
+        gait = controllers.load('dog')
+
+        class Strategy:
+            def __init__(self, start, sd, options):
+                self.rng, self.shape = np.random.default_rng(0), (options['popsize'], len(start))
+                self.result = mock.Mock(xfavorite=start)
+
+            def ask(self):
+                return list(self.rng.normal(0, 50, self.shape))
+
+            def tell(self, candidates, values):
+                pass
+
+        arguments = mock.Mock(population=5, generations=3, sd=1.0)
+        for within in (True, False):
+            arguments.within = within
+            with mock.patch.dict(sys.modules, cma=mock.Mock(CMAEvolutionStrategy=Strategy)):
+                found = tune_base_actions.search(
+                    lambda vectors: np.zeros(len(vectors)), gait.base_actions[3], gait, arguments,
+                    np.random.default_rng(0),
+                )  # fmt: skip
+            self.assertEqual(bool(np.abs(gait.action(found)).max() <= 1 + 1e-9), within)
+        np.testing.assert_allclose(found[0], gait.base_actions[3], atol=1e-4)
+
+        stairs = {'vector': gait.base_actions[3].tolist(), 'tuning': {'within': True}}
+        others = {'vector': gait.base_actions[1].tolist(), 'tuning': {}}
+        data = tune_gait.stored('dog')
+        with (
+            mock.patch.object(tune_base_actions.tune_gait, 'stored', lambda name: data),
+            mock.patch.object(tune_base_actions.tune_gait, 'write', lambda name, data: data),
+        ):
+            with self.assertRaisesRegex(ValueError, "'wall'.*did you mean 'walk'"):
+                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['wall'])
+            with self.assertRaisesRegex(ValueError, "'other'"):
+                tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['other'])
+            tune_base_actions.add('dog', {'walk': stairs}, ['walk'])
+            written = tune_base_actions.enter('dog', {}, ['0', '1'])
+        self.assertEqual(written['sets']['walk'], stairs['vector'])
+        self.assertEqual(written['tuning']['walk'], {'within': True})
+        self.assertNotIn('walk', [name for names in written['base_actions'] for name in names])
+
     def test_a_steady_gait_lands_where_it_is_expected(self):
         gait, seeds = controllers.load('hopper'), np.arange(6)
         vectors = np.array([gait.sets['run'], gait.sets['steady'], gait.sets['foot_back']])

@@ -190,6 +190,30 @@ class LearnTest(parameterized.TestCase):
         with self.assertRaisesRegex(ValueError, 'other inputs'):
             learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, start=HOPPER), 1)
 
+    def test_a_run_selects_among_further_gaits(self):
+        learner = learn_gaits.Learner(HOPPER, 1, TINY, 1)
+        for _ in range(6):
+            learner.advance()
+        gait = learner.environments.task.gait.parameters
+        names = ('foot_back', 'steady')
+        with tempfile.TemporaryDirectory() as name:
+            path = f'{name}/policy.npz'
+            policies.save(learner.exported(), path)
+            settings = dataclasses.replace(TINY, start=path, gaits=names)
+            other = learn_gaits.Learner(HOPPER, 2, settings, 1)
+        count = len(gait.base_actions)
+        found = gait.vector(other.choices[count:])
+        np.testing.assert_allclose(found, [gait.sets[name] for name in names], atol=1e-9)
+        seen = learner.seen(learner.replay.before[: len(learner.replay)].astype(float))
+        with torch.no_grad():
+            values, before = other.network(seen), learner.target(seen)
+        np.testing.assert_allclose(values[:, :count], before, atol=1e-5)
+        expected = before.mean(1, keepdim=True).expand(-1, len(names))
+        np.testing.assert_allclose(values[:, count:], expected, atol=1e-5)
+        self.assertLen(other.exported().choices, count + len(names))
+        with self.assertRaisesRegex(ValueError, "'tuned'.*did you mean"):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, gaits=('tuned',)), 1)
+
     def test_several_environments_share_the_simulations(self):
         settings = dataclasses.replace(TINY, num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
         learner = learn_gaits.Learner(HOPPER, 1, settings, 1)
