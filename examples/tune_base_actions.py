@@ -162,7 +162,9 @@ def search(
         result[:, gait.actions] += np.asarray(candidates) * gait.search_scale[gait.actions]
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
         result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
-        return gait.vector(gait.action(result).clip(-1, 1)) if arguments.within else result
+        if arguments.within:
+            result = gait.vector(gait.action(result).clip(-1, 1)).round(9)
+        return result
 
     options = {
         'popsize': arguments.population, 'CMA_diagonal': True, 'verbose': -9,
