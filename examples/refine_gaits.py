@@ -85,12 +85,12 @@ def _terrains(character: str, *names: str) -> tuple[str, ...]:
 OVERRIDES: dict[str, dict[str, Any]] = {
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0': {
         'also': _terrains('Biped2D', 'Mixed', 'Walls', 'Gaps', 'Cliffs'), 'num_envs': 75,
-        'samples': 1.624e6, 'last_learning_rate': 1e-5, 'kl': 0.0225, 'averaged': 2e5,
+        'samples': 2.06e6, 'last_learning_rate': 1e-5, 'kl': 0.0225, 'averaged': 2e5,
         'evaluate_every': 49152,
     },
     'FSM_Dog2D_Terrain_Mixed-v0': {
-        'also': _terrains('Dog2D', 'Gaps', 'Slopes_Walls'), 'num_envs': 66, 'samples': 1.98e5,
-        'last_learning_rate': 3e-5, 'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
+        'also': _terrains('Dog2D', 'Gaps', 'Slopes_Walls'), 'num_envs': 66, 'samples': 6e5,
+        'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
     },
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0': {
         'also': _terrains('Dog2D', 'Cliffs', 'Narrow_Gaps'), 'num_envs': 66, 'samples': 7e5,
@@ -101,7 +101,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {
     },
     'FSM_Hopper2D_Terrain_Mixed-v0': {
         'also': _terrains('Hopper2D', 'Gaps', 'Slopes_Mixed', 'Walls', 'Mixed_Easy'), 'num_envs': 80,
-        'samples': 5e5, 'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225,
+        'samples': 9.9e5, 'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225,
         'evaluate_every': 24576,
     },
     'FSM_Goat2D_Terrain_Cliffs-v0': {
