@@ -424,8 +424,8 @@ def main() -> None:
         record = {
             'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
             'seed': arguments.seed, 'generations': arguments.generations,
-            'population': arguments.population, 'sd': arguments.sd,
-            **({'within': True} if arguments.within else {}), **figures,
+            'population': arguments.population, 'sd': arguments.sd, 'within': arguments.within,
+            **figures,
             'cpu_seconds': round(time.process_time() - began),
         }  # fmt: skip
         stored['steady'] = {'vector': chosen.tolist(), 'tuning': record}
@@ -443,8 +443,7 @@ def main() -> None:
         record = {
             'terrain': terrain, 'search': tune.__name__,
             'seed': arguments.seed, 'generations': arguments.generations,
-            'population': arguments.population, 'sd': arguments.sd,
-            **({'within': True} if arguments.within else {}),
+            'population': arguments.population, 'sd': arguments.sd, 'within': arguments.within,
             'default': round(float(scores[0].mean()), 3),
             'set_before': round(float(scores[:-1].max(0).mean()), 3),
             'alone': round(float(scores[-1].mean()), 3),

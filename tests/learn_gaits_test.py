@@ -213,6 +213,8 @@ class LearnTest(parameterized.TestCase):
         self.assertLen(other.exported().choices, count + len(names))
         with self.assertRaisesRegex(ValueError, "'tuned'.*did you mean"):
             learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, gaits=('tuned',)), 1)
+        with self.assertRaisesRegex(ValueError, "'big_hop'.*within the action range"):
+            learn_gaits.Learner(HOPPER, 1, dataclasses.replace(TINY, gaits=('big_hop',)), 1)
 
     def test_several_environments_share_the_simulations(self):
         settings = dataclasses.replace(TINY, num_envs=5, also=('FSM_Hopper2D_*Walls*', HOPPER))
