@@ -163,6 +163,7 @@ def search(
         result[:, gait.absolute] = np.abs(result[:, gait.absolute])
         result[:, gait.actions] = result[:, gait.actions].round(DIGITS)
         if arguments.within:
+            # Rounding to `DIGITS` would leave the range.
             result = gait.vector(gait.action(result).clip(-1, 1)).round(9)
         return result
 
@@ -418,14 +419,16 @@ def main() -> None:
 
     known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
     rng = np.random.default_rng(arguments.seed)
+    settings = {
+        name: getattr(arguments, name)
+        for name in ('seed', 'generations', 'population', 'sd', 'within')
+    }
     if arguments.steady is not None:
         began = time.process_time()
         chosen, figures = steady(gait, known[0], arguments, rng)
         record = {
             'terrain': 'flat', 'search': steady.__name__, 'cycle': arguments.steady,
-            'seed': arguments.seed, 'generations': arguments.generations,
-            'population': arguments.population, 'sd': arguments.sd, 'within': arguments.within,
-            **figures,
+            **settings, **figures,
             'cpu_seconds': round(time.process_time() - began),
         }  # fmt: skip
         stored['steady'] = {'vector': chosen.tolist(), 'tuning': record}
@@ -441,9 +444,7 @@ def main() -> None:
         chosen, scores = tune(obstacles, have, arguments, rng)
         obstacles.bench.environments.close()
         record = {
-            'terrain': terrain, 'search': tune.__name__,
-            'seed': arguments.seed, 'generations': arguments.generations,
-            'population': arguments.population, 'sd': arguments.sd, 'within': arguments.within,
+            'terrain': terrain, 'search': tune.__name__, **settings,
             'default': round(float(scores[0].mean()), 3),
             'set_before': round(float(scores[:-1].max(0).mean()), 3),
             'alone': round(float(scores[-1].mean()), 3),
@@ -454,8 +455,7 @@ def main() -> None:
         stored[f'{terrain}_{number}'] = {'vector': chosen.tolist(), 'tuning': record}
         known.append(chosen)
         print(f'{terrain}_{number}', record, flush=True)
-        with files.replacing(path) as part:
-            part.write_text(json.dumps(stored, indent=1))
+        files.write_json(stored, path)
 
 
 if __name__ == '__main__':
