@@ -77,13 +77,12 @@ class Settings:
     noise: float = 0.15  # standard deviation of the actors' noise
     noise_share: float = 0.25  # share of actions with noise, if there are actors
     epsilon: float = 0.08  # share of random actions after `expert_cycles`
-    greedy: float = 0.25  # share of simulations without random actions and without retries
+    # Share of simulations without retries, and without random actions after `expert_cycles`.
+    greedy: float = 0.25
     retry: float = 0.8  # probability that a simulation returns to an earlier state after a fall
     retries: int = 4  # largest number of retries in a row
-    back: tuple[int, int] = (
-        1,
-        3,
-    )  # smallest and largest number of cycles to return before the last one
+    # Smallest and largest number of cycles that a retry goes back, besides the last one.
+    back: tuple[int, int] = (1, 3)
     retry_epsilon: float = 0.3  # share of random actions in the first cycles of a retry
     retry_cycles: int = 2
     gamma: float = 0.95  # per cycle
@@ -101,9 +100,7 @@ class Settings:
     final_rate: float = 1e-5
     members: int = 1  # networks that learn in a final phase; the policy has their mean values
     view: float = 6.5  # m; distance of the farthest ground height in the input
-    relief: float = (
-        1.5  # m; heights relative to the root are clipped at this deviation from the mean
-    )
+    relief: float = 1.5  # m; heights relative to the root are clipped this far from the mean
     convolutions: tuple[tuple[int, int, int], ...] = ((16, 8, 2), (32, 5, 2), (32, 3, 1))
     ground_units: int = 128  # units of the layer after the convolutions
     hidden: tuple[int, ...] = (512, 256)
@@ -161,11 +158,9 @@ _STATE = (
     'samples', 'updates', 'loss', 'seconds', 'curve', 'mean', 'std', 'observation', 'tried',
     'past', 'chains', 'travelled', 'tally', 'renewed',
 )  # fmt: skip
+_FINAL = 'final_updates', 'final_rate', 'members'  # settings of the final phase
 # Settings that may change when a run is continued.
-_CHANGEABLE = (
-    'samples', 'final_updates', 'final_rate', 'members', 'write_every', 'evaluate_every',
-    'evaluation_episodes',
-)  # fmt: skip
+_CHANGEABLE = (*_FINAL, 'samples', 'write_every', 'evaluate_every', 'evaluation_episodes')
 _NETWORKS = 'network', 'target'
 _PARTS = *_NETWORKS, 'optimizer'
 
@@ -364,7 +359,7 @@ class Learner:
         self.ids = environments_of(id_, s)
         self.simulations = Simulations(self.ids, seeds, threads)
         environments = self.environments = self.simulations.groups[0]
-        # Simulations without random actions and without retries.
+        # Simulations without retries, and without random actions after the first cycles.
         self.greedy = np.concatenate(
             [
                 np.arange(each.num_envs) < s.greedy * each.num_envs
@@ -378,7 +373,7 @@ class Learner:
             raise ValueError(f'gaits: {s.gaits}; expected sets within the action range')
         self.choices = self.choices.clip(-1, 1)
         if s.action == 'continuous':
-            self.choices = self.choices[:1]
+            self.choices = np.zeros_like(self.choices[:1])  # the default gait
         ahead = np.linspace(-gait_rules.BEHIND, gait_rules.AHEAD, gait_rules.SAMPLES)
         self.line = int((ahead <= s.view).sum())
         heights, size = environments.blocks['terrain'], environments.task.observation.shape[1]
@@ -663,6 +658,7 @@ class Learner:
         self.renewed = self.samples
         if s.renew_every:
             self.network.load_state_dict(self.target.state_dict())
+            self.begin_optimizer()  # with the constant rate
         self.seconds['learning'] += time.process_time() - begin
 
     def exported(self) -> policies.Policy:
@@ -713,8 +709,8 @@ class Learner:
     def evaluate(self) -> dict[str, Any]:
         """Evaluates the policy, and returns the new point of the curve.
 
-        `metres` and `falls` are those of simulations without random actions and without retries
-        since the last point, by environment. Without episodes of evaluation `distance` is their
+        `metres` and `falls` are those of the `greedy` simulations since the last point, by
+        environment. Without episodes of evaluation `distance` is their
         ratio in the environment of the run; it is their mean distance to a fall. It is absent if
         these simulations have not moved, as after the final phase.
         """
@@ -770,7 +766,10 @@ class Learner:
 
     def restore(self, folder: pathlib.Path) -> None:
         """Restores the run from the files that `save` wrote."""
-        self.set_state(checkpoints.load_run(folder, self.settings, _CHANGEABLE))
+        state = checkpoints.load_run(folder, self.settings, _CHANGEABLE)
+        self.set_state(state)
+        if any(state['settings'][name] != getattr(self.settings, name) for name in _FINAL):
+            self.renewed = 0  # so that the final phase is repeated
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restores the state returned by `get_state` of a run with these settings."""

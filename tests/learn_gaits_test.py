@@ -290,6 +290,11 @@ class LearnTest(parameterized.TestCase):
             policy = policies.load(folders[0] / 'policy.npz')
             policy.check(VectorEnvironment(HOPPER, 1, 1))
             self.assertEqual(policy.info['samples'], 48)
+            # Another final phase is repeated, from the same transitions.
+            members = settings.members + 1
+            more = dataclasses.replace(settings, members=members)
+            learn_gaits.train(HOPPER, 1, more, folders[0], 1)
+            self.assertLen(policies.load(folders[0] / 'policy.npz').networks, members)
             with self.assertRaisesRegex(ValueError, 'other settings'):
                 other = dataclasses.replace(TINY, alive=1.0, **changes)
                 learn_gaits.train(HOPPER, 1, other, folders[0], 1)
