@@ -11,7 +11,7 @@ average of those of all updates (setting `averaged`), in which their random chan
 are those of `learn_gaits.py`.
 
 After a fall most simulations return to a state a few cycles earlier, as in `learn_gaits.py`; these
-returns end a trajectory, and the actions after them are those of the policy.
+retries end a trajectory, and the actions after them are those of the policy.
 
 Without `--start` the policy is first learnt by `learn_gaits.py`, with the settings of the
 environment, in the folder OUTPUT/ID/seed_S/first. Writes into OUTPUT/ID/seed_S: `checkpoint.pt`
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 import pathlib
 import time
 from typing import Any
@@ -70,8 +71,9 @@ class Settings:
     averaged: float = 1e5  # cycles over which the weights of the policy are averaged; 0: not
     greedy: float = 0.34  # share of simulations that do not return to earlier states
     retry: float = 0.5  # probability that the others do after a fall
-    retries: int = 6  # largest number of returns in a row
-    back: tuple[int, int] = (1, 5)  # smallest and largest number of cycles, before the last one
+    retries: int = 6  # largest number of retries in a row
+    # Smallest and largest number of cycles that a retry goes back, besides the last one.
+    back: tuple[int, int] = (1, 5)
     write_every: float = 16384  # cycles
     evaluate_every: float = 32768  # cycles
 
@@ -120,6 +122,25 @@ def settings_for(id_: str, **changes: Any) -> Settings:
     return Settings(**{'first': learn_gaits.settings_for(id_), **own, **changes})
 
 
+def simulated(id_: str, settings: Settings) -> learn_gaits.Settings:
+    """Returns the settings of the simulations.
+
+    Raises:
+      ValueError: actors change the base actions, an environment is unknown or has no gait.
+    """
+    s = settings
+    if s.first.actors:
+        raise ValueError(
+            f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
+        )
+    own = dataclasses.replace(
+        s.first, also=s.also, num_envs=s.num_envs, start='', capacity=1, greedy=s.greedy,
+        retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
+    )  # fmt: skip
+    learn_gaits.environments_of(id_, own)
+    return own
+
+
 class Refiner:
     """One run: simulations as in Q-learning, the policy, the value and the progress."""
 
@@ -129,19 +150,10 @@ class Refiner:
         """Begins with a policy of `learn_gaits.py`.
 
         Raises:
-          ValueError: the policy does not fit the environment, actors change the base actions, or an
-            environment has no gait.
+          ValueError: the policy does not fit the environment, or as `simulated`.
         """
         self.settings, s = settings, settings
-        if s.first.actors:
-            raise ValueError(
-                f"action: {s.first.action!r}; expected 'discrete', a choice of base actions"
-            )
-        own = dataclasses.replace(
-            s.first, also=s.also, num_envs=s.num_envs, start='', capacity=1, greedy=s.greedy,
-            retry=s.retry, retries=s.retries, back=s.back, evaluation_episodes=0,
-        )  # fmt: skip
-        self.learner = learner = learn_gaits.Learner(id_, seed, own, threads)
+        self.learner = learner = learn_gaits.Learner(id_, seed, simulated(id_, s), threads)
         learner.begin_with(initial)
         networks = [copy.deepcopy(learner.network) for _ in initial.networks]
         for number, network in enumerate(networks):
@@ -279,17 +291,23 @@ class Refiner:
             getattr(self, name).load_state_dict(state[name])
         self.learner.set_state(state['learner'])
 
-    def write(self, folder: pathlib.Path, before: list[dict[str, Any]], threads: int) -> None:
-        """Writes curve and policy; the curve continues that of the first run, `before`."""
+    def write(
+        self, folder: pathlib.Path, before: list[dict[str, Any]], threads: int
+    ) -> list[dict[str, Any]]:
+        """Writes curve and policy; returns the curve, which continues that of the first run."""
         done = before[-1]['samples'] if before else 0
-        points = [{**point, 'samples': point['samples'] + done} for point in self.learner.curve]
+        curve = [
+            *before,
+            *({**point, 'samples': point['samples'] + done} for point in self.learner.curve),
+        ]
         checkpoints.write_curve(
             folder, self.learner.environments.spec.id, self.learner.seed, self.settings, threads,
-            [*before, *points], environments=self.learner.ids,
+            curve, environments=self.learner.ids,
         )  # fmt: skip
         policy = self.exported()
         info = {**policy.info, 'samples': self.samples + done}
         policies.save(dataclasses.replace(policy, info=info), folder / 'policy.npz')
+        return curve
 
 
 def first_policy(
@@ -298,8 +316,12 @@ def first_policy(
     """Returns the initial policy, and its learning curve if it is learnt here."""
     if settings.start:
         return learn_gaits.initial_policy(settings.start), []
-    curve = learn_gaits.train(id_, seed, settings.first, folder / 'first', threads)
-    return policies.load(folder / 'first' / 'policy.npz'), curve
+    first = folder / 'first'
+    if (folder / 'checkpoint.pt').exists():  # PPO has begun
+        curve = json.loads((first / 'curve.json').read_text())['curve']
+    else:
+        curve = learn_gaits.train(id_, seed, settings.first, first, threads)
+    return policies.load(first / 'policy.npz'), curve
 
 
 def train(
@@ -314,6 +336,7 @@ def train(
     """
     with checkpoints.only_run(folder):
         torch.set_num_threads(1)
+        simulated(id_, settings)  # before Q-learning
         initial, before = first_policy(id_, seed, settings, folder, threads)
         refiner, s = Refiner(id_, seed, settings, threads, initial), settings
         if (folder / 'checkpoint.pt').exists():
@@ -331,8 +354,7 @@ def train(
                     refiner.write(folder, before, threads)
                 if ends or refiner.samples // s.write_every > begin // s.write_every:
                     checkpoints.save(refiner.get_state(), folder / 'checkpoint.pt')
-        refiner.write(folder, before, threads)
-        return [*before, *refiner.learner.curve]
+        return refiner.write(folder, before, threads)
 
 
 def main() -> None:

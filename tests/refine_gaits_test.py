@@ -5,6 +5,7 @@ import json
 import pathlib
 import sys
 import tempfile
+from unittest import mock
 
 import numpy as np
 import torch
@@ -50,6 +51,20 @@ class RefineTest(parameterized.TestCase):
         exported = refiner.exported()
         self.assertLen(exported.networks, 2)
         np.testing.assert_array_equal(exported(observation), initial(observation))
+
+    @parameterized.parameters(
+        ({'first': dataclasses.replace(FIRST, action='both')}, 'action'),
+        ({'also': ('FSM_Hoper2D_*',)}, 'did you mean'),
+        ({'also': ('PD_Biped2D_Gaps_Terrain-v0',)}, 'no gait'),
+    )
+    def test_bad_settings_are_refused_before_q_learning(self, changes, message):
+        settings = dataclasses.replace(SMALL, **changes)
+        with (
+            tempfile.TemporaryDirectory() as name,
+            mock.patch.object(learn_gaits, 'train', side_effect=AssertionError),
+            self.assertRaisesRegex(ValueError, message),
+        ):
+            refine_gaits.train(HOPPER, 1, settings, pathlib.Path(name), 1)
 
     def test_actions_are_drawn_with_their_probabilities(self):
         refiner, _ = make(num_envs=8, horizon=1)
@@ -136,6 +151,10 @@ class RefineTest(parameterized.TestCase):
             written = json.loads((folders[0] / 'curve.json').read_text())
             points = [point['samples'] for point in written['curve']]
             self.assertEqual(points, [16, 48, 80])  # Q-learning first
+            self.assertEqual(points, [point['samples'] for point in curves[0]])
+            with mock.patch.object(learn_gaits, 'train', side_effect=AssertionError):
+                again = refine_gaits.train(HOPPER, 1, settings, folders[0], 1)
+            self.assertEqual([{**point, 'seconds': None} for point in again], curves[0])
             policy = policies.load(folders[0] / 'policy.npz')
             policy.check(VectorEnvironment(HOPPER, 1, 1))
             self.assertEqual(policy.info['samples'], 80)
