@@ -9,8 +9,8 @@
 For each terrain, in the order given, the gaits found so far run over it until they fall, and the
 states one to three cycles before these falls are stored. The score of a gait in a state is the
 distance travelled with that gait for one cycle (two if the legs change roles each cycle) and the
-default gait in the next cycles, divided by the usual distance of as many cycles. The score of a set
-of gaits is the mean over states of the score of its best gait. CMA-ES (Hansen 2016,
+default gait in the next cycles, divided by `USUAL` times the distance of as many cycles of the default
+gait on flat ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best gait. CMA-ES (Hansen 2016,
 arXiv:1604.00772) searches for the gait that increases the score of the set most. The stored scores
 are those in states that were not used by the search.
 
@@ -24,7 +24,8 @@ a change of the base actions, and so of the action range: `--add` stores them in
 With `--steady LENGTH` a gait is searched for with cycles of at least this length whose landing place
 depends as little as possible on the state, so that a policy can foresee it: after `SETTLED` cycles on
 flat ground the joint angles (and slides) of copies of a simulation are changed at random, and the
-score is high where the copies are still close together one to `AHEAD` cycles later.
+score is high where the copies are still close together one to `AHEAD` cycles later. Falls, cycles that
+are shorter, and speeds far from the target speed reduce it.
 
 Writes OUTPUT/CHARACTER.json: the gaits that were found, with records of the searches. `--enter` makes
 gaits of this file, or existing sets, the base actions in `trl_suite/controllers/CHARACTER.json`. `--score`
@@ -52,15 +53,17 @@ from trl_suite.util.program import begin_script
 BACK = 3  # largest number of cycles from a state to the fall
 AFTER = 3  # cycles with the default gait after those with the candidate
 USUAL = 0.8  # share of the distance on flat ground that gives the full score
-OTHERS = 0.3  # share of the cycles before a fall with other gaits than the default one
+OTHERS = 0.3  # share of the cycles before a fall with a gait drawn from all, instead of the first
 HORIZON = 8.0  # s, with `--alone`
 STATES, VALIDATION = 32, 64  # numbers of states for the search, and for the stored scores
-STARTS = 6  # number of noisy starts with `--alone`
+STARTS = 6  # number of noisy starts; twice as many with `--steady`
 FINALISTS = 5  # the best of this number of last generations, and the mean of the distribution
 FRICTION = 0.81
-# With `--steady`: cycles before and after the change; starts and copies of each; standard deviation of
-# the change, rad (slides: m); spread that counts as none, m; tolerance of the speed, m/s.
+# With `--steady`: cycles before and after the change; copies of each start; standard deviation of the
+# change, rad (slides: m); spread that counts as none, m; tolerance of the speed, m/s.
 SETTLED, AHEAD, COPIES, CHANGE, CLOSE, SPEED_TOLERANCE = 4, 3, 4, 0.02, 3e-3, 0.6
+# Weights of falls, of missing length (1/m) and of the speed (s/m) in the score.
+FALLS, LENGTH, SPEED = 3.0, 2.0, 0.3
 DIGITS = 4
 HAND = 'by hand'  # how sets were found that no search has found
 
@@ -255,7 +258,7 @@ def steadiness(
             duration[going] += bench.task.state.duration[going]
         going = going[~(step.terminated | step.truncated)[going]]
     whole = np.isfinite(places[-1])
-    # A simulation that has fallen counts as 1 m away.
+    # If a copy has fallen, the spread of its start counts as 1 m.
     spread = np.where(whole, places - places[0], 0.0)[1:].reshape(AHEAD, *shape).std(3)
     spread[:, ~whole.reshape(shape).all(2)] = 1.0
     distance = np.where(whole, places[-1] - places[0], 0.0).reshape(len(vectors), -1).sum(1)
@@ -266,9 +269,9 @@ def steadiness(
         'length': distance / count / AHEAD, 'speed': distance / np.maximum(duration, 1e-9),
     }  # fmt: skip
     away = np.abs(figures['speed'] - bench.gait.target_speed)
-    score = -np.log10(figures['spread'] + CLOSE).mean(1) - 3 * (1 - figures['upright'])
-    score -= 2 * np.maximum(0, length - figures['length'])
-    return score - 0.3 * np.maximum(0, away - SPEED_TOLERANCE), figures
+    score = -np.log10(figures['spread'] + CLOSE).mean(1) - FALLS * (1 - figures['upright'])
+    score -= LENGTH * np.maximum(0, length - figures['length'])
+    return score - SPEED * np.maximum(0, away - SPEED_TOLERANCE), figures
 
 
 def steady(
@@ -318,12 +321,16 @@ def score(obstacles: Obstacles, terrain: str, rng: np.random.Generator) -> pathl
 def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.Path:
     """Makes gaits the base actions of a character, in this order.
 
-    Numbers are indices of base actions of the original.
+    Numbers are indices of base actions of the original. The default gait, if it is the base action of
+    an index, is that index of the new ones.
 
     Raises:
-      ValueError: a name is unknown.
+      ValueError: a name is unknown, or there are too few.
     """
     data = tune_gait.stored(character)
+    default = data['action_offset']
+    if isinstance(default, int) and default >= len(names):
+        raise ValueError(f'{len(names)} gaits; the default gait is base action {default}')
     data.setdefault('tuning', {})
     original = data.setdefault('original_base_actions', data['base_actions'])
     numbers = list(map(str, range(len(original))))
@@ -337,7 +344,7 @@ def enter(character: str, found: dict[str, Any], names: Sequence[str]) -> pathli
         original[int(name)] if name in numbers else [name, name, 0] for name in names
     ]
     used = {name for a, b, _ in (*original, *data['base_actions']) for name in (a, b)}
-    used.add(data['action_offset'])
+    used.add(default)
     used |= {name for name, record in data['tuning'].items() if record.get('within')}
     for part in ('sets', 'tuning'):
         data[part] = {name: value for name, value in data[part].items() if name in used}
@@ -363,16 +370,15 @@ def add(character: str, found: dict[str, Any], names: Sequence[str]) -> pathlib.
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('character', choices=controllers.available())
-    parser.add_argument(
-        '--terrain', nargs='+', default=[], help='terrains; one gait is searched for each'
-    )
-    parser.add_argument('--alone', action='store_true', help='repeat the gait')
     parser.add_argument('--within', action='store_true', help='search within the action range')
-    parser.add_argument(
+    parser.add_argument('--alone', action='store_true', help='repeat the gait; with --terrain')
+    group = parser.add_mutually_exclusive_group(required=True)
+    group.add_argument('--terrain', nargs='+', help='terrains; one gait is searched for each')
+    group.add_argument(
         '--steady', type=float, metavar='LENGTH', help='search for a gait with such cycles, m'
     )
     parser.add_argument(
-        '--start', nargs='+', help='sets, or numbers of base actions; default: action 0'
+        '--start', nargs='+', help='sets, or numbers of base actions; default: the default gait'
     )
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument(
@@ -381,16 +387,16 @@ def main() -> None:
     parser.add_argument('--population', type=int, default=12)
     parser.add_argument('--generations', type=int, default=30)
     parser.add_argument('--output', type=pathlib.Path, default=pathlib.Path('runs'))
-    parser.add_argument(
+    group.add_argument(
         '--enter',
         nargs='+',
         metavar='SET',
         help='sets, or numbers of base actions of the original, that become the base actions',
     )
-    parser.add_argument(
+    group.add_argument(
         '--add', nargs='+', metavar='SET', help='sets, found with --within, that are stored'
     )
-    parser.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
+    group.add_argument('--score', metavar='TERRAIN', help='terrain for the scores')
     arguments = parser.parse_args()
     if arguments.steady is not None and not 0 < arguments.steady < np.inf:
         parser.error(f'argument --steady: {arguments.steady}; expected a length above 0 m')
@@ -408,7 +414,7 @@ def main() -> None:
         return
 
     if arguments.score:
-        obstacles = Obstacles(gait, arguments.score, gait.base_actions[0], VALIDATION)
+        obstacles = Obstacles(gait, arguments.score, gait.action_offset, VALIDATION)
         print(score(obstacles, arguments.score, np.random.default_rng(arguments.seed)))
         return
 
@@ -419,10 +425,17 @@ def main() -> None:
 
     known = [vector(name) for name in arguments.start] if arguments.start else [gait.action_offset]
     rng = np.random.default_rng(arguments.seed)
-    settings = {
+    settings = {'known': arguments.start or ['default gait']} | {
         name: getattr(arguments, name)
         for name in ('seed', 'generations', 'population', 'sd', 'within')
     }
+
+    def add_found(kind: str, vector: np.ndarray, record: dict[str, Any]) -> None:
+        number = 1 + sum(name.rsplit('_', 1)[0] == kind for name in stored)
+        stored[f'{kind}_{number}'] = {'vector': vector.tolist(), 'tuning': record}
+        print(f'{kind}_{number}', record, flush=True)
+        files.write_json(stored, path)
+
     if arguments.steady is not None:
         began = time.process_time()
         chosen, figures = steady(gait, known[0], arguments, rng)
@@ -431,10 +444,8 @@ def main() -> None:
             **settings, **figures,
             'cpu_seconds': round(time.process_time() - began),
         }  # fmt: skip
-        stored['steady'] = {'vector': chosen.tolist(), 'tuning': record}
-        print(record)
-        files.write_json(stored, path)
-    for terrain in arguments.terrain:
+        add_found(steady.__name__, chosen, record)
+    for terrain in arguments.terrain or ():
         began = time.process_time()
         print(gait.character, terrain, flush=True)
         have = np.array(known)
@@ -451,11 +462,8 @@ def main() -> None:
             'set_after': round(float(scores.max(0).mean()), 3),
             'cpu_seconds': round(time.process_time() - began),
         }  # fmt: skip
-        number = 1 + sum(name.rsplit('_', 1)[0] == terrain for name in stored)
-        stored[f'{terrain}_{number}'] = {'vector': chosen.tolist(), 'tuning': record}
         known.append(chosen)
-        print(f'{terrain}_{number}', record, flush=True)
-        files.write_json(stored, path)
+        add_found(terrain, chosen, record)
 
 
 if __name__ == '__main__':

@@ -256,6 +256,9 @@ class TuneTest(absltest.TestCase):
                 tune_base_actions.add('dog', {'walk': stairs, 'other': others}, ['other'])
             tune_base_actions.add('dog', {'walk': stairs}, ['walk'])
             written = tune_base_actions.enter('dog', {}, ['0', '1'])
+            data['action_offset'] = 1  # the default gait is the second base action
+            with self.assertRaisesRegex(ValueError, '1 gaits.*base action 1'):
+                tune_base_actions.enter('dog', {}, ['0'])
         self.assertEqual(written['sets']['walk'], stairs['vector'])
         self.assertEqual(written['tuning']['walk'], {'within': True})
         self.assertNotIn('walk', [name for names in written['base_actions'] for name in names])
