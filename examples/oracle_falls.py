@@ -95,7 +95,7 @@ def measure(
     environments = VectorEnvironment(row, number, 1, seed, **options)
     rate = 1 / environments.control_timestep
     backs = [round(seconds * rate) for seconds in BACK]
-    past, places = oracle_gaits.falls(environments, policy, max(backs))
+    past, places, _ = oracle_gaits.falls(environments, policy, max(backs))
     copies = VectorEnvironment(row, tries * len(STDS), 1, seed, **options)
     copies.reset()
     std = np.repeat(STDS, tries)[:, None]

@@ -42,8 +42,8 @@ from trl_suite.util.program import begin_script
 from trl_suite.vector import VectorEnvironment
 
 BACK = 5  # largest number of cycles from a state to the fall
-PASSED = 2.0  # m beyond the place of the fall
-MOST_CYCLES = 12  # after the action that is tried
+PASSED, PASSED_CYCLES = 2.0, 4  # beyond the place of the fall: m, mean cycles of the policy
+MOST_CYCLES = 12  # with that of the action that is tried
 NOISE = 0.3  # standard deviation of random parameters, in units of the action
 NUDGE = 1e-3  # standard deviation of changes of joint angles, rad
 KINDS = 'base', 'random', 'nudged'
@@ -52,21 +52,24 @@ Act = Callable[[np.ndarray], np.ndarray]
 
 def falls(
     environments: VectorEnvironment, act: Act, back: int = BACK
-) -> tuple[list[list[dict[str, Any]]], np.ndarray]:
+) -> tuple[list[list[dict[str, Any]]], np.ndarray, float]:
     """Runs each simulation until a fall that is preceded by `back` steps.
 
     Returns:
-      For each simulation the states before its last `back` steps, the last one first; and the
-      position in which it fell, (n,) m.
+      For each simulation the states before its last `back` steps, the last one first; the position
+      in which it fell, (n,) m; and the mean distance of all steps, m.
     """
-    count = environments.num_envs
+    count, distance, steps = environments.num_envs, 0.0, 0
     past: list[collections.deque] = [collections.deque(maxlen=back) for _ in range(count)]
     going, observation = np.ones(count, bool), environments.reset()
     with tqdm.tqdm(total=count, unit='fall') as bar:
         while going.any():
             for i in np.flatnonzero(going).tolist():
                 past[i].appendleft(environments.get_state([i]))
+            before = position(environments)
             step = environments.step(act(observation), going)
+            distance += float((position(environments) - before)[going].sum())
+            steps += int(going.sum())
             for i in np.flatnonzero(step.terminated & going).tolist():
                 if len(past[i]) == back:
                     going[i] = False
@@ -75,13 +78,13 @@ def falls(
                     past[i].clear()
                     environments.reset([i])
             observation = environments.task.observation.copy()
-    return [list(each) for each in past], position(environments)
+    return [list(each) for each in past], position(environments), distance / steps
 
 
 def prevented(
     copies: VectorEnvironment,
     states: Sequence[dict[str, Any]],
-    place: float,
+    beyond: float,
     actions: np.ndarray,
     act: Act,
 ) -> np.ndarray:
@@ -90,7 +93,7 @@ def prevented(
     Args:
       copies: environments of this kind, at least m.
       states: the states in which the actions are tried, m.
-      place: place of the fall, m.
+      beyond: the position that has to be passed, m.
       actions: the actions, each for one cycle, (m, k).
       act: the policy that continues.
 
@@ -105,7 +108,7 @@ def prevented(
     passed = np.zeros(copies.num_envs, bool)
     for _ in range(MOST_CYCLES):
         step = copies.step(action, going)
-        passed[going] = ~step.terminated[going] & (position(copies)[going] > place + PASSED)
+        passed[going] = ~step.terminated[going] & (position(copies)[going] > beyond)
         going = going[~(step.terminated | passed)[going]]
         if not len(going):
             break
@@ -122,7 +125,8 @@ def measure(
     environments = VectorEnvironment(id_, number, 1, seed, **options)
     parameters = environments.task.gait.parameters
     base = parameters.action(parameters.base_actions)
-    past, places = falls(environments, policy)
+    past, places, pace = falls(environments, policy)
+    margin = min(PASSED, PASSED_CYCLES * pace)
     ends = np.cumsum([1, len(base), randoms, randoms])  # of the copies of each kind
     copies = VectorEnvironment(id_, int(ends[-1]), 1, seed, **options)
     copies.reset()
@@ -137,11 +141,11 @@ def measure(
             changes = rng.normal(0, NUDGE, (randoms, joints))
             states = [state] * ends[2] + [nudged(copies, state, each) for each in changes]
             tried = np.concatenate([own, base, noisy, np.repeat(own, randoms, 0)])
-            found[i, back] = prevented(copies, states, float(place), tried, policy)
+            found[i, back] = prevented(copies, states, float(place) + margin, tried, policy)
     parts = np.split(found, ends[:-1], axis=2)[1:]
     result: dict[str, Any] = {
         'falls': number, 'seed': seed, 'samples': policy.info.get('samples'),
-        'policy': policy.id, 'own': float(found[..., 0].mean()),
+        'policy': policy.id, 'passed': round(margin, 3), 'own': float(found[..., 0].mean()),
     }  # fmt: skip
     for kind, part in zip(KINDS, parts, strict=True):
         some = part.any(2)

@@ -27,7 +27,8 @@ class OracleTest(absltest.TestCase):
         def default(observation):
             return np.zeros((len(observation), size))
 
-        states, places = oracle_gaits.falls(environments, default)
+        states, places, pace = oracle_gaits.falls(environments, default)
+        self.assertBetween(pace, 0.5, 2.4)  # hops are 2.4 m long; those into gaps are shorter
         copies = VectorEnvironment(HOPPER, 2, 1, 1, autoreset='disabled', step_limit=None)
         copies.reset()
         for each, place in zip(states, places, strict=True):
@@ -42,7 +43,7 @@ class OracleTest(absltest.TestCase):
                 # The same action falls again; at a place far behind nothing is prevented by it.
                 for nearer, expected in ((0.0, False), (1e3, True)):
                     found = oracle_gaits.prevented(
-                        copies, [state] * 2, place - nearer, np.zeros((2, size)), default
+                        copies, [state] * 2, place + 0.5 - nearer, np.zeros((2, size)), default
                     )
                     self.assertEqual(found.tolist(), [expected] * 2 if back > 1 else [False] * 2)
 
@@ -74,7 +75,7 @@ class OracleTest(absltest.TestCase):
         """Noise prevents a fall if the character gets beyond its place, before or after its time."""
         policy = policies.reference(RAPTOR)
         environments = VectorEnvironment(RAPTOR, 2, 1, 0, autoreset='disabled', step_limit=None)
-        past, places = oracle_gaits.falls(environments, policy, 20)
+        past, places, _ = oracle_gaits.falls(environments, policy, 20)
         copies = VectorEnvironment(RAPTOR, 2, 1, 1, autoreset='disabled', step_limit=None)
         copies.reset()
         none = np.zeros((20, 2, len(copies.action_map)))
@@ -92,7 +93,7 @@ class OracleTest(absltest.TestCase):
         options = {'autoreset': 'disabled', 'step_limit': None, 'task_kwargs': condition}
         row = evaluate_footsteps.row_for(FOOTSTEPS, None)
         environments = VectorEnvironment(row, 2, 1, 0, **options)
-        past, _ = oracle_gaits.falls(environments, policy, 15)
+        past, _, _ = oracle_gaits.falls(environments, policy, 15)
         copies = VectorEnvironment(row, 2, 1, 1, **options)
         copies.reset()
         none = np.zeros((15, 2, len(copies.action_map)))
