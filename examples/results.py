@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import oracle_gaits
 import train_all
 
 from trl_suite import policies
@@ -151,7 +152,7 @@ def shared_rows() -> list[list[str]]:
         rows.append([
             f'`{id_}`', f'`{entry["policy"]}`', preference, f'{own["distance"]:.0f} ({low:.0f} to {high:.0f})',
             f'{own["median_distance"]:.0f}', f'{own["speed"]:.2f}', f'{before["distance"]:.0f}',
-            str(own['episodes']),
+            str(own['episodes']), f'{own["completion_rate"]:.0%}',
         ])  # fmt: skip
     return rows
 
@@ -268,9 +269,10 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
         f'written by `examples/results.py` from the {len(runs)} runs in `trained/`, each of them one '
         'run of `examples/ppo.py`, or for gait environments of `examples/search_gaits.py`, '
         '`examples/learn_gaits.py` or `examples/refine_gaits.py`, with the settings in its JSON file; '
-        '`examples/train_all.py` repeats them. Of several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
+        '`examples/train_all.py` repeats them, except for what a note under the table of gaits says. Of several seeds the best one is shipped: `suite.reference_policy(id)`. Results of the papers: '
         '[comparison with the papers](findings.md).',
-        f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes that were '
+        f'Every policy was evaluated without noise in {" or ".join(map(str, episodes))} episodes (gaits on '
+        'other terrains: see the column *episodes*) that were '
         'used neither for training nor for the selection of a policy during training; the results '
         'therefore differ from the learning curves. (Of several seeds, the best one was selected in these '
         'episodes; all seeds are listed under *Actuation models*.) *Return* is divided by its maximum; the '
@@ -309,7 +311,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
     if rows:
         parts += [
             '## Gaits',
-            'Median and mean distance in m before a fall, of the trained policy and of action 0, the '
+            'Median and mean distance in m before a fall, of the trained policy and of the '
             f'default gait, in the same {train_all.GAIT_EPISODES} episodes, which are truncated after '
             f'{terrainrl.STEP_LIMIT} cycles; the mean with its 95 % interval; speed in m/s. *Decisions*: with '
             '`examples/search_gaits.py`, cycles before which all base actions were simulated; with '
@@ -328,6 +330,13 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                 ),
                 rows,
             ),
+            'Runs that differ from the settings in their files:',
+            '\n'.join(
+                f'- `{id_}`: {run["note"]}'
+                for id_, entry in entries.items()
+                for run in entry['runs']
+                if 'note' in run
+            ),
         ]
     rows = shared_rows()
     if rows:
@@ -335,7 +344,9 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             '## Gaits on other terrains',
             'Policies that are shipped for further environments, by `examples/share_gaits.py`. *Before*: '
             'the mean of the policy that was replaced, or else of the default gait, in the same episodes. '
-            '*Preference*: number that is added to the value of the default gait.',
+            '*Preference*: number that is added to the value of the default gait. *Truncated*: share of '
+            f'the episodes that lasted {terrainrl.STEP_LIMIT} cycles; where it is high, the distance to a '
+            'fall is longer.',
             table(
                 (
                     'environment',
@@ -346,6 +357,7 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
                     'speed',
                     'before',
                     'episodes',
+                    'truncated',
                 ),
                 rows,
             ),
@@ -356,7 +368,10 @@ def page(entries: dict[str, dict[str, Any]]) -> str:
             '## Falls of gaits that other actions prevent',
             'Measured by `examples/oracle_gaits.py`: the share of the falls of a policy that some action '
             'prevents if it is taken one, two, ... five cycles before the end and the policy goes on from '
-            'there. *Base*: every base action; *random*: eight base actions with noise in all parameters; '
+            f'there: the character gets {oracle_gaits.PASSED:g} m beyond the place of the fall, or as far as '
+            f'{oracle_gaits.PASSED_CYCLES} of its mean cycles if they are shorter, within '
+            f'{oracle_gaits.MOST_CYCLES} cycles. *Base*: every base action (7 to 18 of them, depending on '
+            'the character; more tries prevent more falls); *random*: eight base actions with noise in all parameters; '
             '*nudged*: no other action, but joint angles that are changed by 0.001 rad, eight times; '
             '*any*: the share of falls that some action prevents, at any time. Where it is low, the gait '
             'is the limit, or the view. Where base actions prevent more than nudges, the choice of the '
