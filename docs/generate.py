@@ -247,6 +247,7 @@ def learnt(spec: catalogue.EnvSpec) -> str:
     result, samples, taken = run['evaluation'], run['curve'][-1]['samples'], run['shipped_at']
     settings, unit = run['settings'], task_type(spec).samples
     first, searched = settings.get('first', settings), 'cycles' in settings
+    begin = settings if settings.get('start') else first
     trained = f'{samples / 1e6:.2g} million {unit}'
     after = f'{taken / 1e6:.2g} million'
     if searched:
@@ -265,8 +266,8 @@ def learnt(spec: catalogue.EnvSpec) -> str:
         ('mean distance', f'{result["distance"]:.1f} m'),
         ('trained for', f'{trained}, seed {run["seed"]}'),
         *([('policy saved after', after)] if taken < 0.99 * samples else []),
-        *([('of these with PPO', f'the last {settings["samples"] / 1e6:.2g} million')] if first is not settings else []),
-        *([('initial policy', begun(first, unit))] if first.get('start') else []),
+        *([('of these with PPO', f'the last {settings["samples"] / 1e6:.2g} million')] if settings is not begin else []),
+        *([('initial policy', begun(begin, unit))] if begin.get('start') else []),
         *observing(spec),
         ('machine', run['machine']),
     )  # fmt: skip

@@ -98,6 +98,12 @@ OVERRIDES: dict[str, dict[str, Any]] = {
         'also': _terrains('Dog2D', 'Cliffs', 'Narrow_Gaps'), 'num_envs': 66, 'samples': 1.2e6,
         'last_learning_rate': 1e-5, 'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
     },
+    'FSM_Dog2D_Terrain_Cliffs-v0': {
+        'start': 'FSM_Dog2D_Terrain_Slopes_Mixed-v0',
+        'also': _terrains('Dog2D', 'Cliffs', 'Slopes_Mixed', 'Narrow_Gaps'), 'num_envs': 132,
+        'horizon': 32, 'samples': 5.2e5, 'learning_rate': 2.8e-5, 'last_learning_rate': 1.4e-5,
+        'retry': 0.7, 'kl': 0.0225, 'evaluate_every': 49152,
+    },
     'FSM_Raptor2D_Terrain_Mixed-v0': {
         'samples': 2.5e5, 'retry': 0.7, 'averaged': 0.0, 'evaluate_every': 12288,
     },

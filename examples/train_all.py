@@ -66,22 +66,26 @@ GAITS = (  # gait environments that are trained by default
     'FSM_Goat2D_Terrain_Variable_Steps-v0', 'FSM_Biped2D_Terrain_Slopes_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed-v0', 'FSM_Goat2D_Terrain_Cliffs-v0',
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
+    'FSM_Dog2D_Terrain_Stairs_Rugged-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
 )  # fmt: skip
 
 
 LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.py
     'FSM_Dog2D_Terrain_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0', 'FSM_Biped2D_Terrain_Mixed-v0',
     'FSM_Hopper2D_Terrain_Mixed_Easy-v0', 'FSM_Goat2D_Terrain_Variable_Steps-v0',
-    'FSM_Goat2D_Terrain_Cliffs-v0',
+    'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Stairs_Rugged-v0',
     # Policies for all terrains of a character.
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
+    # PPO of these on some terrains.
+    'FSM_Dog2D_Terrain_Cliffs-v0',
 )  # fmt: skip
 
 REFINED = (  # of these, environments whose policies refine_gaits.py improves
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
     'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
-    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
+    'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',
+    'FSM_Hopper2D_Terrain_Mixed-v0',
 )  # fmt: skip
 
 
@@ -122,7 +126,7 @@ def program(id_: str) -> ModuleType:
 def start_of(id_: str) -> str | None:
     """Returns the initial policy of the training of an environment, if any."""
     own = program(id_).settings_for(id_)
-    return getattr(getattr(own, 'first', own), 'start', None)
+    return getattr(own, 'start', '') or getattr(getattr(own, 'first', own), 'start', None)
 
 
 def needed(id_: str) -> list[str]:
