@@ -31,11 +31,12 @@ def terminable() -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGTERM, _terminate)
-    hook, sys.unraisablehook = sys.unraisablehook, _sending_again(sys.unraisablehook)
+    sys.unraisablehook = hook = _SendingAgain(sys.unraisablehook)
     try:
         yield
     finally:
-        sys.unraisablehook = hook
+        if not hook.ends:
+            sys.unraisablehook = hook.before
         signal.signal(signal.SIGTERM, before)
 
 
@@ -44,28 +45,33 @@ def _terminate(number: int, frame: object) -> None:
     raise Terminated
 
 
-def _sending_again(
-    hook: Callable[[sys.UnraisableHookArgs], object],
-) -> Callable[[sys.UnraisableHookArgs], None]:
-    """Returns a hook that sends a signal again if its exception was ignored.
+class _SendingAgain:
+    """A hook that sends a signal again if its exception was ignored.
 
     Python ignores exceptions in destructors and in callbacks of weak references: without this, a
-    signal that arrives there would not end the program.
+    signal that arrives there would not end the program. What later destructors raise, of objects
+    that this one has left half freed, is not reported.
+
+    Attributes:
+      before: the hook for other exceptions.
+      ends: whether a signal was sent again.
     """
 
-    def handle(ignored: sys.UnraisableHookArgs) -> None:
+    def __init__(self, before: Callable[[sys.UnraisableHookArgs], object]) -> None:
+        self.before, self.ends = before, False
+
+    def __call__(self, ignored: sys.UnraisableHookArgs) -> None:
         if not issubclass(ignored.exc_type, KeyboardInterrupt):
-            hook(ignored)
+            if not self.ends:
+                self.before(ignored)
             return
-        number = signal.SIGINT
+        self.ends, number = True, signal.SIGINT
         if issubclass(ignored.exc_type, Terminated):
             number = signal.SIGTERM
             signal.signal(number, _terminate)
         timer = threading.Timer(0.01, os.kill, (os.getpid(), number))  # after this callback
         timer.daemon = True
         timer.start()
-
-    return handle
 
 
 def begin_script() -> None:
@@ -78,7 +84,7 @@ def begin_script() -> None:
     name = pathlib.Path(sys.argv[0]).name
     sys.excepthook = lambda *raised: _report(name, *raised)
     signal.signal(signal.SIGTERM, _terminate)
-    sys.unraisablehook = _sending_again(sys.unraisablehook)
+    sys.unraisablehook = _SendingAgain(sys.unraisablehook)
 
 
 def _report(
