@@ -716,9 +716,9 @@ class Learner:
         """Evaluates the policy, and returns the new point of the curve.
 
         `metres` and `falls` are those of the `greedy` simulations since the last point, by
-        environment. Without episodes of evaluation `distance` is their
-        ratio in the environment of the run; it is their mean distance to a fall. It is absent if
-        these simulations have not moved, as after the final phase.
+        environment. Without episodes of evaluation `distance` is their ratio in the environment of
+        the run; it is their mean distance to a fall. It is absent if these simulations have not
+        moved, as after the final phase.
         """
         s, begin = self.settings, time.process_time()
         point: dict[str, Any] = {}

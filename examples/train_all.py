@@ -77,11 +77,11 @@ LEARNT = (  # gait environments trained by learn_gaits.py, not by search_gaits.p
     # Policies for all terrains of a character.
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Slopes_Mixed-v0',
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Hopper2D_Terrain_Mixed-v0',
-    # PPO of these on some terrains.
-    'FSM_Dog2D_Terrain_Cliffs-v0',
 )  # fmt: skip
 
-REFINED = (  # of these, environments whose policies refine_gaits.py improves
+# Gait environments whose policies refine_gaits.py improves: of these, or of the environment from
+# which they start.
+REFINED = (
     'FSM_Biped2D_Terrain_Slopes_Mixed-v0', 'FSM_Raptor2D_Terrain_Mixed-v0',
     'FSM_Goat2D_Terrain_Cliffs-v0', 'FSM_Dog2D_Terrain_Mixed-v0',
     'FSM_Dog2D_Terrain_Slopes_Mixed-v0', 'FSM_Dog2D_Terrain_Cliffs-v0',

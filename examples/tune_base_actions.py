@@ -6,13 +6,13 @@
     python examples/tune_base_actions.py hopper --steady 1.4 --generations 60
     python examples/tune_base_actions.py hopper --score mixed_hopper
 
-For each terrain, in the order given, the gaits found so far run over it until they fall, and the
-states one to three cycles before these falls are stored. The score of a gait in a state is the
-distance travelled with that gait for one cycle (two if the legs change roles each cycle) and the
-default gait in the next cycles, divided by `USUAL` times the distance of as many cycles of the default
-gait on flat ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best gait. CMA-ES (Hansen 2016,
-arXiv:1604.00772) searches for the gait that increases the score of the set most. The stored scores
-are those in states that were not used by the search.
+For each terrain, in the order given, the gaits found so far run over it until they fall, and the states
+one to three cycles before these falls are stored. The score of a gait in a state is the distance
+travelled with that gait for one cycle (two if the legs change roles each cycle) and the default gait in
+the next cycles, divided by `USUAL` times the distance of as many cycles of the default gait on flat
+ground, and at most 1. The score of a set of gaits is the mean over states of the score of its best
+gait. CMA-ES (Hansen 2016, arXiv:1604.00772) searches for the gait that increases the score of the set
+most. The stored scores are those in states that were not used by the search.
 
 With `--alone` a gait is repeated from the start of an episode instead, and its score is the distance
 travelled, divided by the distance at the target speed.

@@ -49,8 +49,8 @@ class _SendingAgain:
     """A hook that sends a signal again if its exception was ignored.
 
     Python ignores exceptions in destructors and in callbacks of weak references: without this, a
-    signal that arrives there would not end the program. What later destructors raise, of objects
-    that this one has left half freed, is not reported.
+    signal that arrives there would not end the program. Later destructors may fail because the
+    interrupted one has left their objects half freed; what they raise is not reported.
 
     Attributes:
       before: the hook for other exceptions.
