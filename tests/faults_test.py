@@ -26,7 +26,7 @@ import pytest
 from absl.testing import absltest, parameterized
 
 from trl_suite import cli, motion, policies, sequences, suite, terrain
-from trl_suite.util import program
+from trl_suite.util import files, program
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / 'examples'))
 import checkpoints
@@ -308,6 +308,16 @@ class FaultsTest(parameterized.TestCase):
             self.interrupted(seed, SIGNALS, *arguments)
             for path in sorted(self.folder.rglob('*'), reverse=True):
                 path.rmdir() if path.is_dir() else path.unlink()
+
+    def test_writers_of_one_file_do_not_meet(self):
+        """Also if their processes have the same number, as in containers that share a folder."""
+        path = self.folder / 'file'
+        with files.replacing(path) as one:
+            one.write_text('one')
+            with files.replacing(path) as two:
+                two.write_text('two')
+            self.assertEqual((path.read_text(), one.read_text()), ('two', 'one'))
+        self.assertEqual(self.files(self.folder), {'file': b'one'})
 
     def test_a_signal_leaves_no_hidden_files(self):
         """Unlike SIGKILL, an interrupt and SIGTERM give a program the time to remove them."""

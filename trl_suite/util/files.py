@@ -8,6 +8,7 @@ import io
 import json
 import os
 import pathlib
+import secrets
 import zipfile
 from collections.abc import Iterator
 from typing import Any
@@ -142,7 +143,9 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
       OSError: any that is raised inside; the path is added if the error has none, as for errors of
         `write`.
     """
-    part = path.with_name(f'.{path.stem}.{os.getpid()}.part{path.suffix}')
+    # Processes on other machines or in other containers may have the same number.
+    number = f'{os.getpid()}-{secrets.token_hex(4)}'
+    part = path.with_name(f'.{path.stem}.{number}.part{path.suffix}')
     try:
         yield part
         os.replace(part, path)
