@@ -1,6 +1,7 @@
 """Compiled functions: supported features, and the cache of their machine code."""
 
 import contextlib
+import hashlib
 import io
 import os
 import pathlib
@@ -10,9 +11,11 @@ import subprocess
 import sys
 import textwrap
 import time
+import unittest
 import unittest.mock
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from absl.testing import absltest, parameterized
 from helpers import FolderTest
@@ -20,7 +23,7 @@ from numba.core import event
 
 import trl_suite
 from trl_suite.util import compiled as module
-from trl_suite.util import interrupts
+from trl_suite.util import interrupts, machine_code
 from trl_suite.util.compiled import compiled, compiled_inline, compiled_loop, packed
 
 PACKAGE = pathlib.Path(trl_suite.__file__).parent
@@ -260,15 +263,15 @@ class CacheTest(FolderTest):
         return done.stdout.split(), done.stderr
 
     def folders(self, base=None):
-        return sorted((base or self.cache).glob('trl_suite-*'))
+        return sorted((base or self.cache).glob('trl_suite/kernels/*'))
 
     def test_code_is_cached_per_state_of_the_sources(self):
         self.assertEqual(self.ask(), (['11.0'], ''))
         (first,) = self.folders()
-        files = {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')}
+        files = {path: path.stat().st_mtime_ns for path in first.iterdir()}
         self.assertNotEmpty(files)
         self.assertEqual(self.ask()[0], ['11.0'])
-        self.assertEqual(files, {path: path.stat().st_mtime_ns for path in first.rglob('*.nb?')})
+        self.assertEqual(files, {path: path.stat().st_mtime_ns for path in first.iterdir()})
         # Numba alone would reuse the code of `outer`, whose file has not changed.
         self.write('x * 20.0')
         self.assertEqual(self.ask()[0], ['21.0'])
@@ -318,7 +321,7 @@ class CacheTest(FolderTest):
             NUMBA_CACHE_DIR=nowhere, XDG_CACHE_HOME=nowhere, HOME=nowhere, LOCALAPPDATA=nowhere,
         )  # fmt: skip
         self.assertEqual(found, ['11.0', '20.0'])
-        self.assertEqual(warned.count('no folder for compiled code is writable'), 1)
+        self.assertEqual(warned.count('no folder for compiled code can be used'), 1)
 
     def test_a_full_disk(self):
         """The folder can be made, and no file be written: the code is compiled, and not kept."""
@@ -334,39 +337,25 @@ class CacheTest(FolderTest):
         self.assertEqual(warned.count('compiled code cannot be kept in'), 1)
         self.assertEmpty([path for path in self.cache.rglob('*') if path.is_file()])
 
-    @parameterized.parameters('*.nbi', '*.nbc')
-    def test_damaged_files(self, pattern):
-        """Those that are cut off, as after a crash of the machine, are written again."""
+    def test_damaged_files(self):
+        """Those that are cut off or in which a bit is flipped are compiled and written again."""
         self.ask()
-        whole = {path: path.read_bytes() for path in self.cache.rglob(pattern)}
+        (folder,) = self.folders()
+        whole = {path: path.read_bytes() for path in folder.iterdir()}
         self.assertNotEmpty(whole)
-        for size in (0, 20):
+
+        def flipped(content, place):
+            return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
+
+        for damage in (
+            lambda content: b'', lambda content: content[:20], lambda content: flipped(content, 3),
+            lambda content: flipped(content, len(content) // 2),
+        ):  # fmt: skip
             for path, content in whole.items():
-                path.write_bytes(content[: size or 0])
+                path.write_bytes(damage(content))
             self.assertEqual(self.ask(), (['11.0'], ''))
             for path, content in whole.items():
                 self.assertGreater(path.stat().st_size, 0.9 * len(content))
-
-    def test_numbas_setting_is_not_changed(self):
-        found, _ = self.ask("""
-            import numba
-            from trl_suite.outer import outer
-            before = numba.config.CACHE_DIR
-            outer(1.0)
-            print(numba.config.CACHE_DIR == before)
-        """)
-        self.assertEqual(found, ['True'])
-
-    def test_unused_folders_are_removed(self):
-        old, new = self.cache / 'trl_suite-0', self.cache / 'trl_suite-1'
-        other = self.cache / 'another'
-        for path in (old, new, other):
-            path.mkdir(parents=True)
-            (path / 'file').touch()
-        for path in (old, other):
-            os.utime(path, (0, time.time() - 2 * module.UNUSED))
-        self.ask(FOLDER)
-        self.assertEqual([p.exists() for p in (old, new, other)], [False, True, True])
 
     def test_foreign_types_are_not_cached(self):
         """A process without the module of a type could not read the index that contains it."""
@@ -389,12 +378,18 @@ class CacheTest(FolderTest):
         self.assertEqual(found, ['3.0'])
 
     def test_processes_that_compile_at_once(self):
+        """Also if all of them have the same number, as in containers that share the folder."""
+        script = f'import os; os.getpid = lambda: 7; {ASK}'
         running = [
-            subprocess.Popen([sys.executable, '-c', ASK], stdout=subprocess.PIPE,
+            subprocess.Popen([sys.executable, '-c', script], stdout=subprocess.PIPE,
                              stderr=subprocess.PIPE, text=True, env=self.environ(), cwd=self.folder)
             for _ in range(3)
         ]  # fmt: skip
         self.assertEqual([each.communicate() for each in running], [('11.0\n', '')] * 3)
+        files = [path for folder in self.folders() for path in folder.iterdir()]
+        self.assertEqual({path.suffix for path in files}, {'.nbc'})
+        for path in files:
+            machine_code._read(path)
 
     @parameterized.parameters(
         *[('fork', True), ('fork', False)][: 2 * hasattr(os, 'fork')], ('spawn', True)
@@ -429,6 +424,106 @@ class CacheTest(FolderTest):
     def test_without_compiling(self):
         self.assertEqual(self.ask(NUMBA_DISABLE_JIT='1'), (['11.0'], ''))
         self.assertEmpty(self.folders())
+
+
+class SafetyTest(FolderTest):
+    """Nothing is loaded that others can have written; nothing is removed but machine code."""
+
+    @contextlib.contextmanager
+    def spoiled(self, path, how):
+        """A file or a folder that others can have written."""
+        if how == 'other':
+            with unittest.mock.patch.object(os, 'geteuid', lambda: path.stat().st_uid + 1):
+                yield
+            return
+        if how == 'link':
+            path.symlink_to(path.rename(self.folder / 'moved'))
+        elif how == 'fifo':
+            path.unlink()
+            os.mkfifo(path, 0o600)
+        else:
+            path.chmod(how)
+        yield
+
+    @parameterized.product(
+        name=('trl_suite', 'trl_suite/kernels', 'trl_suite/kernels/*'),
+        how=('other', 'link', 0o777, 0o730, 0o1777),
+    )
+    @unittest.skipUnless(hasattr(os, 'geteuid'), 'needs user ids')
+    def test_folders_of_others_are_not_used(self, name, how):
+        bases = first, second = self.folder / 'first', self.folder / 'second'
+        umask = os.umask(0o002)
+        self.addCleanup(os.umask, umask)
+        for base in bases:
+            for made in (base, *module._made(base).relative_to(base).parents):
+                self.assertEqual((base / made).stat().st_mode & 0o777, 0o700)
+            base.chmod(0o1777)  # like /tmp
+        variables = {'NUMBA_CACHE_DIR': str(first), 'XDG_CACHE_HOME': str(second)}
+        with (
+            unittest.mock.patch.dict(os.environ, variables),
+            unittest.mock.patch.object(module, '_user_cache', lambda: str(second)),
+            self.spoiled(next(first.glob(name)), how),
+            self.assertWarnsRegex(
+                UserWarning, 'another user|by other users|is not a folder'
+            ) as found,
+        ):
+            folder = module.cache_folder.__wrapped__()
+        self.assertIn(str(first), str(found.warning))
+        if how == 'other':  # owns the second one, too
+            self.assertIsNone(folder)
+            self.assertIn('no folder for compiled code can be used', str(found.warning))
+        else:
+            self.assertEqual(folder, next(second.glob('trl_suite/kernels/*')))
+            self.assertIn(f'kept in {folder}', str(found.warning))
+
+    @parameterized.parameters('other', 'link', 'fifo', 0o666, 0o620)
+    @unittest.skipUnless(hasattr(os, 'geteuid'), 'needs user ids')
+    def test_files_of_others_are_not_loaded(self, how):
+        path = self.folder / 'code.nbc'
+        path.write_bytes(hashlib.sha256(b'code').digest() + b'code')
+        path.chmod(0o644)
+        self.assertEqual(machine_code._read(path), b'code')
+        with self.spoiled(path, how), self.assertRaises(OSError):
+            machine_code._read(path)
+
+    def test_unused_code_is_removed_and_nothing_else(self):
+        folder = module._made(self.folder)
+        kernels, elsewhere = folder.parent, self.folder / 'elsewhere'
+        old = [kernels / f'{number:016x}' for number in range(4)]
+        kept = [
+            self.folder / 'trl_suite-results', self.folder / f'trl_suite-{0:016x}', elsewhere,
+            kernels / 'results', kernels / f'{0:017x}', kernels / f'{9:016x}',
+        ]  # fmt: skip
+        for path in (*old[:2], *kept):
+            path.mkdir()
+            (path / f'{0:032x}.nbc').touch()
+        (old[1] / 'notes.txt').touch()
+        old[2].symlink_to(elsewhere)
+        old[3].touch()
+        for path in (*old, *kept[:-1]):  # the last one is in use
+            os.utime(path, (0, time.time() - 2 * module.UNUSED))
+        module._made(self.folder)
+        self.assertFalse(old[0].exists())
+        self.assertEqual([path.name for path in old[1].iterdir()], ['notes.txt'])
+        self.assertTrue(old[2].is_symlink() and old[3].is_file())
+        for path in kept:
+            self.assertLen([*path.iterdir()], 1, path)
+
+    def test_the_folder_does_not_move_with_the_process(self):
+        before = os.getcwd()
+        self.addCleanup(os.chdir, before)
+        os.chdir(self.folder)
+        with unittest.mock.patch.dict(os.environ, NUMBA_CACHE_DIR='.'):
+            self.assertTrue(module.cache_folder.__wrapped__().is_relative_to(os.getcwd()))
+
+    def test_keys(self):
+        """Functions and settings that give different code have different files."""
+        one, two = (lambda x: x + 1.0), (lambda x: x + 2.0)  # in one line
+        keys = [str(machine_code.Cache(one, self.folder, entry)._key) for entry in (False, True)]
+        keys.append(str(machine_code.Cache(two, self.folder, True)._key))
+        with unittest.mock.patch.object(numba.config, 'BOUNDSCHECK', 1):
+            keys.append(str(machine_code.Cache(two, self.folder, True)._key))
+        self.assertLen(set(keys), 4)
 
 
 class DisabledTest(parameterized.TestCase):

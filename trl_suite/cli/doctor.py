@@ -173,8 +173,8 @@ def compiled_code() -> Finding:
         folder = compiled.cache_folder()
     if folder is None:
         return Finding(
-            NOTE, 'no folder for compiled code is writable: every process compiles again',
-            'set NUMBA_CACHE_DIR to a writable folder',
+            NOTE, 'no folder for compiled code can be used: every process compiles again',
+            'set NUMBA_CACHE_DIR to a folder of your own',
         )  # fmt: skip
     sizes = [path.stat().st_size for path in folder.rglob('*') if path.is_file()]
     text = f'compiled code in {folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB'

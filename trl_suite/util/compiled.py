@@ -17,12 +17,13 @@ A small function that is called in an inner loop is decorated with `compiled_inl
 in every caller. Loops over simulations, which Python calls, are decorated with `compiled_loop`;
 tuples of arrays are passed to them as packs, see `packed`.
 
-Numba is imported and a function is compiled when it is first called; the result is cached on disk.
-The cache is in `$NUMBA_CACHE_DIR`, or else in the user's cache folder, with one subfolder for each
-version of the package's sources, since Numba does not detect changes of functions in other modules.
-If no folder can be written, every process compiles the functions again; so it does where files of
-the cache are damaged. With `NUMBA_DISABLE_JIT=1`
-the same code runs as Python, for debugging.
+Numba is imported and a function is compiled when it is first called. Its machine code is kept in the
+folder trl_suite/kernels/HASH in `$NUMBA_CACHE_DIR`, or else in the user's cache folder; HASH depends
+on all sources of the package, since compiled functions contain constants and code of other modules.
+Folders are used only if they belong to the user and nobody else can write there, because loading
+machine code runs it; files are checked as `trl_suite.util.machine_code` says. Without such a folder
+every process compiles the functions again, as it does with those that have free variables or no
+source file. With `NUMBA_DISABLE_JIT=1` the same code runs as Python, for debugging.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ import hashlib
 import importlib.metadata
 import os
 import pathlib
-import shutil
+import re
+import stat
 import sys
 import tempfile
 import threading
@@ -42,11 +44,10 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from trl_suite.util import interrupts
+from trl_suite.util import files, interrupts
 
 PATIENCE = 2.0  # s; if compiling takes longer, a message is printed if stderr is a terminal
-UNUSED = 30 * 86400.0  # s; folders of other source versions that were unused for longer are removed
-_PREFIX = 'trl_suite-'
+UNUSED = 30 * 86400.0  # s; machine code of other source versions unused for longer is removed
 
 
 class Compiled:
@@ -101,21 +102,13 @@ class Compiled:
         if self._native is not None:  # not cached, since it is short; its callers are cached
             return numba.njit(self._native(), _nrt=True, **options)
         options['_nrt'] = False
-        folder = cache_folder()
-        if folder is None:
-            return numba.njit(self.function, **options)
-        # Numba reads CACHE_DIR when a function is decorated; afterwards the user's value is
-        # restored.
-        with _setting:
-            # Two folders, since Numba cannot distinguish functions with and without wrappers.
-            folder = folder / ('entries' if entry else 'rows')
-            before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
-            try:
-                return _forgiving(numba.njit(self.function, cache=True, **options))
-            except RuntimeError:  # the function has no source file, e.g. in an interactive session
-                return numba.njit(self.function, **options)
-            finally:
-                numba.config.CACHE_DIR = before
+        dispatcher = numba.njit(self.function, **options)
+        folder, code = cache_folder(), self.function.__code__
+        if folder is not None and not code.co_freevars and os.path.isfile(code.co_filename):
+            from trl_suite.util.machine_code import Cache
+
+            dispatcher._cache = Cache(self.function, folder, entry)  # noqa: SLF001
+        return dispatcher
 
     def __call__(self, *args: Any) -> Any:
         return self.entry(*args)
@@ -152,50 +145,13 @@ def packed(value: Any) -> Any:
     return Pack(value)
 
 
-def _forgiving(function: Any) -> Any:
-    """Lets a function of Numba compile where its cache is damaged or cannot be written.
-
-    Numba would raise: `OSError` on a full disk, and errors of unpickling after a file was cut off.
-    """
-    cache = function._cache  # noqa: SLF001
-    load, save = cache.load_overload, cache.save_overload
-
-    def load_or_compile(*args: Any) -> Any:
-        try:
-            return load(*args)
-        except Exception:  # unpickling a damaged file raises many types of exceptions
-            with contextlib.suppress(OSError):
-                cache.flush()
-            return None
-
-    def save_if_possible(*args: Any) -> None:
-        try:
-            save(*args)
-        except OSError as error:
-            _warn_of_cache(str(error))
-
-    cache.load_overload, cache.save_overload = load_or_compile, save_if_possible
-    return function
-
-
-@functools.cache
-def _warn_of_cache(reason: str) -> None:
-    warnings.warn(
-        f'compiled code cannot be kept in {cache_folder()}, so every process compiles it again: '
-        f'{reason}',
-        stacklevel=2,
-    )
-
-
-_setting = threading.Lock()
-
-
 @functools.cache
 def _numba() -> Any:
     """Imports Numba, postpones interrupts while it compiles, and registers the type of `Compiled`."""
-    import numba
-    from numba.core import event
-    from numba.extending import typeof_impl
+    with interrupts.postponed():
+        import numba
+        from numba.core import event
+        from numba.extending import typeof_impl
 
     interrupts.postpone_while_compiling()
     announcer = _Announcer()
@@ -223,29 +179,52 @@ def _numba() -> Any:
 
 @functools.cache
 def cache_folder() -> pathlib.Path | None:
-    """Returns the cache folder for these sources, creating it if necessary.
+    """Returns the folder of the machine code of these sources, which is made if necessary.
 
-    If no folder can be written, returns None and issues a warning once.
+    If the first choice cannot be used, a warning is issued once; if none can, None is returned.
     """
-    for base in (os.environ.get('NUMBA_CACHE_DIR'), _user_cache()):
-        if not base:
-            continue
-        folder = pathlib.Path(base) / f'{_PREFIX}{fingerprint()}'
+    refused = []
+    for base in filter(None, (os.environ.get('NUMBA_CACHE_DIR'), _user_cache())):
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except OSError:
+            folder = _made(pathlib.Path(base).absolute())
+        except OSError as error:
+            refused.append(str(error))
             continue
-        os.utime(folder)
-        _forget(folder)
+        if refused:
+            warnings.warn(f'{refused[0]}; compiled code is kept in {folder}', stacklevel=2)
         return folder
     warnings.warn(
-        'no folder for compiled code is writable, so every process compiles it again; set '
-        'NUMBA_CACHE_DIR to a writable folder',
+        'no folder for compiled code can be used, so every process compiles it again; set '
+        f'NUMBA_CACHE_DIR to a folder of your own ({"; ".join(refused)})',
         stacklevel=2,
     )
     return None
+
+
+def _made(base: pathlib.Path) -> pathlib.Path:
+    """Makes the folder below a base.
+
+    Others may write to the base. They could only replace our folder by one that is not ours.
+
+    Raises:
+      OSError: a folder cannot be made, or it is a link, belongs to another user, or can be written
+        by others.
+    """
+    base.mkdir(0o700, parents=True, exist_ok=True)
+    folder = base
+    for name in ('trl_suite', 'kernels', fingerprint()):
+        folder /= name
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(0o700)
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode):
+            raise NotADirectoryError(f'{folder} is not a folder')
+        files.check_own(folder, status)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+    os.utime(folder)
+    _forget(folder)
+    return folder
 
 
 def _user_cache() -> str:
@@ -270,14 +249,15 @@ def fingerprint() -> str:
 
 
 def _forget(folder: pathlib.Path) -> None:
-    """Removes folders of other source versions that were unused for longer than `UNUSED`."""
-    for path in folder.parent.glob(f'{_PREFIX}*'):
-        try:
-            unused = path.stat().st_mtime < time.time() - UNUSED
-        except OSError:  # removed by another process
-            continue
-        if unused:
-            shutil.rmtree(path, ignore_errors=True)
+    """Removes the machine code of source versions that were unused for longer than `UNUSED`."""
+    for path in folder.parent.iterdir():
+        with contextlib.suppress(OSError):  # removed by another process, or not empty
+            status = path.lstat()
+            own = stat.S_ISDIR(status.st_mode) and re.fullmatch('[0-9a-f]{16}', path.name)
+            if own and status.st_mtime < time.time() - UNUSED:
+                for file in path.glob('*.nbc'):
+                    file.unlink()
+                path.rmdir()
 
 
 class _Announcer:

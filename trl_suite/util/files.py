@@ -9,6 +9,7 @@ import json
 import os
 import pathlib
 import secrets
+import stat
 import zipfile
 from collections.abc import Iterator
 from typing import Any
@@ -83,6 +84,26 @@ def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> N
         raise ValueError(
             f'{path}: has {size / 1e6:.0f} MB; expected no more than {largest / 1e6:.0f} MB'
         )
+
+
+def check_own(path: Path, status: os.stat_result) -> None:
+    """Checks that no other user can have written a file, or to a folder.
+
+    Nothing is checked on systems without user ids, such as Windows.
+
+    Args:
+      path: for the message.
+      status: of the file or folder.
+
+    Raises:
+      PermissionError: it belongs to another user, or others can write it.
+    """
+    if not hasattr(os, 'geteuid'):
+        return
+    if status.st_uid != os.geteuid():
+        raise PermissionError(f'{path} belongs to another user')
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f'{path} can be written by other users')
 
 
 def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
