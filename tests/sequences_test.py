@@ -318,11 +318,21 @@ class RunTest(parameterized.TestCase):
         self.assertLen(self.run_short(Keeper())['scores'], 3)
         self.assertEqual([path.name for path in self.folder.iterdir()], ['result.json'])
 
+    def test_folders_of_the_user_are_not_removed(self):
+        for name in ('result.stage0', 'result.stage2'):
+            (self.folder / name / 'own').mkdir(parents=True)
+        with self.assertRaisesRegex(FileExistsError, 'result.stage2: exists; remove it, or choose'):
+            self.run_short(Keeper())
+        self.assertFalse(self.path.exists())
+        (self.folder / 'result.stage2').rename(self.folder / 'moved')
+        self.assertLen(self.run_short(Keeper())['scores'], 3)
+        self.assertTrue((self.folder / 'result.stage0' / 'own').exists())
+
     def test_what_killed_runs_left_is_removed(self):
         """Also by a process with the same number, as in a container that is started again."""
         with self.assertRaises(KeyboardInterrupt):
             self.run_short(Keeper(1))
-        (self.folder / 'result.stage0').mkdir()
+        (self.folder / 'result.stage2').mkdir()
         part = self.folder / f'.result.stage2.{os.getpid()}.part'
         part.mkdir()
         (part / 'history.json').write_text('half')

@@ -145,6 +145,9 @@ def run(
         if path.exists():
             result = _resumed(path, result, learner)
         else:
+            for number in range(1, len(sequence)):  # else a folder of the user would be removed
+                if os.path.lexists(folder := _state(path, number)):
+                    raise FileExistsError(f'{folder}: exists; remove it, or choose another result')
             result['initial'] = scores(sequence, learner.policy(), *test)
             _write(path, result)
         done = len(result['scores'])
@@ -168,7 +171,7 @@ def run(
                         learner.save(folder)
                 # This completes the stage; the states of those before are obsolete.
                 _write(path, result)
-                for earlier in range(number + 1):
+                for earlier in range(1, number + 1):
                     shutil.rmtree(_state(path, earlier), ignore_errors=True)
                 bar.update()
         return result
