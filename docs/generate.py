@@ -731,8 +731,9 @@ def main() -> int:
         print('\n'.join(f'docs/{path} is out of date; run docs/generate.py' for path in old))
         return int(bool(old))
     for path in gone(found):
-        (DOCS / path).unlink()
-    for path in set(old) & set(found):
+        print(f'docs/{path} has no subject; remove it')
+    old = [path for path in old if path in found]
+    for path in old:
         file = DOCS / path
         file.parent.mkdir(exist_ok=True)
         with files.replacing(file) as part:
