@@ -870,6 +870,25 @@ class ProgramTest(CommandTest):
             (done.returncode, done.stdout, done.stderr), (130, '', 'trl-suite: interrupted\n')
         )
 
+    @parameterized.parameters('numpy', 'dm_control')
+    def test_an_interrupt_in_a_callback_of_an_import(self, name):
+        """As ctypes calls Python while PyOpenGL is imported, which turns any exception into an error."""
+        with tempfile.TemporaryDirectory() as folder:
+            pathlib.Path(folder, f'{name}.py').write_text(
+                'import ctypes, signal\n'
+                'class Address(ctypes.c_void_p):\n'
+                '    @classmethod\n'
+                '    def from_param(cls, value):\n'
+                '        signal.raise_signal(signal.SIGINT)\n'
+                'function = ctypes.pythonapi.PyErr_Clear\n'
+                'function.argtypes = [Address]\n'
+                'function(None)\n'
+            )
+            done = self.program('rollout', GAPS, PYTHONPATH=os.pathsep.join([folder, *sys.path]))
+        self.assertEqual(
+            (done.returncode, done.stdout, done.stderr), (130, '', 'trl-suite: interrupted\n')
+        )
+
     def test_an_interrupt_of_the_gallery(self):
         with subprocess.Popen(
             [sys.executable, '-m', 'trl_suite', 'gallery', '--filter', 'terrains/', '--output', 'all'],

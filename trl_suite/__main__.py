@@ -6,7 +6,10 @@ import sys
 def main(prog: str = 'trl-suite') -> int:
     """Runs the command line; an interrupt while it is imported ends in one line, too."""
     try:
-        from trl_suite import cli
+        from trl_suite.util import interrupts
+
+        with interrupts.postponed():
+            from trl_suite import cli
 
         return cli.main(prog=prog)
     except KeyboardInterrupt:

@@ -6,17 +6,21 @@ import importlib
 from typing import Any
 
 from trl_suite import rendering
+from trl_suite.util import interrupts
 
 
 def load(name: str = 'trl_suite.suite') -> Any:
-    """Imports a module that may import the engine.
+    """Imports a module that may import the engine; interrupts wait for the end.
+
+    PyOpenGL calls Python in callbacks of ctypes, which would turn one into an error.
 
     Raises:
       RuntimeError: the OpenGL library that MUJOCO_GL names is missing; the message says so.
       ImportError: another module is missing.
     """
     try:
-        return importlib.import_module(name)
+        with interrupts.postponed():
+            return importlib.import_module(name)
     except ModuleNotFoundError:
         raise
     # Errors of dm_control if the library that MUJOCO_GL names is missing.

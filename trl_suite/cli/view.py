@@ -91,10 +91,8 @@ def view(environment: Environment, policy: rendering.Policy, title: str) -> None
     Raises:
       RuntimeError: no window can be opened.
     """
-    from trl_suite.viewing.window import Window
-
     shown: Any = environment
     if hasattr(environment.task, 'watch'):
         shown = Playback(environment, policy)
         policy = shown.policy
-    Window(environment, title).launch(shown, policy)
+    engine.load('trl_suite.viewing.window').Window(environment, title).launch(shown, policy)
