@@ -2,6 +2,7 @@
 
 import pathlib
 import re
+import tempfile
 
 from setuptools import find_packages, setup
 
@@ -23,8 +24,12 @@ def long_description() -> str:
     return re.sub(r'\[([^]]*)\]\((?!https?:)[^)]*\)', r'\1', text)
 
 
+# A new folder: setuptools packs what an earlier build left in build/, deleted modules included.
+build = tempfile.TemporaryDirectory()
+
 setup(
     name='trl_suite',
+    options={'build': {'build_base': build.name}},
     version=VERSION,
     description='Terrain RL Simulator on MuJoCo: locomotion over random terrain, as a suite',
     long_description=long_description(),

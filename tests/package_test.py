@@ -11,6 +11,7 @@ import sysconfig
 import tempfile
 import textwrap
 import tomllib
+import zipfile
 
 import pytest
 from absl.testing import absltest
@@ -161,19 +162,27 @@ class WheelTest(absltest.TestCase):
             )
         for name in ('setup.py', 'pyproject.toml', 'README.md', 'LICENSE', 'NOTICE'):
             shutil.copy(CHECKOUT / name, source / name)
+        some = folder / 'policies'
+        for left in (source / 'build/lib/trl_suite', some / 'build/lib/trl_suite_policies'):
+            left.mkdir(parents=True)
+            (left / 'deleted.py').touch()  # by an update, after an earlier build
         self.run_quietly(
             sys.executable, '-m', 'build', '--wheel', '--outdir', wheels, source, cwd=work
         )
         (wheel,) = wheels.glob('*.whl')
         self.assertLess(wheel.stat().st_size, 3e6)
         # Of the second distribution, with one policy instead of all.
-        some = folder / 'policies'
-        some.mkdir()
-        for name in ('pyproject.toml', 'README.md', 'LICENSE', f'{TRAINED}.npz', f'{TRAINED}.json'):
+        for name in (
+            'setup.py', 'pyproject.toml', 'README.md', 'LICENSE', f'{TRAINED}.npz',
+            f'{TRAINED}.json',
+        ):  # fmt: skip
             shutil.copy(CHECKOUT / 'trained' / name, some / name)
         self.run_quietly(
             sys.executable, '-m', 'build', '--wheel', '--outdir', folder, some, cwd=work
         )
+        for built in folder.glob('**/*.whl'):
+            names = zipfile.ZipFile(built).namelist()
+            self.assertNotIn('deleted', ' '.join(names))
         shutil.rmtree(source)
 
         self.run_quietly(sys.executable, '-m', 'venv', '--without-pip', venv)
