@@ -6,7 +6,9 @@ import tempfile
 
 from setuptools import find_packages, setup
 
-TORCH = 'torch>=2.5,<2.14'
+TORCH = 'torch>=2.5'
+# Below the next major version, which may change what the suite calls; Ray has changed the interface
+# of its new API stack in minor versions.
 BVH = 'pybvh>=0.9,<1'
 VISER = 'viser>=1.1,<2'
 RAY = '>=2.54.1,<2.61'
@@ -44,12 +46,11 @@ setup(
         'Programming Language :: Python :: 3',
         'Programming Language :: Python :: 3.11',
         'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
         'Topic :: Scientific/Engineering :: Artificial Intelligence',
         'Topic :: Scientific/Engineering :: Physics',
         'Typing :: Typed',
     ],
-    # labmaze, which dm-control needs, does not build on 3.13.
-    python_requires='>=3.11,<3.13',
     packages=[
         *find_packages(include=['trl_suite', 'trl_suite.*']),
         'trl_suite.xml',
@@ -61,6 +62,7 @@ setup(
         'trl_suite.mocap': 'mocap',
         'trl_suite.trained': 'trained',
     },
+    include_package_data=False,  # true by default where pyproject.toml has the table `project`
     package_data={
         'trl_suite': ['py.typed'],
         'trl_suite.controllers': ['*.json'],
@@ -72,12 +74,20 @@ setup(
     install_requires=[
         # MuJoCo 4.0.0 breaks dm_control 1.0.50 when a Physics is made.
         'mujoco>=3.17,<4',
-        'dm-control>=1.0.50',
+        # dm-control requires labmaze, which has no wheels for Python 3.13 and later, and which the
+        # suite never imports. There, `pip install --no-deps` installs dm-control, and the suite
+        # requires what dm-control imports.
+        "dm-control>=1.0.50; python_version < '3.13'",
+        'absl-py',
         'dm-env',
+        'dm-tree',
+        'glfw',
         'numba>=0.61',
         'numpy>=2.0',
         'lxml',
         'packaging',
+        'pyopengl',
+        'scipy',
         'tqdm',
         'trimesh',
     ],

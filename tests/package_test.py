@@ -17,6 +17,7 @@ import pytest
 from absl.testing import absltest
 
 import trl_suite
+from trl_suite.util import libraries
 
 CHECKOUT = pathlib.Path(__file__).resolve().parents[1]
 TRAINED = 'PD_Dog2D_Gaps_Terrain-v0'
@@ -43,7 +44,33 @@ class PinTest(absltest.TestCase):
         # dm_control 1.0.50 asks for mujoco>=3.17 but cannot make a Physics on MuJoCo 4.0.0
         # ('MjModel' object has no attribute 'flex_vertedge'), so an unpinned install is broken.
         self.assertIn("'mujoco>=3.17,<4'", required)
-        self.assertIn("'dm-control>=1.0.50'", required)
+        self.assertIn("'dm-control>=1.0.50", required.replace('"', "'"))
+
+    def test_pages_install_the_version_of_dm_control_that_messages_name(self):
+        pages = [CHECKOUT / 'README.md', CHECKOUT / 'CONTRIBUTING.md', CHECKOUT / '.ci/run']
+        for page in (*pages, *(CHECKOUT / 'docs').glob('*.md')):
+            found = re.findall(r'--no-deps dm-control\S*', page.read_text('utf-8'))
+            self.assertLessEqual({*found}, {libraries.DM_CONTROL}, page.name)
+            if page in pages:
+                self.assertNotEmpty(found, page.name)
+
+    def test_a_missing_dm_control_is_named_with_the_command_that_installs_it(self):
+        gone = 'import sys; sys.modules["dm_control"] = None\n'
+        cases = {
+            'suite': 'import trl_suite.suite',
+            'gymnasium': 'import trl_suite.gym',
+            **{
+                name: f'from trl_suite import cli; sys.exit(cli.main({name.split()}))'
+                for name in (f'evaluate {TRAINED} --policy zero', f'bench {TRAINED}', 'try a.xml')
+            },
+        }
+        for name, code in cases.items():
+            with self.subTest(name), self.assertRaises(AssertionError) as raised:
+                python(gone + code)
+            self.assertEndsWith(
+                str(raised.exception).strip(),
+                f'dm_control is required but not installed; pip install {libraries.DM_CONTROL}',
+            )
 
     def test_the_extra_shimmy_installs_what_shimmy_imports(self):
         # Without Shimmy's own extra, `import shimmy` raises for want of imageio.

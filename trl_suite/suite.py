@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+try:
+    import dm_control  # noqa: F401
+except ModuleNotFoundError as error:
+    from trl_suite.util.libraries import DM_CONTROL, missing
+
+    raise ModuleNotFoundError(missing('dm_control', DM_CONTROL), name=error.name) from error
+
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from trl_suite import policies
 from trl_suite.cli import machine
-from trl_suite.util import compiled, resources
+from trl_suite.util import compiled, libraries, resources
 
 BACKENDS = ('egl', 'osmesa', 'glfw')
 OK, NOTE, FAILED = 'ok', 'note', 'FAILED'
@@ -123,12 +123,15 @@ def versions() -> Iterator[Finding]:
         yield Finding(NOTE, f'required versions are unknown ({error})', 'pip install trl_suite')
         return
     for requirement in map(Requirement, required):
-        if requirement.marker is not None:  # belongs to an extra
+        own = requirement.marker is None or requirement.marker.evaluate({'extra': ''})
+        if not own and requirement.name != 'dm-control':  # belongs to an extra
             continue
         found = machine.version(requirement.name)
         text = f'{requirement.name} {found or "is missing"} (required: {requirement.specifier or "any"})'
         good = found is not None and requirement.specifier.contains(found, prereleases=True)
-        remedy = '' if good else f"pip install '{requirement}'"
+        remedy = '' if good else f"pip install '{requirement.name}{requirement.specifier}'"
+        if remedy and not own:
+            remedy = f'pip install {libraries.DM_CONTROL}'
         yield Finding(OK if good else FAILED, text, remedy)
 
 

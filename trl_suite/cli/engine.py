@@ -7,6 +7,7 @@ from typing import Any
 
 from trl_suite import rendering
 from trl_suite.util import interrupts
+from trl_suite.util.libraries import DM_CONTROL, missing
 
 
 def load(name: str = 'trl_suite.suite') -> Any:
@@ -21,7 +22,9 @@ def load(name: str = 'trl_suite.suite') -> Any:
     try:
         with interrupts.postponed():
             return importlib.import_module(name)
-    except ModuleNotFoundError:
+    except ModuleNotFoundError as error:
+        if error.name == 'dm_control':
+            raise ImportError(missing(error.name, DM_CONTROL)) from error
         raise
     # Errors of dm_control if the library that MUJOCO_GL names is missing.
     except (AttributeError, ImportError) as error:

@@ -1,17 +1,27 @@
-"""Imports of optional libraries."""
+"""Imports of libraries that may be missing."""
 
 from __future__ import annotations
 
 import importlib
 from typing import Any
 
+# pip cannot install dm-control with its requirements on Python 3.13 and later, see setup.py. Without
+# them it must be told the version, too: a later one may need another MuJoCo.
+DM_CONTROL = '--no-deps dm-control==1.0.50'
+
+
+def missing(package: str, source: str) -> str:
+    """Returns the message for a missing package; see `library` for the arguments."""
+    quoted = f"'{source}'" if '[' in source else source
+    return f'{package} is required but not installed; pip install {quoted}'
+
 
 def library(name: str, source: str) -> Any:
-    """Imports a module of an optional library.
+    """Imports a module of a library.
 
     Args:
       name: of the module, e.g. 'PIL.Image'.
-      source: what to install with pip, e.g. 'trl_suite[video]'.
+      source: what to install with pip, e.g. 'trl_suite[video]' or `DM_CONTROL`.
 
     Raises:
       ImportError: it is not installed; the message tells how to install it.
@@ -19,8 +29,4 @@ def library(name: str, source: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        package = name.partition('.')[0]
-        quoted = f"'{source}'" if '[' in source else source
-        raise ImportError(
-            f'{package} is required but not installed; pip install {quoted}'
-        ) from error
+        raise ImportError(missing(name.partition('.')[0], source)) from error
