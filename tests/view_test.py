@@ -1,6 +1,9 @@
 """The command view: inputs and frames of dm_control's viewer, with a fake window."""
 
 import importlib
+import os
+import signal
+import socket
 import types
 import warnings
 from unittest import mock
@@ -12,7 +15,7 @@ from absl.testing import absltest, parameterized
 from trl_suite import suite
 from trl_suite.cli import view
 from trl_suite.environments.environment import Environment
-from trl_suite.viewing import playback
+from trl_suite.viewing import browser, playback
 
 GAPS = cli_test.GAPS
 DOG, PLANS = 'FSM_Dog2D_Terrain_Mixed-v0', 'PD_Biped3D_HLC_PathFollowing-v0'
@@ -69,6 +72,26 @@ class CommandTest(cli_test.CommandTest):
         with mock.patch.object(view, 'check_screen'), mock.patch.object(view, 'view') as shown:
             self.assert_refused(message, 'view', *arguments)
         shown.assert_not_called()
+
+    @parameterized.parameters(
+        (signal.SIGTERM, 143, 'terminated'), (signal.SIGINT, 130, 'interrupted')
+    )
+    def test_status_after_a_signal(self, number, status, how):
+        """The viewer in the web browser runs until then, and is closed."""
+        viewers = []
+
+        def serve(viewer):
+            viewers.append(viewer)
+            os.kill(os.getpid(), number)
+
+        with mock.patch.object(browser.Browser, '_serve', serve):
+            found, out, err = cli_test.run(
+                'view', GAPS, '--browser', '--port', '18700', '--policy', 'zero'
+            )
+        self.assertEqual((found, err), (status, f'trl-suite: {how}\n'))
+        self.assertRegex(out, r'^open http://127.0.0.1:\d+\S* in a web browser; press Ctrl')
+        with self.assertRaises(ConnectionRefusedError):
+            socket.create_connection(('127.0.0.1', viewers[0]._server.get_port())).close()
 
     def test_a_missing_screen_is_an_error(self):
         nothing = {'DISPLAY': '', 'WAYLAND_DISPLAY': ''}

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def in_browser(arguments: argparse.Namespace, options: dict[str, Any]) -> None:
-    """Serves web browsers until a keyboard interrupt."""
+    """Serves web browsers until an interrupt."""
     viewer = engine.load('trl_suite.viewing.browser').Browser(
         arguments.id, arguments.policy, arguments.seed, arguments.host, arguments.port, options
     )

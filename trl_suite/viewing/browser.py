@@ -102,7 +102,7 @@ class Browser:
         self._show(loaded)
 
     def run(self) -> None:
-        """Runs the simulation until `stop` or a keyboard interrupt, then closes the viewer."""
+        """Runs the simulation until `stop` or an interrupt, which is raised; closes the viewer."""
         due = plotted = 0.0
         try:
             while not self._stopped.is_set():
@@ -119,8 +119,6 @@ class Browser:
                 if now - plotted > PLOT_INTERVAL:
                     plotted = now
                     self._panel.plot(self.session)
-        except KeyboardInterrupt:
-            pass
         finally:
             web_server.stop_server(self._server)
             self._uploads.cleanup()
