@@ -348,7 +348,6 @@ class BrowserTest(parameterized.TestCase):
     def test_a_refused_choice_is_taken_back(self):
         viewer = browser.Browser(SOCCER, port=0)
         self.addCleanup(web_server.stop_server, viewer._server)
-        self.addCleanup(viewer._uploads.cleanup)
         preset, policy = viewer._panel._fitted[0], viewer._loaded.policy
         self.assertEqual(preset.value, 'plane')
         with mock.patch.object(viewer._panel, 'tell') as tell:
@@ -369,7 +368,6 @@ class BrowserTest(parameterized.TestCase):
         """0.0.0.0 is no address that a browser can open on another machine."""
         viewer = browser.Browser(DOG, 'zero', host=host, port=0)
         self.addCleanup(web_server.stop_server, viewer._server)
-        self.addCleanup(viewer._uploads.cleanup)
         port = viewer._server.get_port()
         self.assertEqual(viewer.url, f'http://{own}:{port}')
         expected = f'http://{socket.gethostname()}:{port}' if others else ''

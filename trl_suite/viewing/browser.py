@@ -23,12 +23,13 @@ from typing import Any
 
 import mujoco
 
-from trl_suite import suite
+from trl_suite import policies, suite
 from trl_suite.environments import named_policies
+from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene, web_server
 from trl_suite.viewing import panel
-from trl_suite.viewing.session import FRAME, Loaded, Session
+from trl_suite.viewing.session import FRAME, Loaded, Policy, Session
 
 HOST, PORT = '127.0.0.1', 8080
 EVERY = '0.0.0.0'  # all addresses of this machine
@@ -88,12 +89,12 @@ class Browser:
         self._task_kwargs = {**(task_kwargs or {}), 'random': seed}
         self.shown = {PLAN: True, CLIP: False, SAMPLES: False, **dict.fromkeys(DECORATION, False)}
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._files: dict[str, policies.Policy] = {}  # what .npz files held, by name
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
         loaded = self._load(
             spec, policy
         )  # before the server is started, as an error would leave it running
-        self._uploads = tempfile.TemporaryDirectory(prefix='trl_suite_')
         self._server = web_server.start_server(host, port)
         port = self._server.get_port()
         self.url = f'http://{HOST if host == EVERY else host}:{port}'
@@ -121,7 +122,6 @@ class Browser:
                     self._panel.plot(self.session)
         finally:
             web_server.stop_server(self._server)
-            self._uploads.cleanup()
 
     def start(self) -> Browser:
         """Runs the simulation in a separate thread, and returns the viewer."""
@@ -207,21 +207,39 @@ class Browser:
         self._ask(choose)
 
     def choose_policy(self, name: str) -> None:
-        """Switches to another policy, and starts at the first episode of the seed."""
+        """Switches to another policy, and starts at the first episode of the seed.
+
+        An .npz file is read once; `upload_policy` replaces what it held.
+        """
 
         def choose() -> None:
-            spec, environment, policies, _ = self._loaded
-            if name not in policies:
-                policies[name] = named_policies.policy(name, environment, spec.id, self.seed)
-            self._show(Loaded(spec, environment, policies, name))
+            spec, environment, choices, _ = self._loaded
+            if name not in choices:
+                choices[name] = self._policy(name, environment, spec)
+            self._show(Loaded(spec, environment, choices, name))
 
         self._ask(choose)
 
     def upload_policy(self, name: str, content: bytes) -> None:
-        """Switches to a policy that was uploaded as an .npz file."""
-        path = pathlib.Path(self._uploads.name) / pathlib.Path(name).name
-        path.write_bytes(content)
-        self.choose_policy(str(path))
+        """Switches to a policy from the content of an .npz file, in place of one of that name."""
+
+        def choose() -> None:
+            if not name.endswith('.npz'):
+                raise ValueError(f'{name}: expected a policy, .npz')
+            with tempfile.TemporaryDirectory(prefix='trl_suite_') as folder:
+                path = pathlib.Path(folder, 'policy.npz')  # the name may be any text
+                path.write_bytes(content)
+                try:
+                    policy = policies.load(path)
+                except ValueError as error:
+                    raise ValueError(str(error).replace(str(path), name)) from None
+            spec, environment, choices, _ = self._loaded
+            policy.check(environment)
+            self._files[name] = policy
+            choices[name] = self._policy(name, environment, spec)
+            self._show(Loaded(spec, environment, choices, name))
+
+        self._ask(choose)
 
     # Implementation.
 
@@ -239,12 +257,21 @@ class Browser:
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
         spec = suite.find(spec) if isinstance(spec, str) else spec
         environment = suite.build_environment(spec, self._task_kwargs, {})
-        policies = named_policies.available(environment, spec.id, self.seed)
+        choices = named_policies.available(environment, spec.id, self.seed)
         if policy == 'best':
-            policy = next(iter(policies))
-        elif policy not in policies:
-            policies[policy] = named_policies.policy(policy, environment, spec.id, self.seed)
-        return Loaded(spec, environment, policies, policy)
+            policy = next(iter(choices))
+        elif policy not in choices:
+            choices[policy] = self._policy(policy, environment, spec)
+        return Loaded(spec, environment, choices, policy)
+
+    def _policy(self, name: str, environment: Environment, spec: EnvSpec) -> Policy:
+        if not name.endswith('.npz'):
+            return named_policies.policy(name, environment, spec.id, self.seed)
+        if name not in self._files:
+            self._files[name] = policies.load(name)
+        policy = self._files[name]
+        policy.check(environment)
+        return lambda time_step: policy(time_step.observation)
 
     def _show(self, loaded: Loaded) -> None:
         self._loaded = loaded

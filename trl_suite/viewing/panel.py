@@ -74,7 +74,7 @@ class Panel:
         self._policy = gui.add_dropdown('Policy', ['zero'])
         self._when_chosen(self._policy, viewer.choose_policy)
         upload = gui.add_upload_button('Policy from a file', mime_type='.npz')
-        upload.on_upload(lambda _: viewer.upload_policy(upload.value.name, upload.value.content))
+        upload.on_upload(self._uploaded)
         seed = gui.add_number('Seed', initial_value=viewer.seed, min=0, max=2**32 - 1, step=1)
         gui.add_button('First episode of this seed').on_click(
             lambda _: viewer.reset(int(seed.value))
@@ -98,6 +98,10 @@ class Panel:
         for name, shown in viewer.shown.items():
             box = gui.add_checkbox(name, initial_value=shown)
             box.on_update(lambda event, name=name: viewer.show(name, event.target.value))
+
+    def _uploaded(self, event: Any) -> None:
+        file = event.target.value
+        self._viewer.upload_policy(file.name, file.content)
 
     def _when_chosen(self, handle: Any, choose: Any) -> None:
         def chosen(event: Any) -> None:
