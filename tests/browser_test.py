@@ -368,9 +368,9 @@ class BrowserTest(parameterized.TestCase):
         """0.0.0.0 is no address that a browser can open on another machine."""
         viewer = browser.Browser(DOG, 'zero', host=host, port=0)
         self.addCleanup(web_server.stop_server, viewer._server)
-        port = viewer._server.get_port()
-        self.assertEqual(viewer.url, f'http://{own}:{port}')
-        expected = f'http://{socket.gethostname()}:{port}' if others else ''
+        port, token = viewer._server.get_port(), viewer.url.rpartition('/')[2]
+        self.assertEqual(viewer.url, f'http://{own}:{port}/{token}')
+        expected = f'http://{socket.gethostname()}:{port}/{token}' if others else ''
         self.assertEqual(viewer.other_url, expected)
         with urllib.request.urlopen(viewer.url) as page:
             self.assertEqual(page.status, 200)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from trl_suite.util import errors
@@ -23,23 +23,38 @@ def load_viser() -> Any:
     return library('viser', 'trl_suite[viewer]')
 
 
-def start_server(host: str, port: int) -> Any:
+def start_server(
+    host: str,
+    port: int,
+    token: str | None = None,
+    report: Callable[[str], object] = lambda sentence: None,
+) -> Any:
     """Starts a viser server that prints nothing.
 
     Args:
       host: address to listen on; '127.0.0.1' accepts connections only from this machine.
       port: the first port to try; 0 for any free port.
+      token: the path of its address, without which it answers nobody; None to answer nobody.
+      report: called with a sentence about each refused value, in another thread.
 
     Raises:
       ImportError: the extra 'viewer' is not installed.
       OSError: nothing can listen on this address.
+      RuntimeError: this version of viser cannot be guarded.
       ValueError: no such port.
     """
     viser = load_viser()
+    from trl_suite.rendering import web_guard  # imports viser, too
+
     errors.check_whole('port', port, 0, LAST_PORT)
     port = _free_port(host, int(port))  # where there is none, viser would wait forever
-    with _silent_viser():
+    guard = web_guard.Guard(token, report)
+    with _silent_viser(), guard.installed():
         server = viser.ViserServer(host, port, verbose=False)
+    guard.gui = server.gui
+    if not guard.active:
+        stop_server(server)
+        raise RuntimeError(f'viser {viser.__version__} is not supported')
     return server
 
 

@@ -7,13 +7,15 @@
     viewer.stop()
 
 Several browsers can connect to one viewer at the same time. By default it accepts connections only
-from this machine; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`.
+from this machine; over SSH, forward its port: `ssh -L 8080:127.0.0.1:8080 HOST`. Its address ends with a
+token, without which it answers nobody: neither other users of the machine nor other web pages.
 """
 
 from __future__ import annotations
 
 import pathlib
 import queue
+import secrets
 import socket
 import tempfile
 import threading
@@ -28,6 +30,7 @@ from trl_suite.environments import named_policies
 from trl_suite.environments.environment import Environment
 from trl_suite.registry.spec import EnvSpec
 from trl_suite.rendering import overlays, web_scene, web_server
+from trl_suite.util import program
 from trl_suite.viewing import panel
 from trl_suite.viewing.session import FRAME, Loaded, Policy, Session
 
@@ -95,10 +98,13 @@ class Browser:
         loaded = self._load(
             spec, policy
         )  # before the server is started, as an error would leave it running
-        self._server = web_server.start_server(host, port)
-        port = self._server.get_port()
-        self.url = f'http://{HOST if host == EVERY else host}:{port}'
-        self.other_url = f'http://{socket.gethostname()}:{port}' if host == EVERY else ''
+        token = secrets.token_hex(16)
+        self._server = web_server.start_server(
+            host, port, token, lambda sentence: self._ask(lambda: self._panel.tell(sentence))
+        )
+        place = f'{self._server.get_port()}/{token}'
+        self.url = f'http://{HOST if host == EVERY else host}:{place}'
+        self.other_url = f'http://{socket.gethostname()}:{place}' if host == EVERY else ''
         self._panel = panel.Panel(self._server, self)
         self._show(loaded)
 
@@ -112,8 +118,14 @@ class Browser:
                 if not self.playing or now < due:
                     time.sleep(IDLE if not self.playing else min(due - now, IDLE))
                     continue
-                passed = self.session.advance() or FRAME
-                self._draw()
+                try:
+                    passed = self.session.advance() or FRAME
+                    self._draw()
+                except Exception as error:  # such as an uploaded policy whose numbers overflow
+                    self.playing = False
+                    self._panel.tell(program.in_one_line(error))
+                    self._panel.report(self.session.status(), self.playing)
+                    continue
                 # If frames take longer to compute than they last, playback slows down; no frame is
                 # skipped.
                 due = max(now, due) + passed / self.speed
@@ -250,8 +262,8 @@ class Browser:
         while not self._requests.empty():
             try:
                 self._requests.get()()
-            except (ValueError, OSError, RuntimeError) as error:
-                self._panel.tell(' '.join(str(error).split()))
+            except Exception as error:  # whatever is asked, the viewer goes on
+                self._panel.tell(program.in_one_line(error))
                 self._panel.show(self._loaded, self.session)  # what was chosen is not shown
 
     def _load(self, spec: str | EnvSpec, policy: str) -> Loaded:
