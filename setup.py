@@ -7,10 +7,10 @@ import tempfile
 from setuptools import find_packages, setup
 
 TORCH = 'torch>=2.5'
-# Below the next major version, which may change what the suite calls; Ray has changed the interface
-# of its new API stack in minor versions.
+# Below the next version that may change what the suite calls: of viser this is not only its interface
+# (rendering/web_guard.py), and Ray has changed the interface of RLlib in minor versions.
 BVH = 'pybvh>=0.9,<1'
-VISER = 'viser>=1.1,<2'
+VISER = 'viser>=1.1,<1.2'
 RAY = '>=2.54.1,<2.61'
 
 VERSION = '0.1.0'
