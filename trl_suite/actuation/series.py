@@ -14,7 +14,6 @@ of the joint without any torque inside. Both begin an episode at 0.
 from __future__ import annotations
 
 import dataclasses
-import pathlib
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
@@ -41,19 +40,13 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
       damping: damping of the springs relative to their stiffness, s.
 
     Raises:
-      ValueError: a body has several of the joints, or an MJCF file refers to other files.
+      ValueError: a body has several of the joints.
     """
     character = Character(spec)
     limits = dict(zip(spec.joints, character.torque_limits, strict=True))
     text = spec.xml
     if text is None:
-        path = spec.path or resources.directory('xml') / f'{spec.name}.xml'
-        text = pathlib.Path(path).read_text(encoding='utf-8')
-        if ' file=' in text:
-            raise ValueError(
-                f'backlash and flex: {path} refers to other files; make the character by '
-                '`characters.from_file`, which reads them'
-            )
+        text = (resources.directory('xml') / f'{spec.name}.xml').read_text(encoding='utf-8')
     tree = ElementTree.fromstring(text)
     contact = tree.find('contact')
     if contact is None:

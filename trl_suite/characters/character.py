@@ -67,7 +67,6 @@ class CharacterSpec:
       stumble_exempt: links that may touch the ground without a stumble.
       description: one line.
       root_weight: weight of the root in the imitation reward.
-      path: MJCF file of a user's own character; by default xml/<name>.xml of the suite.
       spatial: whether its root is free in three dimensions, instead of moving in the x-z plane.
       xml, assets: MJCF text instead of a file, and its meshes and pictures by name.
       bodies: names of the links, root first, if they are not 'root' and those of the joints.
@@ -86,7 +85,6 @@ class CharacterSpec:
     stumble_exempt: tuple[str, ...]
     description: str
     root_weight: float = 1.0
-    path: str | None = None
     spatial: bool = False
     xml: str | None = dataclasses.field(default=None, repr=False)
     assets: Mapping[str, bytes] = dataclasses.field(default_factory=dict, repr=False)
@@ -137,8 +135,7 @@ class Character(composer.Entity):
         if spec.xml is not None:
             self._mjcf_root = mjcf.from_xml_string(spec.xml, assets=dict(spec.assets))
         else:
-            path = spec.path or str(resources.directory('xml') / f'{spec.name}.xml')
-            self._mjcf_root = mjcf.from_path(path)
+            self._mjcf_root = mjcf.from_path(str(resources.directory('xml') / f'{spec.name}.xml'))
         if name is not None:
             self._mjcf_root.model = name
 

@@ -155,7 +155,6 @@ def from_file(
         end_effectors=tuple(end_effectors),
         stumble_exempt=tuple(exempt),
         description=description,
-        path=str(file),
         spatial=found.spatial,
         xml=tree.to_xml_string(),
         assets=tree.get_assets(),
