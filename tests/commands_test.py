@@ -31,7 +31,6 @@ class TryTest(CommandTest):
         self.assertIn('end effectors: right_shin, left_shin; must not touch the ground: trunk', out)
         self.assertRegex(out, r'facing: along \[1.0, 0.1\], derived from .* left and right')
         self.assertIn('collide: 6; in contact at the start: 0', out)
-        self.assertIn('actuators: 2 in the file, 2 kept, 0 omitted', out)
         self.assertRegex(out, 'right_hip +hinge +90 +3 +70')
         self.assertRegex(out, 'note: no torque limits in the file; .*left_hip')
         self.assertRegex(out, '(?s)flat: root .* m at the start.*slopes: .*steps: ')
@@ -48,7 +47,7 @@ class TryTest(CommandTest):
         self.assertIn('dog_file: three-dimensional', out)
         self.assertRegex(out, r'facing: along \[-?0.\d*, 1.0\]')
         self.assertIn('end effectors: left_shin; must', out)
-        self.assertIn('actuators: 3 in the file, 2 kept, 1 omitted', out)
+        self.assertIn('note: actuators that are left out, 1 of 3, because', out)
         self.assertTrue(pathlib.Path('a.png').exists())
 
     def test_invalid_files_are_rejected(self):
@@ -59,7 +58,10 @@ class TryTest(CommandTest):
             "unknown root 'leg2'; did you mean 'leg'", 'try', 'two.urdf', '--root', 'leg2'
         )
         self.assert_refused("suffix '.jpg'; expected .png", 'try', 'two.urdf', '--output', 'a.jpg')
-        self.assertEqual([path.name for path in pathlib.Path().iterdir()], ['two.urdf'])
+        size = '<mujoco><size nuser_geom="2000000000"/>'
+        pathlib.Path('two.xml').write_text(own_test.MJCF.replace('<mujoco>', size))
+        self.assert_refused('two.xml: .*; expected what can be read in 10 s', 'try', 'two.xml')
+        self.assertEqual({path.name for path in pathlib.Path().iterdir()}, {'two.urdf', 'two.xml'})
 
 
 class DoctorTest(CommandTest):

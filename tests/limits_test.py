@@ -1,21 +1,85 @@
 """What would take all memory, or for ever, is refused by name before it begins."""
 
+import contextlib
+import os
 import pathlib
+import resource
+import sys
 import tempfile
 import tracemalloc
 import zipfile
+from unittest import mock
 
 import imageio.v3 as iio
 import numpy as np
 from absl.testing import absltest, parameterized
 from PIL import Image
 
-from trl_suite import motion, policies, rendering, retargeting, suite, terrain
+from trl_suite import characters, motion, policies, rendering, retargeting, suite, terrain
+from trl_suite.util import limited
 from trl_suite.vector import VectorEnvironment
 
 IDS = (
     'PD_Biped2D_Gaps_Terrain-v0', 'PD_Biped3D_Imitate-v0', 'FSM_Dog2D_Terrain_Slopes-v0',
 )  # fmt: skip
+
+
+def model(first='', world='', trunk=''):
+    return (
+        f'<mujoco>{first}<worldbody>{world}<body name="trunk" pos="0 0 1"><freejoint/><geom size=".1"/>{trunk}'
+        '<body name="leg"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".05"/></body></body>'
+        '</worldbody></mujoco>'
+    )
+
+
+def asset(text):
+    return model(f'<asset>{text}</asset>')
+
+
+def replicated(count, inside='<geom size=".1"/>'):
+    return f'<replicate count="{count}" offset="0 0 1">{inside}</replicate>'
+
+
+def chain(length, copies):
+    """Files that include each other, the next one `copies` times by other spellings of its name."""
+    files = {
+        'm.xml': model('<include file="i0.xml"/>'),
+        f'i{length}.xml': '<mujoco><option/></mujoco>',
+    }
+    for i in range(length):
+        inside = ''.join(f'<include file="{"./" * k}i{i + 1}.xml"/>' for k in range(copies))
+        files[f'i{i}.xml'] = f'<mujoco>{inside}</mujoco>'
+    return files
+
+
+def attached(levels, copies):
+    """Models that attach each other, the next one `copies` times."""
+    files = {f'a{levels}.xml': model()}
+    for i in range(levels):
+        copied = ''.join(f'<attach model="a" body="trunk" prefix="p{k}"/>' for k in range(copies))
+        first = f'<asset><model name="a" file="a{i + 1}.xml"/></asset>'
+        files[f'a{i}.xml'] = model(first, trunk=f'<body name="b{i}">{copied}</body>')
+    return {**files, 'm.xml': files['a0.xml']}
+
+
+CABLE = """<composite type="cable" curve="l 0 0" count="20000000 1 1" size="1">
+<geom type="capsule" size=".01"/></composite>"""
+FILES = {  # character files that ask for more than any computer has, and the files that they need
+    'replicate': {'m.xml': model(world=replicated('+2000000'))},
+    'nested': {'m.xml': model(world=replicated(300, replicated(300, replicated(300))))},
+    'attach': attached(1, 20_000), 'attach_attached': attached(5, 12),
+    'attach_itself': {'m.xml': asset('<model name="a" file="m.xml"/>')}, 'doubling': chain(30, 2),
+    'composite': {'m.xml': model(trunk=CABLE)},
+    'flexcomp': {
+        'm.xml': model(trunk='<flexcomp name="f" type="grid" count="900 900 9" spacing="1 1 1" dim="3"/>'),
+    },
+    'size': {'m.xml': model('<size nuser_geom="2000000000"/>')}, 'keys': {'m.xml': model('<size nkey="200000000"/>')},
+    'hfield': {'m.xml': asset('<hfield name="h" nrow="60000" ncol="60000" size="1 1 1 1"/>')},
+    'texture': {'m.xml': asset('<texture name="t" type="2d" builtin="flat" width="90000" height="90000"/>')},
+    'mesh': {'m.xml': asset('<mesh name="m" builtin="supersphere" params="99999 1 1"/>')},
+    'endless': {'m.xml': asset('<mesh name="m" file="endless.stl"/>')},
+    'pipe': {'m.xml': asset('<mesh name="m" file="pipe.stl"/>')},
+}  # fmt: skip
 
 
 class LimitsTest(parameterized.TestCase):
@@ -91,6 +155,36 @@ class LimitsTest(parameterized.TestCase):
         low.save(self.folder / 'a.png', save_all=True, append_images=[high, high])
         ground = terrain.SpatialGround(terrain.from_image(self.folder / 'a.png', 0.1), 0)
         self.assertEqual(float(ground.height(0, 0)), 0.0)
+
+    @parameterized.parameters(*FILES)
+    def test_character_files(self, name):
+        path = self.folder / 'm.xml'
+        for file, text in FILES[name].items():
+            (self.folder / file).write_text(text)
+        os.mkfifo(self.folder / 'pipe.stl')
+        (self.folder / 'endless.stl').symlink_to('/dev/zero')
+        own, before = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        with (
+            mock.patch.multiple(limited, SECONDS=1, WAIT=5.0 if name == 'pipe' else 60.0),
+            self.assertRaisesRegex(ValueError, f'^{path}: .*; expected|{path}: .*Error'),
+        ):
+            characters.from_file(path)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        self.assertLess(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 5)
+        if sys.platform == 'linux':  # a child begins with the memory of its parent, in kB
+            self.assertLessEqual(after.ru_maxrss, max(own.ru_maxrss, before.ru_maxrss, 2.5e6))
+
+    def test_no_module_beside_a_character_file_is_run(self):
+        for module in ('pickle', 'resource', 'numpy', 'mujoco'):
+            (self.folder / f'{module}.py').write_text('raise SystemExit("was run")')
+        (self.folder / 'm.xml').write_text(model())
+        with contextlib.chdir(self.folder):
+            self.assertEqual(characters.from_file('m.xml').links, ('trunk', 'leg'))
+
+    def test_a_long_chain_of_files_is_read(self):
+        for file, text in chain(1500, 1).items():
+            (self.folder / file).write_text(text)
+        self.assertEqual(characters.from_file(self.folder / 'm.xml').links, ('trunk', 'leg'))
 
 
 if __name__ == '__main__':

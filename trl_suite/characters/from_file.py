@@ -4,9 +4,9 @@
                                 end_effectors=('left_foot', 'right_foot'), spatial=True)
     environment = suite.build(spec, terrain='hills3d', task='walk')
 
-MuJoCo reads the file. Frames are MuJoCo's: the character faces +x, z points up. The masses, joint
-limits, joint damping, position actuators and torque limits of the file are kept; missing values are
-chosen as follows:
+MuJoCo reads the file, in a process of its own with limited time and memory. Frames are MuJoCo's:
+the character faces +x, z points up. The masses, joint limits, joint damping, position actuators and
+torque limits of the file are kept; missing values are chosen as follows:
 
 * the torque limit of a joint is the torque of the whole character's weight at the farthest end of
   the links that the joint carries; the force limit of a slide is twice that weight;
@@ -23,32 +23,35 @@ sensors, lights and everything outside the character are removed.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
-from dm_control import mjcf
+from dm_control import composer, mjcf
 
-from trl_suite.characters.character import CharacterSpec, Joint
+from trl_suite.characters.character import Character, CharacterSpec, Joint
 from trl_suite.characters.inspect import KINDS, ModelInspector
 from trl_suite.characters.model_file import (
     Rotation,
     check_numbers,
-    compiled,
     find_root,
     flat,
     named,
-    problem,
     turned,
 )
 from trl_suite.characters.specs import CHARACTERS
-from trl_suite.util import errors
-from trl_suite.util.files import existing
+from trl_suite.util import errors, limited
+from trl_suite.util.files import check_size, existing
 
 SUFFIXES = ('.xml', '.mjcf', '.urdf')
 COLOUR = (0.27, 0.42, 0.62, 1)  # red, green, blue, opacity
+_DIVERGED = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]  # fmt: skip
 CAMERA_AWAY = 3.2  # distance of cameras, in reaches of the character
 
 _CAMERAS = {  # position in units of the distance, and the axes of the picture
@@ -62,8 +65,8 @@ _CAMERAS = {  # position in units of the distance, and the axes of the picture
 def from_file(
     path: str | os.PathLike[str],
     *,
-    end_effectors: Sequence[str],
-    fall_links: Sequence[str],
+    end_effectors: Sequence[str] | None = None,
+    fall_links: Sequence[str] | None = None,
     root: str | None = None,
     spatial: bool | None = None,
     turn: Sequence[float] | None = None,
@@ -81,8 +84,9 @@ def from_file(
         addresses from the folders that contain the file. Visual geoms of a URDF file are discarded,
         as by MuJoCo.
       end_effectors: bodies whose positions imitation tracks and whose contacts are observed, e.g.
-        feet.
-      fall_links: bodies whose contact with the ground ends the episode.
+        feet; by default the last bodies of limbs that reach below the centre of mass.
+      fall_links: bodies whose contact with the ground ends the episode; by default the first one
+        with geoms that can touch it, and with limbs.
       root: body that is the ancestor of all others, a child of the world; by default the only one.
       spatial: whether the character moves in three dimensions, instead of in the x-z plane; by
         default derived from the root's joints: a free joint, or two slides and a hinge.
@@ -105,55 +109,102 @@ def from_file(
         ('description', description, str),
     ):  # fmt: skip
         errors.check_kind(option, value, kind)
+    for what, names in (
+        ('end effectors', end_effectors), ('fall links', fall_links),
+        ('stumble-exempt links', stumble_exempt),
+    ):  # fmt: skip
+        if names is not None and not _is_names(names):
+            raise ValueError(f'{what} are {names!r}; expected a sequence of one name or more')
     if name == '':
         raise ValueError("name is ''; expected a name, or None for that of the file")
     if joints is not None and not isinstance(joints, Mapping):
         raise TypeError(f'joints is {joints!r}; expected a dict of characters.Joint by name')
-    rotation = _rotation(turn)
+    rotation = None if turn is None else _rotation(turn)
     file = existing(path, SUFFIXES)
-    check_numbers(file)
     name = file.stem if name is None else name
     if '/' in name:
         raise ValueError(f"name is {name!r}; expected a name without '/'")
     if name in CHARACTERS:
         raise ValueError(f'the suite has a character named {name!r}; pass another name=')
+    file.open('rb').close()  # raises an OSError if it cannot be read
+    try:
+        spec = limited.call(
+            _read, os.path.abspath(file), name, description, root, spatial, rotation,
+            *(
+                None if names is None else tuple(names)
+                for names in (end_effectors, fall_links, stumble_exempt)
+            ),
+        )  # fmt: skip
+        for joint in joints or {}:
+            if joint not in spec.joints:
+                raise ValueError(errors.unknown('joint', joint, spec.joints))
+    except ValueError as error:
+        raise ValueError(f'{file}: {error}') from None
+    for joint, own in (joints or {}).items():
+        if not isinstance(own, Joint):
+            raise TypeError(f'joints[{joint!r}] is {own!r}; expected a characters.Joint')
+    return dataclasses.replace(spec, joints={**spec.joints, **(joints or {})})
+
+
+def _is_names(names: object) -> bool:
+    """Whether an argument is a collection of one name or more."""
+    return (
+        isinstance(names, Collection)
+        and not isinstance(names, (str, bytes))
+        and len(names) > 0
+        and all(isinstance(name, str) for name in names)
+    )
+
+
+def _read(
+    path: str,
+    name: str,
+    description: str,
+    root: str | None,
+    spatial: bool | None,
+    rotation: np.ndarray | None,
+    end_effectors: tuple[str, ...] | None,
+    fall_links: tuple[str, ...] | None,
+    exempt: tuple[str, ...] | None,
+) -> CharacterSpec:
+    """Reads a file in a process of its own; arguments are those of `from_file`."""
+    file = pathlib.Path(path)
+    check_numbers(file)
     spec = named(file)
-    model = compiled(file, spec)
-    number = find_root(file, model, root)
+    model = spec.compile()
+    number = find_root(model, root)
     own_turn = model.body_quat[number]
-    if abs(own_turn[0]) < 1 - 1e-6 or turn is not None:
-        rotation = Rotation(rotation).quaternion(own_turn)
-        model = turned(file, spec, model.body(number).name, rotation)
-    found = ModelInspector(file, model, number, spatial)
-    if abs(own_turn[0]) < 1 - 1e-6:
+    is_turned = abs(own_turn[0]) < 1 - 1e-6
+    if is_turned or rotation is not None:
+        whole = Rotation((1, 0, 0, 0) if rotation is None else rotation).quaternion(own_turn)
+        model = turned(spec, model.body(number).name, whole)
+    found = ModelInspector(model, number, spatial)
+    if is_turned:
         found.notes.append(
             f'the root is rotated in the file by {own_turn.round(3).tolist()}; its axes are now those of '
             'the world'
         )
+    lowest, first = found.limbs()
+    end_effectors, fall_links = end_effectors or lowest, fall_links or first
+    exempt = exempt or end_effectors
     found.check_names('end effector', end_effectors)
     found.check_posture(end_effectors)
     found.check_names('fall link', fall_links, solid=True)
-    exempt = end_effectors if stumble_exempt is None else stumble_exempt
     found.check_names('stumble-exempt link', exempt)
     figures = found.figures()
     if left_out := found.left_out():
         found.notes.append(
-            'actuators that are left out, because they do not act on a joint of the character: '
-            f'{", ".join(left_out)}'
+            f'actuators that are left out, {len(left_out)} of {model.nu}, because they do not act on a '
+            f'joint of the character: {", ".join(left_out)}'
         )
-    for joint, own in (joints or {}).items():
-        if joint not in figures:
-            raise problem(file, errors.unknown('joint', joint, figures))
-        if not isinstance(own, Joint):
-            raise TypeError(f'joints[{joint!r}] is {own!r}; expected a characters.Joint')
     tree = _tree(file, spec, found)
     tree.model = name
-    return CharacterSpec(
+    made = CharacterSpec(
         name=name,
-        joints={**figures, **(joints or {})},
-        fall_links=tuple(fall_links),
-        end_effectors=tuple(end_effectors),
-        stumble_exempt=tuple(exempt),
+        joints=figures,
+        fall_links=fall_links,
+        end_effectors=end_effectors,
+        stumble_exempt=exempt,
         description=description,
         spatial=found.spatial,
         xml=tree.to_xml_string(),
@@ -162,12 +213,30 @@ def from_file(
         collision_geoms=found.collision_geoms,
         notes=tuple(found.notes),
     )
+    check_size(path, size=sum(map(len, (made.xml or '', *made.assets.values()))))
+    _check_physics(made)
+    return made
 
 
-def _rotation(turn: Sequence[float] | None) -> np.ndarray:
+def _check_physics(spec: CharacterSpec) -> None:
+    """Raises an error if a character in an arena cannot be compiled or simulated."""
+    character, arena = Character(spec), composer.Arena()
+    character.create_root_joints(arena.attach(character))
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    model, data = physics.model.ptr, physics.data.ptr
+    mujoco.mj_step(model, data)
+    for name in dir(model):
+        value = getattr(model, name)
+        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+            raise ValueError(f'{name} has a value that is not finite; expected smaller numbers')
+    if data.warning.number[_DIVERGED].any():
+        raise ValueError('its simulation diverges in the first step; expected a stable one')
+
+
+def _rotation(turn: Sequence[float]) -> np.ndarray:
     """Returns a unit quaternion."""
     try:
-        found = np.array((1, 0, 0, 0) if turn is None else turn, float)
+        found = np.array(turn, float)
     except (TypeError, ValueError):
         found = np.zeros(0)
     length = np.linalg.norm(found)
@@ -181,10 +250,7 @@ def _rotation(turn: Sequence[float] | None) -> np.ndarray:
 def _tree(file: pathlib.Path, spec: mujoco.MjSpec, found: ModelInspector) -> mjcf.RootElement:
     """Returns the character alone: no world, root joints, actuators, options; explicit values."""
     model = found.model
-    try:
-        tree = mjcf.from_xml_string(flat(spec.to_xml()), model_dir=str(file.parent))
-    except (ValueError, KeyError, AttributeError, OSError) as error:
-        raise problem(file, f'cannot be converted: {error}') from None
+    tree = mjcf.from_xml_string(flat(spec.to_xml()), model_dir=str(file.parent))
     root = tree.find('body', found.bodies[0])
     outside = [child for child in tree.worldbody.all_children() if child is not root]
     joints = [child for child in root.all_children() if child.tag in ('joint', 'freejoint')]

@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-import pathlib
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from trl_suite.characters.character import Joint
-from trl_suite.characters.model_file import problem
 from trl_suite.util import errors
 
 GRAVITY = 9.8  # m/s^2, of the arenas
@@ -72,10 +70,8 @@ def _right(left: str) -> list[str]:
 class ModelInspector:
     """The properties of a character in a compiled file."""
 
-    def __init__(
-        self, file: pathlib.Path, model: mujoco.MjModel, root: int, spatial: bool | None
-    ) -> None:
-        self.file, self.model, self.notes = file, model, list[str]()
+    def __init__(self, model: mujoco.MjModel, root: int, spatial: bool | None) -> None:
+        self.model, self.notes = model, list[str]()
         self.data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self.data)
         self.root = root
@@ -88,24 +84,24 @@ class ModelInspector:
         touching = (model.geom_contype | model.geom_conaffinity) != 0
         self.geoms = np.flatnonzero(np.isin(model.geom_bodyid, self.ids) & touching)
         if not len(self.geoms):
-            raise problem(
-                file, 'no geom of the character can touch the ground: expected some whose contype '
-                'and conaffinity are not both 0 (in URDF, <collision> elements)',
-            )  # fmt: skip
+            raise ValueError(
+                'no geom of the character can touch the ground: expected some whose contype '
+                'and conaffinity are not both 0 (in URDF, <collision> elements)'
+            )
         for i in self.geoms:
             masks = int(model.geom_contype[i]), int(model.geom_conaffinity[i])
             if not all(-(2**30) <= mask < 2**30 for mask in masks):
-                raise problem(
-                    file, f'geom {model.geom(i).name!r} has contype {masks[0]} and conaffinity '
-                    f'{masks[1]}; expected masks below 2^30, as one bit is for the ground',
-                )  # fmt: skip
+                raise ValueError(
+                    f'geom {model.geom(i).name!r} has contype {masks[0]} and conaffinity '
+                    f'{masks[1]}; expected masks below 2^30, as one bit is for the ground'
+                )
         self.collision_geoms = tuple(model.geom(i).name for i in self.geoms)
         heavy = model.body_mass[self.ids] > 0
         heavy[0] = True
         self.links = tuple(np.array(self.bodies)[heavy].tolist())
         self.weight = float(model.body_mass[self.ids].sum()) * GRAVITY
         if not self.weight > 0:
-            raise problem(file, f'the mass of {self.bodies[0]!r} and its descendants is 0')
+            raise ValueError(f'the mass of {self.bodies[0]!r} and its descendants is 0')
         self._doubt()
 
     def _dimensions(self, root_joints: np.ndarray, spatial: bool | None) -> bool:
@@ -120,29 +116,29 @@ class ModelInspector:
             return spatial
         if says is not None:
             return says
-        raise problem(
-            self.file, f'the root {self.bodies[0]!r} has {", ".join(kinds) or "no joints"}; expected '
-            'a free joint, or two slides and a hinge; or pass spatial=True or spatial=False',
-        )  # fmt: skip
+        raise ValueError(
+            f'the root {self.bodies[0]!r} has {", ".join(kinds) or "no joints"}; expected '
+            'a free joint, or two slides and a hinge; or pass spatial=True or spatial=False'
+        )
 
     def _check_joints(self) -> None:
         model = self.model
         if not len(self.joints):
-            raise problem(self.file, f'no joint attaches a body to the root {self.bodies[0]!r}')
+            raise ValueError(f'no joint attaches a body to the root {self.bodies[0]!r}')
         for i in self.joints:
             name, kind, axis = model.joint(i).name, int(model.jnt_type[i]), self.data.xaxis[i]
             aside = abs(axis[1])
             if kind == _SLIDE and not model.jnt_limited[i]:
-                raise problem(self.file, f'slide {name!r} has no limits; expected a range, in m')
+                raise ValueError(f'slide {name!r} has no limits; expected a range, in m')
             if not self.spatial and (
                 kind == _BALL
                 or (kind == _HINGE and aside < 1 - LATERAL)
                 or (kind == _SLIDE and aside > LATERAL)
             ):
-                raise problem(
-                    self.file, f'{KINDS[kind]} {name!r} (axis {axis.round(3).tolist()}) leaves the '
-                    'x-z plane; expected hinges about y and slides in the plane, or spatial=True',
-                )  # fmt: skip
+                raise ValueError(
+                    f'{KINDS[kind]} {name!r} (axis {axis.round(3).tolist()}) leaves the '
+                    'x-z plane; expected hinges about y and slides in the plane, or spatial=True'
+                )
 
     def _doubt(self) -> None:
         """Adds notes on values that are probably in another unit."""
@@ -199,9 +195,25 @@ class ModelInspector:
             names.append(f'{model.actuator(a).name or a} ({on})')
         return names
 
+    def limbs(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Returns the last bodies of limbs that reach below the centre of mass, and the first inner one.
+
+        Only bodies that can touch the ground count. If no limb reaches down, all do; if no body is an
+        inner one, the first of the last ones is returned.
+        """
+        model, data = self.model, self.data
+        mujoco.mj_comPos(model, data)
+        solid = [i for i in self.ids.tolist() if i in model.geom_bodyid[self.geoms]]
+        inner = set[int]()
+        for body in solid:
+            while (body := int(model.body_parentid[body])) and body not in inner:
+                inner.add(body)
+        last = [i for i in solid if i not in inner]
+        low = [i for i in last if data.xipos[i, 2] < data.subtree_com[self.root, 2]] or last
+        falls = [i for i in solid if i in inner] or last
+        return tuple(model.body(i).name for i in low), (model.body(falls[0]).name,)
+
     def check_names(self, what: str, names: Sequence[str], solid: bool = False) -> None:
-        if isinstance(names, (str, bytes)) or not isinstance(names, Collection) or not names:
-            raise ValueError(f'{what}s are {names!r}; expected a sequence of one name or more')
         model = self.model
         touching = {model.body(i).name for i in model.geom_bodyid[self.geoms]}
         for name in names:
@@ -209,15 +221,13 @@ class ModelInspector:
                 by_joint = {model.joint(i).name: model.jnt_bodyid[i] for i in self.joints}
                 if name in by_joint:
                     link = model.body(by_joint[name]).name
-                    raise problem(
-                        self.file, f'{what} {name!r} is a joint; did you mean its body {link!r}?'
-                    )
-                raise problem(self.file, errors.unknown(what, name, self.bodies))
+                    raise ValueError(f'{what} {name!r} is a joint; did you mean its body {link!r}?')
+                raise ValueError(errors.unknown(what, name, self.bodies))
             if solid and name not in touching:
-                raise problem(
-                    self.file, f'{what} {name!r} has no geom that can touch the ground; bodies '
-                    f'with such geoms: {", ".join(sorted(touching))}',
-                )  # fmt: skip
+                raise ValueError(
+                    f'{what} {name!r} has no geom that can touch the ground; bodies '
+                    f'with such geoms: {", ".join(sorted(touching))}'
+                )
 
     def figures(self) -> dict[str, Joint]:
         """The parameters of all joints; sets `limits`, their largest torques or forces."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
+import os
 import pathlib
 import re
 from collections.abc import Sequence
@@ -18,25 +18,19 @@ from trl_suite.util.files import check_size
 
 LARGEST = 1e30  # number in a file; squares of larger ones may overflow
 MOST_PARTS = 10_000  # bodies, joints, geoms and sites of a file
-_PARTS = (
-    'body', 'joint', 'freejoint', 'geom', 'site', 'link', 'collision', 'composite', 'flexcomp',
-)  # fmt: skip
-_COPIES = ('replicate', 'composite', 'flexcomp')  # elements whose attribute 'count' multiplies
 # Kinds of elements, besides bodies, that need names because they are looked up later.
 _NAMED = ('joints', 'geoms', 'sites', 'cameras', 'lights', 'equalities', 'excludes', 'tendons')
 
 
-def problem(file: pathlib.Path, what: str) -> ValueError:
-    """Returns an error that names the file."""
-    return ValueError(f'{file}: {what}')
-
-
 def named(file: pathlib.Path) -> mujoco.MjSpec:
     """Reads a file, and gives names to elements without a name."""
-    try:
-        spec = mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        raise problem(file, f'not a model: {" ".join(str(error).split())}') from None
+    spec = mujoco.MjSpec.from_file(str(file))
+    parts = sum(len(getattr(spec, kind)) for kind in ('bodies', 'joints', 'geoms', 'sites'))
+    if parts > MOST_PARTS:
+        raise ValueError(
+            f'bodies, joints, geoms and sites are {parts}; expected no more than {MOST_PARTS}'
+        )
+    spec.memory = spec.njmax = spec.nconmax = spec.nstack = -1  # it is simulated in another model
     spec.compiler.fusestatic = False  # bodies without joints may be end effectors
     for mesh in spec.meshes:
         mesh.file = _in_package(file, mesh.file)
@@ -53,10 +47,10 @@ def named(file: pathlib.Path) -> mujoco.MjSpec:
             _name(item, f'unnamed_{kind}_{i}', taken[kind])
     for item in (*spec.bodies[1:], *(item for kind in _NAMED for item in getattr(spec, kind))):
         if '/' in item.name or not item.name.isprintable():
-            raise problem(
-                file, f'the name {item.name!r} has a slash, a line break or another character that is '
-                'not printable; expected a name without them',
-            )  # fmt: skip
+            raise ValueError(
+                f'the name {item.name!r} has a slash, a line break or another character that is '
+                'not printable; expected a name without them'
+            )
     return spec
 
 
@@ -71,67 +65,37 @@ def _name(item: Any, wanted: str, taken: set[str]) -> None:
         item.name = name
 
 
-def check_numbers(file: pathlib.Path, above: tuple[pathlib.Path, ...] = ()) -> None:
+def check_numbers(file: pathlib.Path) -> None:
     """Raises an error for NaN, which MuJoCo treats as a missing value, and for huge numbers.
 
-    Refuses models that load themselves, too, which would crash the process, and those with so many
-    parts that MuJoCo would take all memory.
-
     Args:
-      file: the file; files that it includes or loads are checked as well.
-      above: files that load it, the first one first.
+      file: an absolute path; files that it includes or loads are checked as well.
     """
-    check_size(file)
-    try:
-        parser = etree.XMLParser(resolve_entities=False)
-        elements = [*etree.fromstring(file.read_bytes(), parser).iter(etree.Element)]
-    except etree.XMLSyntaxError as error:
-        raise problem(file, f'not a model: {error}') from None
-    _check_parts(file, elements)
-    names = {element.get(key) for element in elements for key in ('name', 'class')}
-    for element in elements:
-        for key, text in element.items():
-            if text not in names and key not in ('name', 'class') and _is_huge(text):
-                of = f' of {element.get("name")!r}' if element.get('name') else ''
-                raise problem(
-                    file, f'line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); expected '
-                    f'finite numbers up to {LARGEST:g}',
-                )  # fmt: skip
-    above = (*above, file.resolve())
-    for element in elements:
-        if element.tag not in ('include', 'model') or not element.get('file'):
-            continue
-        # MuJoCo resolves paths also relative to the first file.
-        for folder in dict.fromkeys((file.parent, above[0].parent)):
-            inside = folder / element.get('file', '')
-            if inside.resolve() in above:
-                raise problem(
-                    file, f'line {element.sourceline}: <{element.tag} file="{element.get("file")}"> '
-                    'loads a file that loads this one; expected another model',
-                )  # fmt: skip
-            if inside.is_file():  # otherwise MuJoCo reports the missing file
-                check_numbers(inside, above)
-                break
-
-
-def _check_parts(file: pathlib.Path, elements: list[etree._Element]) -> None:
-    """Refuses more than `MOST_PARTS` parts, counting the copies that MuJoCo makes."""
-    total = 0
-    for element in elements:
-        if element.tag in _PARTS:
-            around = (element, *element.iterancestors(*_COPIES))
-            total += math.prod(_count(each) for each in around)
-            if total > MOST_PARTS:
-                raise problem(
-                    file, f'line {element.sourceline}: bodies, joints, geoms and sites are more than '
-                    f'{MOST_PARTS}; expected fewer',
-                )  # fmt: skip
-
-
-def _count(element: etree._Element) -> int:
-    """Returns how many copies an element makes."""
-    numbers = element.get('count', '') if element.tag in _COPIES else ''
-    return math.prod(int(number) for number in numbers.split() if number.isdecimal())
+    files = [file]
+    for each in files:  # grows
+        check_size(each)
+        where = '' if each == file else f'{each}: '
+        try:
+            parser = etree.XMLParser(resolve_entities=False)
+            elements = [*etree.fromstring(each.read_bytes(), parser).iter(etree.Element)]
+        except etree.XMLSyntaxError as error:
+            raise ValueError(f'{where}not a model: {error}') from None
+        names = {element.get(key) for element in elements for key in ('name', 'class')}
+        for element in elements:
+            for key, text in element.items():
+                if text not in names and key not in ('name', 'class') and _is_huge(text):
+                    of = f' of {element.get("name")!r}' if element.get('name') else ''
+                    raise ValueError(
+                        f'{where}line {element.sourceline}: {key}="{text}"{of} (<{element.tag}>); '
+                        f'expected finite numbers up to {LARGEST:g}'
+                    )
+            if element.tag in ('include', 'model') and element.get('file'):
+                # MuJoCo resolves paths also relative to the first file.
+                for folder in (each.parent, file.parent):
+                    inside = pathlib.Path(os.path.abspath(folder / element.get('file', '')))
+                    if inside.is_file():  # otherwise MuJoCo reports the missing file
+                        files += [] if inside in files else [inside]
+                        break
 
 
 def _is_huge(text: str) -> bool:
@@ -156,7 +120,7 @@ def _in_package(file: pathlib.Path, name: str) -> str:
     return str(next((place for place in places if place.is_file()), name))
 
 
-def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> int:
+def find_root(model: mujoco.MjModel, root: str | None) -> int:
     """Returns the id of the root body; by default the only child of the world."""
     top = {model.body(i).name: i for i in range(1, model.nbody) if not model.body_parentid[i]}
     if root is None and len(top) == 1:
@@ -164,23 +128,20 @@ def find_root(file: pathlib.Path, model: mujoco.MjModel, root: str | None) -> in
     if root in top:
         return top[root]
     if not top:
-        raise problem(file, 'there is no body; expected one that is the ancestor of all others')
+        raise ValueError('there is no body; expected one that is the ancestor of all others')
     if root is None:
-        raise problem(file, f'several bodies may be the root; pass root=, one of {[*top]}')
+        raise ValueError(f'several bodies may be the root; pass root=, one of {[*top]}')
     names = [model.body(i).name for i in range(1, model.nbody)]
     if root in names:
         above = model.body(model.body_rootid[model.body(root).id]).name
-        raise problem(file, f'root {root!r} is the child of another body; did you mean {above!r}?')
-    raise problem(file, errors.unknown('root', root, names))
+        raise ValueError(f'root {root!r} is the child of another body; did you mean {above!r}?')
+    raise ValueError(errors.unknown('root', root, names))
 
 
-def turned(
-    file: pathlib.Path, spec: mujoco.MjSpec, root: str, rotation: np.ndarray
-) -> mujoco.MjModel:
+def turned(spec: mujoco.MjSpec, root: str, rotation: np.ndarray) -> mujoco.MjModel:
     """Rotates the children of a body, so that the axes of the body are those of the world.
 
     Args:
-      file: path of the file, for messages.
       spec: the file as read, which is changed.
       root: name of the body, a child of the world.
       rotation: rotation of its children, unit quaternion wxyz.
@@ -193,10 +154,10 @@ def turned(
         if equality.objtype == mujoco.mjtObj.mjOBJ_BODY and root in (
             equality.name1, equality.name2,
         ):  # fmt: skip
-            raise problem(
-                file, f'the root {root!r} is rotated, and equality {equality.name!r} refers to it; remove '
-                'the equality, or rotate the character in the file',
-            )  # fmt: skip
+            raise ValueError(
+                f'the root {root!r} is rotated, and equality {equality.name!r} refers to it; remove '
+                'the equality, or rotate the character in the file'
+            )
     frame = body.add_frame(quat=rotation)
     for item in (*body.geoms, *body.sites, *body.cameras, *body.lights, *body.bodies):
         if item.frame is None:
@@ -214,15 +175,7 @@ def turned(
         body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.quat = 1, 0, 0, 0
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    return compiled(file, spec)
-
-
-def compiled(file: pathlib.Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles a file."""
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise problem(file, ' '.join(str(error).split())) from None
+    return spec.compile()
 
 
 def flat(text: str) -> str:

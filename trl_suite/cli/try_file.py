@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import pathlib
 from typing import TYPE_CHECKING, Any
 
@@ -28,11 +27,10 @@ def run(arguments: argparse.Namespace) -> None:
     suite = engine.load()
     from trl_suite import characters
 
-    ends, falls = _links(arguments)
     name = arguments.file.stem
     spec = characters.from_file(
-        arguments.file, end_effectors=ends, fall_links=falls, root=arguments.root,
-        spatial=arguments.spatial, turn=arguments.turn,
+        arguments.file, end_effectors=arguments.end_effectors, fall_links=arguments.fall_links,
+        root=arguments.root, spatial=arguments.spatial, turn=arguments.turn,
         name=f'{name}_file' if name in characters.CHARACTERS else name,
     )  # fmt: skip
     pictures: list[np.ndarray] = []
@@ -40,55 +38,16 @@ def run(arguments: argparse.Namespace) -> None:
         environment = suite.build(spec, terrain=terrain, task='walk', task_kwargs={'random': 0})
         environment.reset()
         if not pictures:
-            print(_report(spec, environment, arguments.file), flush=True)
+            print(_report(spec, environment), flush=True)
         print(f'{terrain}: {_stand(environment)}', flush=True)
         pictures.append(rendering.frame(environment, 360, 480))
     rendering.film_strip(pictures, output, len(pictures))
     print(output)
 
 
-def _links(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
-    """Returns end effectors, and links that must not touch the ground.
-
-    By default end effectors are the last bodies of limbs that reach below the centre of mass, and the
-    first other body with collision geoms must not touch the ground.
-    """
-    import mujoco
-
-    from trl_suite.characters import model_file
-
-    file = files.existing(arguments.file, ('.xml', '.mjcf', '.urdf'))
-    model_file.check_numbers(file)
-    model = model_file.compiled(file, model_file.named(file))
-    root = model_file.find_root(file, model, arguments.root)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    w, *axis = arguments.turn or (1, 0, 0, 0)
-    up = model_file.Rotation((w, *(-x for x in axis))).vector(np.array([0.0, 0.0, 1.0]))
-    touching = model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]
-    solid = [int(i) for i in np.flatnonzero(model.body_rootid == root) if i in touching]
-    inner = {body for i in solid for body in _above(model, i)}
-    last = [i for i in solid if i not in inner]
-    low = [i for i in last if (data.xipos[i] - data.subtree_com[root]) @ up < 0]
-    falls = [i for i in solid if i in inner] or last
-    return (
-        arguments.end_effectors or [model.body(i).name for i in low or last],
-        arguments.fall_links or [model.body(i).name for i in falls[:1]],
-    )
-
-
-def _above(model: Any, body: int) -> list[int]:
-    """Returns the ancestors of a body."""
-    found = []
-    while body := int(model.body_parentid[body]):
-        found.append(body)
-    return found
-
-
-def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -> str:
+def _report(spec: CharacterSpec, environment: Environment) -> str:
     """Returns the properties of a character, after a reset of its environment on level ground."""
-    from trl_suite.characters import inspect, model_file
+    from trl_suite.characters import inspect
 
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     character = environment.task.character
@@ -103,8 +62,6 @@ def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -
             f'along {forward.round(2).tolist()}, derived from the positions of left and right links'
         )
     kinds = [joint.type or 'hinge' for joint in character.joints]
-    given = len(model_file.named(file).actuators)
-    left = next((note for note in spec.notes if note.startswith('actuators')), '').count(' (')
     joints = zip(spec.joints.items(), kinds, character.torque_limits, strict=True)
     lines = [
         f'{spec.name}: {"three-dimensional" if spec.spatial else "planar"}, '
@@ -116,7 +73,6 @@ def _report(spec: CharacterSpec, environment: Environment, file: pathlib.Path) -
         f'{", ".join(spec.fall_links)}',
         f'pairs of its geoms that can collide: {pairs}; in contact at the start: {len(inside)}'
         + (f', up to {-min(inside):.2g} m deep' if inside else ''),
-        f'actuators: {given} in the file, {given - left} kept, {left} omitted; the character has one per joint',
         tables.table(
             ('joint', 'type', 'kp', 'kd', 'torque limit'),
             (
@@ -137,20 +93,21 @@ def _root(environment: Environment) -> int:
 
 def _colliding(model: Any, bodies: np.ndarray) -> int:
     """Returns the number of pairs of geoms, of these bodies, that can collide."""
-    excluded, count = {*model.exclude_signature.tolist()}, 0
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
-    for a, b in itertools.combinations(geoms.tolist(), 2):
-        if not (
-            model.geom_contype[a] & model.geom_conaffinity[b]
-            or model.geom_contype[b] & model.geom_conaffinity[a]
-        ):
-            continue
-        first, second = sorted(model.geom_bodyid[[a, b]].tolist())
-        one, other = model.body_weldid[[first, second]]
-        above = model.body_weldid[model.body_parentid[[one, other]]]
-        joined = one == other or above[0] == other or above[1] == one
-        count += not joined and (first << 16) + second not in excluded
-    return count
+    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    own = model.geom_bodyid[geoms]
+    welded = model.body_weldid[own]
+    above = model.body_weldid[model.body_parentid[welded]]
+    count = 0
+    for i in range(len(geoms)):
+        rest = slice(i + 1, None)
+        touching = (types[i] & affinities[rest]) | (types[rest] & affinities[i])
+        apart = (
+            (welded[i] != welded[rest]) & (above[i] != welded[rest]) & (welded[i] != above[rest])
+        )
+        pairs = (np.minimum(own[i], own[rest]) << 16) + np.maximum(own[i], own[rest])
+        count += (apart & (touching != 0) & ~np.isin(pairs, model.exclude_signature)).sum()
+    return int(count)
 
 
 def _contacts(model: Any, data: Any, bodies: np.ndarray) -> list[float]:
