@@ -435,6 +435,8 @@ class ActionTest(parameterized.TestCase):
         environment.reset()
         with self.assertRaisesRegex(ValueError, 'not an array of numbers'):
             environment.step(['left'] * 11)
+        with self.assertRaisesRegex(ValueError, 'not an array of numbers'):
+            environment.step([10**400] * 11)
 
     @parameterized.parameters(*EXAMPLES)
     def test_far_actions_are_clipped(self, id_):

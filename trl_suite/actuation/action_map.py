@@ -81,7 +81,7 @@ class ActionMap:
             if action.dtype.kind not in 'fiubO':  # NumPy would turn dates and strings into numbers
                 raise ValueError(f'the type is {action.dtype}')
             action = action.astype(float, copy=False)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f'{are} not an array of numbers: {error}') from None
         if action.shape != shape:
             raise ValueError(f'{have} shape {action.shape}; expected {shape}')

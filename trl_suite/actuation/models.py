@@ -205,14 +205,14 @@ def _add_position(
             for joint, size in zip(joints, character.dofs, strict=True)
         ]).astype(float)  # fmt: skip
     else:
-        middle = np.array(action_offset)
+        middle = errors.floats('action_offset', action_offset)
     if action_scale is None:
         slide = np.ptp(character.joint_ranges, axis=1) / 2
         # Joints with a small range get the original's scale.
         original = ORIGINAL_SPAN * np.ptp(original_ranges(character), axis=1)
         turn = np.minimum(POSITION_SCALE, original)
         action_scale = _spread(character, np.where(character.prismatic, slide, turn))
-    reach = np.broadcast_to(np.asarray(action_scale, dtype=float), len(names)).copy()
+    reach = np.broadcast_to(errors.floats('action_scale', action_scale), len(names)).copy()
     if middle.shape != (len(names),) or not (
         np.all(reach > 0) and np.all(np.isfinite([middle, reach]))
     ):

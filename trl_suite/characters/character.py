@@ -12,7 +12,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 
-from trl_suite.util import resources
+from trl_suite.util import errors, resources
 
 GROUP_COLLISION = 3  # geom group of the collision boxes; group 0 has the visual geoms
 DIGITS = 6  # decimals of the values in a fingerprint
@@ -50,7 +50,8 @@ class Joint:
         for name in ('kp', 'kd', 'weight', 'armature', 'target', 'original_range'):
             value = getattr(self, name)
             least = -np.inf if name in ('target', 'original_range') else 0.0
-            if value is not None and not (np.isfinite(value).all() and np.min(value) >= least):
+            numbers = errors.floats(f'{name} of a joint', 0.0 if value is None else value)
+            if not (np.isfinite(numbers).all() and numbers.min() >= least):
                 expected = 'finite numbers' if least else 'a finite number, 0 or more'
                 raise ValueError(f'{name} of a joint is {value!r}; expected {expected}')
 

@@ -237,7 +237,7 @@ def _rotation(turn: Sequence[float]) -> np.ndarray:
     """Returns a unit quaternion."""
     try:
         found = np.array(turn, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.zeros(0)
     length = np.linalg.norm(found)
     if found.shape != (4,) or not 0 < length < np.inf:

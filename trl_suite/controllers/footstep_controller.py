@@ -70,7 +70,7 @@ class Controller:
         answer = self._function(observation)
         try:
             action = np.asarray(answer, dtype=float)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f'controller {self.name} does not return numbers: {error}') from None
         n, size = len(observation), self._size
         if action.ndim != 2 or len(action) != n or size not in (None, action.shape[1]):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import numbers
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from trl_suite.util import errors
 
 
 class OneThread:
@@ -35,7 +36,9 @@ def check_step_limit(value: Any) -> int | None:
     Raises:
       ValueError: it is neither None nor a positive integer.
     """
-    if value is not None and not (_is_number(value) and 1 <= value < np.inf and value % 1 == 0):
+    if value is not None and not (
+        errors.is_number(value) and 1 <= value < np.inf and value % 1 == 0
+    ):
         raise ValueError(f'step_limit is {value!r}; expected a positive integer or None')
     return None if value is None else int(value)
 
@@ -46,15 +49,11 @@ def check_time_limit(value: Any) -> float:
     Raises:
       ValueError: it is not a positive number.
     """
-    if not (_is_number(value) and value > 0):
+    if not (errors.is_number(value) and value > 0):
         raise ValueError(
             f'time_limit is {value!r}; expected a positive number of seconds, inf for no limit'
         )
     return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, (bool, np.bool_))
 
 
 def given_ids(env_ids: np.ndarray | Sequence[int] | None, num_envs: int) -> list[int]:

@@ -72,7 +72,7 @@ class Clip:
         for field in ('times', 'poses'):
             try:
                 array = np.array(getattr(self, field), dtype=float)  # a copy, made read-only
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise self._error(field, f'an array of numbers is needed ({error})') from None
             array.setflags(write=False)
             object.__setattr__(self, field, array)

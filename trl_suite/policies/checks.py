@@ -18,7 +18,7 @@ def array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         with np.errstate(over='ignore'):
             copied = np.array(value, dtype=np.float32, order='C')
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'{name}: an array of numbers is needed ({error})') from None
     if copied.shape != shape:
         raise ValueError(f'{name}: has shape {copied.shape}; expected {shape}')

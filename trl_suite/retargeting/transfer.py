@@ -126,7 +126,7 @@ def retarget(
         if (own.root, own.joints, own.sizes) == (layout.root, layout.joints, layout.sizes):
             return motion
     theirs, chosen = _joints(motion), counterparts(motion, layout.joints, joint_map)
-    if scale is not None and not 0 < scale < np.inf:
+    if scale is not None and not (errors.is_number(scale) and 0 < scale < np.inf):
         raise ValueError(f'scale is {scale}; expected a positive number')
     if isinstance(motion, Capture):
         path, turns = motion.positions, motion.rotations[:, theirs.index(chosen['root'])]

@@ -16,6 +16,7 @@ from dm_env import specs
 
 from trl_suite.actuation.action_map import ActionMap
 from trl_suite.engine import PhysicsWorld, World
+from trl_suite.util import errors
 from trl_suite.util.compiled import compiled
 
 MOST_SUBSTEPS = 1000  # physics steps per control step
@@ -355,13 +356,13 @@ def start_phases(
     if option is None:
         return lambda drawn: drawn
     if isinstance(option, numbers.Real):
-        phase = float(option)
+        phase = float(option) if errors.is_number(option) else np.nan
         if not 0 <= phase < 1:
             raise ValueError(f'start_phase is {option}; expected a number in [0, 1), or pairs')
         return lambda drawn: phase
     try:
         pairs = np.asarray(option, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pairs = np.empty(0)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs) or not (
         (np.diff(pairs, axis=1) > 0).all() and (np.diff(pairs.ravel()) >= 0).all()

@@ -2,6 +2,7 @@
 
 import collections.abc
 import difflib
+import math
 import numbers
 import types
 import typing
@@ -45,6 +46,29 @@ def _listed(names: list[str]) -> str:
     return f'{len(names)}, such as {", ".join(names[:: len(names) // 5])}'
 
 
+def is_number(value: object) -> bool:
+    """Whether a value is a real number that is not NaN, no bool, and not too large for a float."""
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        return not math.isnan(value)
+    except OverflowError:  # of whole numbers and fractions
+        return False
+
+
+def floats(name: str, value: Any) -> np.ndarray:
+    """Returns a new array of floats.
+
+    Raises:
+      ValueError: the value is no number or array of numbers, or has one that is too large for a float;
+        the message has the name.
+    """
+    try:
+        return np.array(value, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f'{name}: expected a number, or an array of numbers: {error}') from None
+
+
 def check_whole(name: str, value: object, low: int, high: int, why: str = '') -> None:
     """Checks that an argument is a whole number between two bounds.
 
@@ -57,8 +81,7 @@ def check_whole(name: str, value: object, low: int, high: int, why: str = '') ->
     Raises:
       ValueError: the value is not such a number; the message has the name and the bounds.
     """
-    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not number or value % 1 or not low <= value <= high:  # type: ignore[operator]
+    if not is_number(value) or value % 1 or not low <= value <= high:  # type: ignore[operator]
         raise ValueError(f'{name} is {value!r}; expected a whole number from {low} to {high}{why}')
 
 
@@ -101,9 +124,7 @@ def _choices(hint: object) -> tuple[object, ...]:
 
 def _fits(value: object, hint: object) -> bool:
     if hint in KINDS:
-        if not isinstance(value, KINDS[hint][0]) or value != value:  # NaN
-            return False
-        return hint is bool or not isinstance(value, bool)
+        return isinstance(value, KINDS[hint][0]) and (hint not in (int, float) or is_number(value))
     if typing.get_origin(hint) in (collections.abc.Sequence, collections.abc.Collection):
         (inner,) = typing.get_args(hint)
         # Bytes and mappings are iterable as well, but their elements are not the intended values; nor

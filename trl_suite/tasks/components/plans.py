@@ -111,7 +111,7 @@ def span(name: str, value: Any, unit: str) -> tuple[float, float]:
     """
     try:
         low, high = map(float, value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         low, high = np.nan, np.nan
     if not 0 <= low <= high < np.inf:
         raise ValueError(f'{name} is {value}; expected minimum and maximum, in {unit}')

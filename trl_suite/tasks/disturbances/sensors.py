@@ -72,7 +72,7 @@ class SensorConfig(Config):
             message = f'{where} is {value!r}; expected whole numbers of steps up to {MOST_DELAY}'
             try:
                 low, high = bounds(where, value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise ValueError(message) from None
             if low % 1 or high % 1 or not 0 <= low <= high <= MOST_DELAY:
                 raise ValueError(message)
