@@ -24,6 +24,7 @@ import torch
 from trl_suite.util import files
 
 FORMAT = b'trl_suite checkpoint 1\n'
+LARGEST = 2**32  # bytes
 # Globals in pickled arrays; `bytes` in empty ones.
 ARRAYS = [
     np.ndarray, np.dtype, np._core.multiarray._reconstruct, np._core.multiarray.scalar, codecs.encode,
@@ -60,12 +61,12 @@ def load(path: pathlib.Path) -> dict[str, Any]:
     """Returns the state in a checkpoint.
 
     Raises:
-      ValueError: the file is damaged, has another format, or contains other objects; the message has
-        its path.
+      ValueError: the file is too large or damaged, has another format, or contains other objects;
+        the message has its path.
     """
-    with path.open('rb') as file:
-        known = file.readline(len(FORMAT)) == FORMAT
-        digest, data = file.readline(66).strip(), file.read()
+    file = io.BytesIO(files.read_bytes(path, LARGEST))
+    known = file.readline(len(FORMAT)) == FORMAT
+    digest, data = file.readline(66).strip(), file.read()
     remedy = 'remove it to start again'
     if not known:
         raise ValueError(

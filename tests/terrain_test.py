@@ -393,8 +393,8 @@ class FileTest(parameterized.TestCase):
         self.assertEqual(terrain.load('mixed_humanoid').parameters(), mixed)
 
     @parameterized.named_parameters(
-        ('no_json', '{"Type": ', ['not a terrain file']),
-        ('nested', '[' * 100_000, ['not a terrain file']),
+        ('no_json', '{"Type": ', ['not JSON']),
+        ('nested', '[' * 100_000, ['not JSON']),
         ('no_object', '[]', ['Type and Params']),
         ('no_type', '{"Params": []}', ["'Type' is missing", 'var2d_gaps']),
         ('wrong_key', '{"Type": "var2d_gaps", "Parms": []}', ["'Parms'", "'Params'"]),
@@ -440,7 +440,7 @@ class FileTest(parameterized.TestCase):
     def test_files_that_are_not_utf8_are_rejected(self):
         path = self.write('')
         path.write_bytes(b'\xff\xfe\x00')
-        with self.assertRaisesRegex(ValueError, 'mine.json: not a terrain file'):
+        with self.assertRaisesRegex(ValueError, 'mine.json: not '):
             terrain.load(path)
 
     def test_other_sources(self):

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from trl_suite.characters.character import Character, CharacterSpec
-from trl_suite.util import resources
+from trl_suite.util import files, resources
 
 MOTOR_INERTIA = 0.01  # kg m^2, as the default armature of joints, which becomes that of the motor
 GEAR_INERTIA = 1e-4  # kg m^2; of what turns between play and spring
@@ -46,7 +46,7 @@ def divided(spec: CharacterSpec, backlash: float, flex: float, damping: float) -
     limits = dict(zip(spec.joints, character.torque_limits, strict=True))
     text = spec.xml
     if text is None:
-        text = (resources.directory('xml') / f'{spec.name}.xml').read_text(encoding='utf-8')
+        text = files.read_text(resources.directory('xml') / f'{spec.name}.xml')
     tree = ElementTree.fromstring(text)
     contact = tree.find('contact')
     if contact is None:

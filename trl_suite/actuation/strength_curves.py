@@ -21,14 +21,13 @@ and of `LEAST`, the factor where the cosine is smaller, which is outside the mea
 
 from __future__ import annotations
 
-import json
 import pathlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from trl_suite.util import errors
+from trl_suite.util import errors, files
 
 HUMAN = 'human'
 LEAST = 0.1
@@ -139,9 +138,9 @@ def load(given: Any, own: str | None, character: str, joints: tuple[str, ...]) -
 
 def _read(path: pathlib.Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding='utf-8'))
+        return files.read_json(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f'torque_pose: cannot read the table {str(path)!r}: {error}') from None
+        raise ValueError(f'torque_pose: cannot read the table: {error}') from None
 
 
 def _curve(joint: str, entry: Any) -> Curve:
@@ -151,7 +150,7 @@ def _curve(joint: str, entry: Any) -> Curve:
         raise ValueError(f'{owner} is {entry!r}; expected a dict with {", ".join(_FIELDS)}')
     try:
         angle, positive, negative = (np.array(entry[name], float) for name in _FIELDS)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f'{owner} is {entry!r}; expected lists of numbers') from None
     if angle.ndim != 1 or len(angle) < 2 or not angle.shape == positive.shape == negative.shape:
         raise ValueError(f'{owner}: expected lists of equal length, at least 2')

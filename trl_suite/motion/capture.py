@@ -28,6 +28,7 @@ from trl_suite.util.libraries import library
 BVH_UNIT = 0.01  # m; most files are in cm
 ACCLAIM_UNIT = 0.0254  # m; an inch, multiplied by the factor in the file
 ACCLAIM_RATE = 120.0  # frames per second of the CMU database; the files do not state the rate
+MOST_ROTATIONS = 2e7  # of a motion; frames need not name all bones
 _AXES = {'x': (1.0, 0.0, 0.0), 'y': (0.0, 1.0, 0.0), 'z': (0.0, 0.0, 1.0)}
 
 
@@ -76,6 +77,7 @@ def read_bvh(
     """
     path = existing(path)
     axes = frame(forward, up)
+    _check_positive('unit', unit, 'metres')
     text = read_text(path)
     _check_bvh(path, text)
     pybvh = library('pybvh', 'trl_suite[clips]')
@@ -133,10 +135,15 @@ def read_amc(
     """
     path, skeleton = existing(path), existing(skeleton)
     axes = frame(forward, up)
-    if not 0 < rate < np.inf:
-        raise ValueError(f'rate is {rate}; expected a positive number of frames per second')
+    _check_positive('rate', rate, 'frames per second')
+    _check_positive('unit', unit, 'metres')
     bones, length, degrees = _skeleton(skeleton)
     frames = _frames(path, bones)
+    if len(frames) * len(bones) > MOST_ROTATIONS:
+        raise ValueError(
+            f'{path}: {len(frames)} frames of {len(bones)} bones; expected no more than '
+            f'{MOST_ROTATIONS:g} rotations in all'
+        )
     times, names = np.arange(len(frames)) / rate, list(bones)
     radians = np.pi / 180 if degrees else 1.0
     offsets, local = np.zeros((len(bones), 3)), []
@@ -177,6 +184,11 @@ def frame(forward: str, up: str) -> np.ndarray:
     if abs(rows[0] @ rows[1]) > 0:
         raise ValueError(f'forward is {forward!r} and up {up!r}; expected two axes')
     return np.stack([rows[0], np.cross(rows[1], rows[0]), rows[1]])
+
+
+def _check_positive(name: str, value: object, unit: str) -> None:
+    if not (errors.is_number(value) and 0 < value < np.inf):  # type: ignore[operator]
+        raise ValueError(f'{name} is {value!r}; expected a positive number of {unit}')
 
 
 def _euler(order: str, angles: np.ndarray, intrinsic: bool) -> np.ndarray:
@@ -256,7 +268,7 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
     }
     root = bones['root']
     bone: dict[str, Any] | None = None
-    children: list[str] = []
+    named = {'root': None}  # in the order of the hierarchy
     section, length, degrees = '', 1.0, True
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split('#')[0].split()
@@ -302,20 +314,20 @@ def _skeleton(path: pathlib.Path) -> tuple[dict[str, dict[str, Any]], float, boo
                 elif key == 'dof':
                     bone['dof'] = _dofs(values)
             elif section == 'hierarchy' and key not in ('begin', 'end'):
-                if words[0] not in ('root', *children):
+                if words[0] not in named:
                     raise ValueError('a bone whose parent is not named above')
                 for child in values:
                     if child not in bones:
                         raise ValueError(errors.unknown('bone', child, bones))
-                    if child in ('root', *children):
+                    if child in named:
                         raise ValueError(f'{child!r} has a parent already')
                     bones[child]['parent'] = words[0]
-                    children.append(child)
+                    named[child] = None
         except ValueError as error:
             raise ValueError(f'{path}, line {number}: {line.strip()!r}: {error}') from None
-    if not root['dof'] or not children:
+    if not root['dof'] or len(named) < 2:
         raise ValueError(f'{path}: expected the sections :root and :hierarchy')
-    return {name: bones[name] for name in ('root', *children)}, length, degrees
+    return {name: bones[name] for name in named}, length, degrees
 
 
 def _number(values: Sequence[str], positive: bool = False) -> float:

@@ -38,10 +38,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.resources
 import json
-import math
-import numbers
 import os
-import pathlib
 import types
 from collections.abc import Mapping
 from typing import Any
@@ -50,8 +47,8 @@ from trl_suite.terrain.checks import check
 from trl_suite.terrain.planar.generators import GENERATORS
 from trl_suite.terrain.spatial.generators import GENERATORS3D
 from trl_suite.terrain.spatial.layout import GRID
-from trl_suite.util.errors import unknown
-from trl_suite.util.files import existing
+from trl_suite.util.errors import is_number, unknown
+from trl_suite.util.files import existing, read_json
 
 _UNUSED = ('GroundWidth', 'VertSpacingX', 'VertSpacingZ')
 
@@ -107,11 +104,7 @@ class Terrain:
         Raises:
           ValueError: terrain_level is not a number.
         """
-        if (
-            isinstance(terrain_level, bool)
-            or not isinstance(terrain_level, numbers.Real)
-            or math.isnan(terrain_level)
-        ):
+        if not is_number(terrain_level):
             raise ValueError(f'terrain_level must be a number, not {terrain_level!r}')
         defaults = _defaults(self.type)
         sets = [{**defaults, **values} for values in self.parameter_sets] or [dict(defaults)]
@@ -160,11 +153,11 @@ def _from_mapping(name: str, content: Mapping[str, Any]) -> Terrain:
 
 
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f'key {twice!r} is given twice')
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f'key {key!r} is given twice')
+        content[key] = value
     return content
 
 
@@ -195,11 +188,7 @@ def load(source: Terrain | str | os.PathLike[str] | Mapping[str, Any]) -> Terrai
         if name not in PRESETS and name not in PRESETS3D:
             raise ValueError(unknown('terrain', name, (*PRESETS, *PRESETS3D)))
         return PRESETS[name] if name in PRESETS else PRESETS3D[name]
-    try:
-        text = existing(name, (pathlib.Path(name).suffix.lower(),)).read_text(encoding='utf-8-sig')
-        content = json.loads(text, object_pairs_hook=_without_repetition)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f'{name}: not a terrain file in JSON: {error}') from error
+    content = read_json(existing(name), _without_repetition)
     if not isinstance(content, dict):
         raise ValueError(f'{name}: must hold a JSON object with keys Type and Params')
     return _from_mapping(name, content)

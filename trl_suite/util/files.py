@@ -1,4 +1,4 @@
-"""Checks of paths, and atomic writing of files."""
+"""Reading of strangers' files, checks of paths, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import contextlib
 import difflib
 import io
 import json
+import math
 import os
 import pathlib
 import secrets
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,17 @@ except ImportError:  # Windows has none
     fcntl = None  # type: ignore[assignment]
 
 Path = str | os.PathLike[str]
-LARGEST = 2**28  # bytes of a text, or of the arrays of an archive, 268 MB
+LARGEST = 2**28  # bytes of a file, or of the arrays of an archive, 268 MB
+MOST_EMPTY = 10**6  # elements of an array without content
 
 
 def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
     """Returns the path of a file to be written; checks it before a long computation starts.
 
     Raises:
-      ValueError: the suffix is not one of `suffixes`.
-      OSError: the folder does not exist or cannot be written, or the path is a folder.
+      ValueError: the suffix is not one of `suffixes`, or the path is a pipe or a device.
+      OSError: the folder does not exist or cannot be written, the path is a folder, or the system
+        does not accept the name.
     """
     path = pathlib.Path(path)
     _check_suffix(path, suffixes)
@@ -38,8 +41,19 @@ def check_path(path: Path, suffixes: tuple[str, ...]) -> pathlib.Path:
         raise FileNotFoundError(f'{path}: the folder {str(path.parent)!r} does not exist')
     if path.is_dir():
         raise IsADirectoryError(f'{path}: is a folder')
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f'{path}: the folder {str(path.parent)!r} cannot be written')
+    if path.exists():
+        _check_regular(path)
+    trial = _beside(path, 'test')
+    try:
+        trial.touch()
+        trial.unlink()
+    except PermissionError:
+        raise PermissionError(
+            f'{path}: the folder {str(path.parent)!r} cannot be written'
+        ) from None
+    except OSError as error:
+        error.filename = str(path)
+        raise
     return path
 
 
@@ -47,18 +61,26 @@ def existing(path: Path, suffixes: tuple[str, ...] | None = None) -> pathlib.Pat
     """Returns the path of an existing file.
 
     Raises:
-      ValueError: suffixes are given, and that of the path is not one of them.
+      ValueError: suffixes are given, and that of the path is not one of them; or it is not a
+        regular file.
       FileNotFoundError: there is no such file; the message has similar names in the same folder.
     """
     path = pathlib.Path(path)
     if suffixes is not None:
         _check_suffix(path, suffixes)
-    if not path.is_file():
+    if not path.exists():
         beside = [p.name for p in path.parent.glob('*')] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, beside, n=3, cutoff=0.5)
         hint = f'; did you mean {" or ".join(map(repr, near))}?' if near else ''
         raise FileNotFoundError(f'{path}: there is no such file{hint}')
+    _check_regular(path)
     return path
+
+
+def _check_regular(path: pathlib.Path) -> None:
+    """Refuses folders, pipes, sockets and devices; opening a pipe would wait for its other end."""
+    if not path.is_file():
+        raise ValueError(f'{path}: is a folder, a pipe or a device; expected a regular file')
 
 
 def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
@@ -69,7 +91,7 @@ def _check_suffix(path: pathlib.Path, suffixes: tuple[str, ...]) -> None:
 
 
 def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> None:
-    """Checks the size of a file before it is read.
+    """Checks a file before it is read.
 
     Args:
       path: path of the file.
@@ -77,9 +99,12 @@ def check_size(path: Path, largest: int = LARGEST, size: int | None = None) -> N
       size: size of the content, bytes, if it differs from that of the file.
 
     Raises:
-      ValueError: it is too large; the message names the file and both sizes.
+      ValueError: it is not a regular file, or too large; the message names the file and both sizes.
+      OSError: there is no such file.
     """
-    size = pathlib.Path(path).stat().st_size if size is None else size
+    if size is None:
+        size = pathlib.Path(path).stat().st_size
+        _check_regular(pathlib.Path(path))
     if size > largest:
         raise ValueError(
             f'{path}: has {size / 1e6:.0f} MB; expected no more than {largest / 1e6:.0f} MB'
@@ -106,22 +131,51 @@ def check_own(path: Path, status: os.stat_result) -> None:
         raise PermissionError(f'{path} can be written by other users')
 
 
-def load_arrays(path: Path) -> np.lib.npyio.NpzFile:
+def read_bytes(path: Path, largest: int = LARGEST) -> bytes:
+    """Returns the content of a file; errors are those of `check_size`."""
+    check_size(path, largest)
+    with open(path, 'rb') as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1)
+    if len(content) > size:  # as of those in /proc
+        raise ValueError(f'{path}: has more than its size; expected a regular file')
+    return content
+
+
+class Arrays(np.lib.npyio.NpzFile):
+    """An open archive; an array is read, and checked, when it is taken out by its name."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Returns an array.
+
+        Raises:
+          ValueError: the entry is not an array, or one that has more elements than bytes (of strings
+            without characters, or with an axis of length 0), whose lists would take all memory.
+        """
+        array = super().__getitem__(name)
+        if not isinstance(array, np.ndarray):
+            raise ValueError('is not an array')
+        if math.prod(max(n, 1) for n in array.shape) > max(array.nbytes, MOST_EMPTY):
+            raise ValueError(f'has shape {array.shape}, of type {array.dtype} without content')
+        return array
+
+
+def load_arrays(path: Path) -> Arrays:
     """Opens an archive of arrays (.npz) without pickled objects.
 
     Raises:
       ValueError: the file or its uncompressed content is too large, or it is not an archive.
       OSError: it cannot be read.
     """
-    check_size(path)
-    content = io.BytesIO(pathlib.Path(path).read_bytes())
+    content = io.BytesIO(read_bytes(path))
     try:
         with zipfile.ZipFile(content) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
     except zipfile.BadZipFile as error:
         raise ValueError(f'{path}: not an archive of arrays (.npz): {error}') from None
     check_size(path, size=size)
-    return np.load(content, allow_pickle=False)
+    content.seek(0)
+    return Arrays(content, allow_pickle=False)
 
 
 def read_text(path: Path) -> str:
@@ -131,17 +185,23 @@ def read_text(path: Path) -> str:
       ValueError: it is too large or not UTF-8; the message names the file and the byte.
       OSError: it cannot be read.
     """
-    check_size(path)
+    content = io.BytesIO(read_bytes(path))
     try:
-        return pathlib.Path(path).read_text(encoding='utf-8-sig')
+        return io.TextIOWrapper(content, encoding='utf-8-sig').read()
     except UnicodeDecodeError as error:
         raise ValueError(
             f'{path}: not text in UTF-8: {error.reason} at byte {error.start}'
         ) from None
 
 
-def read_json(path: Path) -> Any:
+def read_json(
+    path: Path, object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None
+) -> Any:
     """Returns the content of a JSON file.
+
+    Args:
+      path: path of the file.
+      object_pairs_hook: as for `json.loads`; a ValueError that it raises names the file.
 
     Raises:
       ValueError: it is not JSON, or nested too deeply; the message names the file.
@@ -149,7 +209,7 @@ def read_json(path: Path) -> Any:
     """
     text = read_text(path)
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=object_pairs_hook)
     except RecursionError:
         raise ValueError(f'{path}: not JSON: nested too deeply') from None
     except ValueError as error:  # also raised for integers with too many digits
@@ -164,9 +224,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
       OSError: any that is raised inside; the path is added if the error has none, as for errors of
         `write`.
     """
-    # Processes on other machines or in other containers may have the same number.
-    number = f'{os.getpid()}-{secrets.token_hex(4)}'
-    part = path.with_name(f'.{path.stem}.{number}.part{path.suffix}')
+    part = _beside(path, 'part')
     try:
         yield part
         os.replace(part, path)
@@ -176,6 +234,13 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
         raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def _beside(path: pathlib.Path, kind: str) -> pathlib.Path:
+    """Returns a temporary name; its suffix is in lower case, as libraries that write files need it."""
+    # Processes on other machines or in other containers may have the same number.
+    number = f'{os.getpid()}-{secrets.token_hex(4)}'
+    return path.with_name(f'.{path.stem}.{number}.{kind}{path.suffix.lower()}')
 
 
 def replace_between(path: pathlib.Path, begin: str, end: str, text: str) -> None:
