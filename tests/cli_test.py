@@ -590,6 +590,10 @@ class RolloutTest(CommandTest):
         ("'randomize' is not NAME=JSON, such as randomize=robot", GAPS, '--option', 'randomize'),
         ('is not JSON', GAPS, '--option', 'sensors={"noise": 0.1'),
         ("did you mean 'randomize'", GAPS, '--option', 'randomise=robot'),
+        ('controller is 1', 'PD_Biped3D_HLC_Soccer-v0', '--option', 'controller=1'),
+        ('terrain_level is 9', GAPS, '--option', f'terrain_level={"9" * 400}'),
+        ('is not JSON', GAPS, '--option', f'sensors={"[" * 100_000}'),
+        ('File name too long', GAPS, '--video', f'{"a" * 250}.mp4'),
     )  # fmt: skip
     def test_errors_leave_no_files(self, message, *arguments):
         self.assert_refused(message, 'rollout', *arguments)

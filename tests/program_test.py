@@ -62,5 +62,14 @@ class SignalTest(parameterized.TestCase):
         self.assertEqual(freed, [True])
 
 
+class MessageTest(parameterized.TestCase):
+    @parameterized.parameters(
+        ('a\nb  c', 'a b c'), ('\x1b]0;title\x07', r'\x1b]0;title\x07'), ('\u202egnp', r'\u202egnp'),
+        ('\udce4 ä', r'\udce4 ä'), ('x' * 10**6, f'{"x" * 1000} ... {"x" * 1000}'),
+    )  # fmt: skip
+    def test_a_message_is_one_short_line_without_controls(self, message, line):
+        self.assertEqual(program.in_one_line(ValueError(message)), line)
+
+
 if __name__ == '__main__':
     absltest.main()

@@ -104,6 +104,12 @@ class MetricsTest(parameterized.TestCase):
         scores[2, :2] = 1.0
         self.assertLess(sequences.forgetting(scores), 0)
 
+    def test_scores_whose_metrics_would_be_infinite(self):
+        with self.assertRaisesRegex(ValueError, 'scores: expected numbers of at most 1e.100'):
+            sequences.metrics(np.full((3, 3), -1e308), [0.0] * 3)
+        with self.assertRaisesRegex(ValueError, 'initial: expected numbers of at most 1e.100'):
+            sequences.metrics(self.SCORES, [0.0, 1e308, 0.0])
+
     def test_values_that_are_not_needed_may_be_missing(self):
         scores = np.array(self.SCORES)
         scores[np.triu_indices(3, 1)] = np.nan
@@ -515,6 +521,12 @@ class CommandTest(cli_test.CommandTest):
         self.assertEqual(np.sum(result['samples']), 5 * 4)
         out = self.output('sequences', 'check', 'result.json')
         self.assertRegex(out, 'my_learner:Nothing, plaid_biped.*not comparable: budget is 100, not')
+        result['learner'] = '\x1b]0;title\x07a\nvalid and comparable'
+        result['digest'] = sequences.results.digest(result)
+        pathlib.Path('forged.json').write_text(json.dumps(result))
+        out = self.output('sequences', 'check', 'forged.json')
+        self.assertStartsWith(out, r'forged.json: \x1b]0;title\x07a\nvalid and comparable, plaid')
+        self.assertEqual(out.count('\n'), 1)
         text = pathlib.Path('result.json').read_text()
         pathlib.Path('edited.json').write_text(text.replace('"budget": 100', '"budget": 101'))
         self.assert_refused(
@@ -524,6 +536,11 @@ class CommandTest(cli_test.CommandTest):
             "unknown learner of the module my_learner: 'Nothin'; did you mean 'Nothing'",
             'sequences', 'run', 'plaid_biped', '--learner', 'my_learner:Nothin',
         )  # fmt: skip
+        for other in ('.a:C', 'a..b:C', 'a b:C'):
+            self.assert_refused(
+                f"--learner is '{other}'; expected module:Class", 'sequences', 'run', 'plaid_biped',
+                '--learner', other,
+            )  # fmt: skip
         for other in ('os:path', 'pathlib:Path'):
             self.assert_refused(
                 f"--learner is '{other}', which has no train and policy; expected a class",

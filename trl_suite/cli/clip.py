@@ -7,7 +7,7 @@ import pathlib
 
 from trl_suite import rendering
 from trl_suite.cli import engine
-from trl_suite.util import files
+from trl_suite.util import files, program
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -35,13 +35,14 @@ def run(arguments: argparse.Namespace) -> None:
         joints = KinematicViewer(name).layout.joints
         followed = retargeting.counterparts(motion, joints, chosen)
         still = [joint for joint in joints if joint not in followed]
-        print('joints:', ', '.join(f'{own} from {other}' for own, other in followed.items()))
+        pairs = ', '.join(f'{own} from {other}' for own, other in followed.items())
+        print(f'joints: {program.printable(pairs)}')
         if still:
             print('joints without a counterpart:', ', '.join(still))
     if arguments.cycle is not None:
         clip = retargeting.cycle(clip, *arguments.cycle)
     report = clip_check.check(clip, name)
-    print(report)
+    print(*map(program.printable, str(report).splitlines()), sep='\n')
     for fault in report.faults if arguments.frames else ():
         print(
             f'frame {fault.frame}, {fault.time:.3f} s: {fault.kind}, {fault.name}, '

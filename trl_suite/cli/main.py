@@ -52,9 +52,10 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
       The exit status: 0; 1 if a check of `doctor` or a picture failed; 2 after an error, with one
       line on stderr; 130 after an interrupt, 143 after SIGTERM.
     """
+    arguments = argparse.Namespace()
     try:
         with program.terminable():
-            arguments = _parser(prog).parse_args(argv)
+            _parser(prog).parse_args(argv, arguments)
             if sys.stdout is None:
                 raise OSError('standard output is closed')
             command = engine.load(f'trl_suite.cli.{arguments.command}')
@@ -70,7 +71,10 @@ def main(argv: Sequence[str] | None = None, prog: str = 'trl-suite') -> int:
     except KeyboardInterrupt:
         print('trl-suite: interrupted', file=sys.stderr)
         return 130
-    except program.EXPECTED as error:
+    except (*program.EXPECTED, TypeError) as error:
+        # Values of --option may have any type; without one, this is a defect.
+        if isinstance(error, TypeError) and not getattr(arguments, 'options', None):
+            raise
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _drop_output()
         print(f'trl-suite: error: {program.in_one_line(error)}', file=sys.stderr)
@@ -354,7 +358,7 @@ def _option(text: str) -> tuple[str, object]:
         raise argparse.ArgumentTypeError(f'{text!r} is not NAME=JSON, such as randomize=robot')
     try:
         return name, json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         if value[:1] in ('{', '[', '"'):
             raise argparse.ArgumentTypeError(f'the value of {text!r} is not JSON') from None
         return name, value

@@ -9,7 +9,7 @@ import sys
 from typing import Any
 
 from trl_suite.cli import engine
-from trl_suite.util import errors
+from trl_suite.util import errors, program
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -44,10 +44,11 @@ def _check(arguments: argparse.Namespace) -> None:
         result = sequences.read(path)
         notes = sequences.departures(result)
         comparable = f'not comparable: {"; ".join(notes)}' if notes else 'valid and comparable'
-        print(
+        line = (
             f'{path}: {result["learner"]}, {result["sequence"]}, budget {result["budget"]}, seed '
             f'{result["seed"]}: {comparable}'
         )
+        print(program.printable(line))
 
 
 def _budget(text: str, budgets: dict[str, int]) -> int:
@@ -62,7 +63,7 @@ def _budget(text: str, budgets: dict[str, int]) -> int:
 def _learner(text: str) -> Any:
     """Returns a class by 'module:Class'; the current folder is searched first."""
     module, _, name = text.partition(':')
-    if not (module and name):
+    if not (name and all(part.isidentifier() for part in module.split('.'))):
         raise ValueError(f'--learner is {text!r}; expected module:Class')
     sys.path.insert(0, os.getcwd())
     found = importlib.import_module(module)

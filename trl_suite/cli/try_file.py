@@ -10,7 +10,7 @@ import numpy as np
 
 from trl_suite import rendering
 from trl_suite.cli import engine
-from trl_suite.util import files, tables
+from trl_suite.util import files, program, tables
 
 if TYPE_CHECKING:
     from trl_suite.characters import CharacterSpec
@@ -64,7 +64,7 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
     kinds = [joint.type or 'hinge' for joint in character.joints]
     joints = zip(spec.joints.items(), kinds, character.torque_limits, strict=True)
     lines = [
-        f'{spec.name}: {"three-dimensional" if spec.spatial else "planar"}, '
+        f'{program.printable(spec.name)}: {"three-dimensional" if spec.spatial else "planar"}, '
         f'{model.body_mass[own].sum():.4g} kg, {high[2] - low[2]:.3g} m high, '
         f'{high[0] - low[0]:.3g} m along x (ahead), {high[1] - low[1]:.3g} m along y (to the left)',
         f'facing: {looks}; expected along [1, 0]',
@@ -80,7 +80,7 @@ def _report(spec: CharacterSpec, environment: Environment) -> str:
                 for (name, joint), kind, limit in joints
             ),
         ),
-        *(f'note: {note}' for note in spec.notes),
+        *(program.printable(f'note: {note}') for note in spec.notes),
     ]
     return '\n'.join(lines)
 

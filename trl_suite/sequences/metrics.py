@@ -13,6 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trl_suite.util import errors
+
+LARGEST = 1e100  # score; sums and differences of larger ones may be infinite
+
 
 def average_performance(scores: ArrayLike) -> float:
     """Mean score over all tasks after the last stage (Lopez-Paz & Ranzato 2017, ACC).
@@ -23,7 +27,8 @@ def average_performance(scores: ArrayLike) -> float:
       scores: R, (T, T); entries that a metric does not use may be NaN.
 
     Raises:
-      ValueError: R is not square, has fewer than two tasks, or an entry that is used is not finite.
+      ValueError: R is not square, has fewer than two tasks, or an entry that is used is not finite;
+        or any entry is larger than `LARGEST`.
     """
     return _mean(_matrix(scores)[-1])
 
@@ -54,7 +59,7 @@ def forward_transfer(scores: ArrayLike, initial: ArrayLike) -> float:
       scores: R.
       initial: scores before any training, (T,).
     """
-    found, begin = _matrix(scores), np.asarray(initial, float)
+    found, begin = _matrix(scores), _numbers('initial', initial)
     if begin.shape != found.shape[:1]:
         raise ValueError(f'initial: shape is {begin.shape}; expected {found.shape[:1]}')
     return _mean(np.diag(found, 1) - begin[1:])
@@ -107,9 +112,16 @@ def learning_transfer(curve: ArrayLike, reference: ArrayLike) -> float:
 
 
 def _matrix(scores: ArrayLike) -> np.ndarray:
-    found = np.asarray(scores, float)
+    found = _numbers('scores', scores)
     if found.ndim != 2 or found.shape[0] != found.shape[1] or len(found) < 2:
         raise ValueError(f'scores: shape is {found.shape}; expected (T, T) with T >= 2')
+    return found
+
+
+def _numbers(name: str, values: ArrayLike) -> np.ndarray:
+    found = errors.floats(name, values)
+    if (np.abs(found) > LARGEST).any():
+        raise ValueError(f'{name}: expected numbers of at most {LARGEST:g}')
     return found
 
 

@@ -13,15 +13,23 @@ from types import TracebackType
 
 # Exceptions that users can cause. Any other one is a defect, and its traceback is printed.
 EXPECTED = (ValueError, ImportError, RuntimeError, OSError)
+LONGEST = 2000  # characters of a message
 
 
 class Terminated(KeyboardInterrupt):
     """Raised by SIGTERM: unfinished files are removed, as after an interrupt."""
 
 
-def in_one_line(error: BaseException) -> str:
-    """Returns the message of an error in one line."""
-    return ' '.join(str(error).split())
+def printable(text: object) -> str:
+    """Returns a text with escapes for line breaks and for what a terminal would obey."""
+    return ''.join(each if each.isprintable() else ascii(each)[1:-1] for each in str(text))
+
+
+def in_one_line(error: object) -> str:
+    """Returns the message of an error in one line of at most `LONGEST` characters."""
+    line = printable(' '.join(str(error).split()))
+    half = LONGEST // 2
+    return line if len(line) <= LONGEST else f'{line[:half]} ... {line[-half:]}'
 
 
 @contextlib.contextmanager
