@@ -348,6 +348,11 @@ class VideoTest(FolderTest):
             rendering.video(frames, self.folder / name)
         self.assert_only()
 
+    @parameterized.parameters('12:30.mp4', '-a%d.MP4', 'http:a.GIF')
+    def test_names_with_a_meaning_for_ffmpeg_or_in_capitals(self, name):
+        rendering.video(numbered(2), self.folder / name)
+        self.assert_only(name)
+
     def test_invalid_rates_are_rejected(self):
         with self.assertRaisesRegex(ValueError, 'fps is 0'):
             rendering.video(numbered(2), self.folder / 'a.mp4', fps=0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tqdm
 
-from trl_suite.util import interrupts
+from trl_suite.util import errors, interrupts
 from trl_suite.util.files import Path, check_path, replacing
 from trl_suite.util.libraries import library
 
@@ -53,11 +53,12 @@ class Video:
 
     def __init__(self, path: Path, fps: float = CONTROL_FPS) -> None:
         self._path = check_path(path, VIDEO_SUFFIXES)
-        if not 0 < fps < np.inf:
+        if not (errors.is_number(fps) and 0 < fps < np.inf):
             raise ValueError(f'fps is {fps}; expected a positive number')
         self._fps = fps
         self._images: list[Any] = []  # of a .gif
-        module = 'imageio_ffmpeg' if self._path.suffix == '.mp4' else 'PIL.Image'
+        self._h264 = self._path.suffix.lower() == '.mp4'
+        module = 'imageio_ffmpeg' if self._h264 else 'PIL.Image'
         self._library = library(module, 'trl_suite[video]')
         self._shape: tuple[int, ...] | None = None
         self._files = contextlib.ExitStack()
@@ -71,7 +72,7 @@ class Video:
         image = check_image(image)
         if self._shape is None:
             self._shape = image.shape
-            if self._path.suffix == '.mp4' and (image.shape[0] % 2 or image.shape[1] % 2):
+            if self._h264 and (image.shape[0] % 2 or image.shape[1] % 2):
                 raise ValueError(
                     f'{self._path}: frames are {image.shape[1]}x{image.shape[0]} pixels; h264 needs '
                     'even numbers'
@@ -80,7 +81,7 @@ class Video:
             raise ValueError(
                 f'{self._path}: a frame has shape {image.shape}, those before it {self._shape}'
             )
-        if self._path.suffix != '.mp4':
+        if not self._h264:
             self._images.append(self._library.fromarray(image))
             return
         if self._encoder is None:
@@ -97,7 +98,7 @@ class Video:
         command = [
             self._library.get_ffmpeg_exe(), '-y', '-loglevel', 'error', '-f', 'rawvideo', '-pix_fmt', 'rgb24',
             '-s', f'{width}x{height}', '-r', str(self._fps), '-i', '-', '-c:v', 'libx264', '-pix_fmt',
-            'yuv420p', '-crf', '15', str(self._part),
+            'yuv420p', '-crf', '15', f'file:{self._part}',  # a name with a colon is no address
         ]  # fmt: skip
         # An interrupt between the start and the return would leave an encoder that nobody ends, and
         # that creates the file after it was removed.
