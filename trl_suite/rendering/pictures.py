@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tqdm
 
 from trl_suite import terrain as terrains
 from trl_suite.rendering.video import check_image
@@ -126,7 +127,8 @@ def _plot_profiles(
     seed: int,
     terrain_level: float,
 ) -> None:
-    panels = figure.subplots(draws, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    # Panels that share axes take time that grows with the square of their number.
+    panels = figure.subplots(draws, 1, squeeze=False)[:, 0]
     first = round(-2 / terrains.SPACING)
     count = round(length / terrains.SPACING) - first + 1
     x = (first + np.arange(count)) * terrains.SPACING
@@ -142,10 +144,9 @@ def _plot_profiles(
         panel.fill_between(x, heights, low - room, color='0.75', linewidth=0)
         panel.plot(x, heights, color='0.2', linewidth=1)
         panel.axvline(0, color='tab:red', linewidth=0.8, linestyle=':')  # start of episodes
-        panel.set_ylabel('z (m)')
-    panels[0].set(
-        xlim=(x[0], x[-1]), ylim=(low - room, high + room), title=f'{terrain.name} ({terrain.type})'
-    )
+        panel.set(xlim=(x[0], x[-1]), ylim=(low - room, high + room), ylabel='z (m)')
+        panel.tick_params(labelbottom=panel is panels[-1])
+    panels[0].set_title(f'{terrain.name} ({terrain.type})')
     panels[-1].set_xlabel('x (m)')
 
 
@@ -157,12 +158,12 @@ def _plot_maps(
     seed: int,
     terrain_level: float,
 ) -> None:
-    panels = figure.subplots(1, draws, sharex=True, sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, draws, squeeze=False)[0]
     count = min(MAP_POINTS, max(2, round(length / (0.25 * terrains.GRID))))
     # Centres of pixels.
     places = ((np.arange(count) + 0.5) / count - 0.5) * length
     maps, starts = [], []
-    for i in range(draws):
+    for i in tqdm.tqdm(range(draws), unit='map', delay=1, disable=None):
         sequence = np.random.SeedSequence((seed, i))
         ground = terrains.SpatialGround(terrain, sequence, terrain_level=terrain_level)
         starts.append(ground.spawn(np.random.default_rng(sequence)))
@@ -183,6 +184,7 @@ def _plot_maps(
             arrowprops={'arrowstyle': '->', 'color': 'tab:red', 'linewidth': 1.5},
         )  # fmt: skip
         panel.set_xlabel('x (m)')
+        panel.tick_params(labelleft=panel is panels[0])
     panels[0].set_ylabel('y (m)')
     figure.suptitle(f'{terrain.name} ({terrain.type})')
     figure.colorbar(image, ax=list(panels), label='z (m)')
