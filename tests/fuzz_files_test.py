@@ -1,9 +1,11 @@
-"""Files from strangers: whatever is done to a valid file, it is read, or refused by name.
+"""Files from strangers: whatever is in a file, it is read, or refused by name.
 
-Hypothesis changes valid files of every format. The fast tests always make the same changes; the slow ones
+Hypothesis changes valid files of every format, and writes pictures and meshes with any header, numbers
+and references to other files, which must not be opened. The fast tests always make the same changes; the slow ones
 (`-m slow`) draw a seed, print it, and take it from FUZZ_SEED if that is set; FUZZ_EXAMPLES says how many.
 """
 
+import base64
 import dataclasses
 import io
 import json
@@ -11,8 +13,11 @@ import os
 import pathlib
 import random
 import re
+import struct
+import sys
 import tempfile
 import warnings
+import zlib
 
 import hypothesis
 import imageio.v3 as iio
@@ -107,6 +112,160 @@ def changed_archive(draw, whole):
     return content.getvalue()
 
 
+SIZES = (0, 1, 2, 3, 4, 8, 16, 255, 2**15, 65535, 2**16, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
+ELSEWHERE = ('/etc/hostname', '../up.bin', 'secret', 'fifo', '.', '..', 'http://localhost:1/a', '')
+NUMBERS = ('0', '1', '-1', '2', '3', '1e3', '1e308', '-1e309', 'nan', '9' * 30, 'x', '')
+POSTSCRIPT = b'%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n'
+
+
+def likely(good, others):
+    """Mostly the first, so that some files are valid."""
+    return st.one_of(st.just(good), st.just(good), st.sampled_from(others))
+
+
+@st.composite
+def picture(draw, suffixes=('png', 'tif', 'tiff', 'bmp', 'jpg', 'jpeg')):
+    """A suffix, and a picture of any format, which may be another one."""
+    size = likely(3, SIZES)
+    width, height, depth, kind = (
+        draw(size),
+        draw(size),
+        draw(likely(8, SIZES)),
+        draw(likely(0, SIZES)),
+    )
+    data = draw(st.one_of(st.just(bytes(40)), st.binary(max_size=60)))
+
+    def chunk(name, content):
+        return struct.pack('>I', len(content)) + name + content + struct.pack(
+            '>I', zlib.crc32(name + content)
+        )  # fmt: skip
+
+    def entry(tag, value):
+        return struct.pack(
+            '<HHII', tag, draw(likely(4, (1, 2, 3, 12))), draw(likely(1, SIZES)), value
+        )
+
+    png = b'\x89PNG\r\n\x1a\n' + chunk(
+        b'IHDR', struct.pack('>IIBBBBB', width, height, depth % 256, kind % 256, 0, 0, 0)
+    )
+    png += chunk(b'IDAT', zlib.compress(data)) + chunk(b'IEND', b'')
+    bmp = b'BM' + struct.pack('<IIIIiiHHIIIIII', 54, 0, 54, 40, width % 2**31, height % 2**31, 1,
+                              depth % 2**16, kind, len(data), 0, 0, 0, 0) + data  # fmt: skip
+    tags = ((256, width), (257, height), (258, depth), (259, draw(likely(1, (2, 5, 7, 8, 32773)))),
+            (262, kind), (273, draw(likely(8, SIZES))), (278, height), (279, draw(size)))  # fmt: skip
+    tiff = b'II*\0' + struct.pack('<I', 8 + len(data)) + data + struct.pack('<H', len(tags))
+    tiff += b''.join(entry(*tag) for tag in tags) + bytes(4)
+    jpeg = io.BytesIO()
+    iio.imwrite(jpeg, np.zeros((8, 8, 3), np.uint8), extension='.jpg')
+    jpeg = re.sub(
+        rb'(\xff\xc0..\x08)....', lambda found: found[1] + struct.pack('>HH', height % 2**16, width % 2**16),
+        jpeg.getvalue(), flags=re.DOTALL,
+    )  # fmt: skip
+    other = draw(
+        st.sampled_from((POSTSCRIPT, b'GIF89a', b'P6 9 9 255 ', b'RIFF', b'\x00\x00\x01\x00', b''))
+    )
+    formats = {'png': png, 'bmp': bmp, 'tif': tiff, 'tiff': tiff, 'jpg': jpeg, 'jpeg': jpeg}
+    suffix = draw(st.sampled_from(suffixes))
+    return suffix, draw(likely(formats[suffix], (*formats.values(), other + data)))
+
+
+@st.composite
+def scene(draw):
+    """A glTF scene that may name other files, and refer to itself."""
+    data = np.array([[-9, 0, -9], [9, 0, -9], [0, 0, 9]], '<f4').tobytes()
+    size, index = likely(3, (*SIZES, -1)), likely(0, (1, 2, -1, 2**31))
+    inside = 'data:application/octet-stream;base64,' + base64.b64encode(data).decode()
+    tree = {
+        'asset': {'version': '2.0'},
+        'buffers': [{'uri': draw(likely(inside, (*ELSEWHERE, 'own.bin'))), 'byteLength': 36}],
+        'bufferViews': [{'buffer': draw(index), 'byteLength': draw(likely(36, SIZES))}],
+        'accessors': [
+            {'bufferView': draw(index), 'componentType': draw(likely(5126, (5125, 5121, 0))),
+             'count': draw(size), 'type': draw(likely('VEC3', ('SCALAR', 'MAT4', 'x')))}
+        ],
+        'images': [{'uri': draw(st.sampled_from(ELSEWHERE))}],
+        'textures': [{'source': 0}],
+        'materials': [{'pbrMetallicRoughness': {'baseColorTexture': {'index': 0}}}],
+        'meshes': [
+            {'primitives': draw(st.integers(1, 3)) * [
+                {'attributes': {'POSITION': draw(index)}, 'material': 0, 'mode': draw(likely(4, (0, 1, 5)))}
+            ]}
+        ],
+        'nodes': [
+            {'mesh': draw(index), 'children': draw(likely([1], ([], [0], [1, 1], [9])))},
+            {'mesh': 0, 'scale': draw(likely([1, 1, 1], ([0, 0, 0], [1e308] * 3, [1])))},
+        ],
+        'scenes': [{'nodes': [draw(index)]}],
+    }  # fmt: skip
+    if draw(st.booleans()):
+        del tree[draw(st.sampled_from(sorted(tree)))]
+    return json.dumps(tree).encode()
+
+
+@st.composite
+def solid(draw):
+    """A suffix, and a mesh of any format that may name other files."""
+    number, word = likely('1', NUMBERS), st.sampled_from(ELSEWHERE)
+    three = [f'{draw(number)} {draw(number)} {draw(number)}' for _ in range(3)]
+    triangle = [f'{x} {y} {z}' for x, y, z in ((-9, -9, 0), (9, -9, 0), (0, 9, 1))]
+    points = draw(st.one_of(st.just(triangle), st.just(three)))
+    face, count = draw(likely('1/1 2/2 3/3', three)), draw(likely(3, SIZES))
+    obj = [
+        f'mtllib {draw(word)}',
+        'usemtl a',
+        *(f'v {point}' for point in points),
+        'vt 0 0',
+        f'f {face}',
+    ]
+    kind, data = draw(likely('float', ('uchar', 'x'))), draw(st.binary(max_size=40))
+    head = [
+        'ply', f'format {draw(likely("ascii", ("binary_little_endian", "binary_big_endian", "x")))} 1.0',
+        f'comment TextureFile {draw(word)}', f'element vertex {count}',
+        *(f'property {kind} {axis}' for axis in 'xyz'), f'element face {draw(likely(1, SIZES))}',
+        f'property list {draw(likely("uchar", ("uint", "x")))} int vertex_indices', 'end_header',
+    ]  # fmt: skip
+    ply = '\n'.join([*head, *points, draw(likely('3 0 1 2', three)), '']).encode() + data
+    if draw(st.booleans()):
+        stl = bytes(80) + struct.pack('<I', count) + draw(likely(bytes(50), (data,)))
+    else:
+        stl = '\n'.join(
+            ['solid', *(f'vertex {point}' for point in points), 'endsolid', '']
+        ).encode()
+    tree = draw(scene())
+    glb = b'glTF' + struct.pack(
+        '<IIII', 2, 20 + len(tree), draw(likely(len(tree), SIZES)), 0x4E4F534A
+    )
+    lines = draw(st.one_of(st.just(obj), st.permutations(obj)))
+    contents = {
+        'obj': '\n'.join(lines).encode(),
+        'ply': ply,
+        'stl': stl,
+        'gltf': tree,
+        'glb': glb + tree,
+    }
+    suffix = draw(st.sampled_from(sorted(contents)))
+    return suffix, draw(likely(contents[suffix], (*contents.values(), POSTSCRIPT)))
+
+
+class Audit:
+    """Collects what Python opens, starts and connects to inside the context."""
+
+    def __init__(self):
+        self.on, self.events = False, []
+        sys.addaudithook(self._add)  # stays for ever
+
+    def _add(self, event, arguments):
+        if self.on and event in ('open', 'subprocess.Popen', 'os.system', 'socket.connect'):
+            self.events.append((event, str(arguments[0])))
+
+    def __enter__(self):
+        self.on, self.events = True, []
+        return self.events
+
+    def __exit__(self, *error):
+        self.on = False
+
+
 def character(path, **options):
     """Reads a character; what is accepted can be compiled."""
     row = characters.from_file(path, **options)
@@ -144,7 +303,7 @@ def ground(path):
 
 def surface(path):
     """Reads a mesh or a picture; its heights are finite."""
-    if path.suffix == '.png':
+    if path.suffix in terrain.custom.IMAGES:
         made = terrain.from_image(path, 0.5)
     else:
         made = terrain.from_mesh(path, 0.5)
@@ -252,6 +411,69 @@ class FuzzTest(parameterized.TestCase):
 
         run()
 
+    def check_written(self, make, settings):
+        for name in ('secret', 'own.bin'):
+            (self.folder / name).write_bytes(POSTSCRIPT)
+        if not (self.folder / 'fifo').exists():
+            os.mkfifo(self.folder / 'fifo')
+        surface(self.folder / 'hill.png')  # what Pillow and trimesh import, they open before
+        surface(self.folder / 'hill.obj')
+        audit = Audit()
+
+        @settings
+        @hypothesis.given(make())
+        def run(written):
+            suffix, content = written
+            path = self.folder / f'written.{suffix}'
+            path.write_bytes(content)
+            with audit as events:
+                try:
+                    surface(path)
+                except ValueError as error:
+                    self.assertIn(path.name, str(error))
+            own = {('open', str(self.folder / name)) for name in (path.name, 'own.bin', 'secret')}
+            own = own if suffix in ('gltf', 'glb') else {('open', str(path))}
+            imported = sys.prefix, sys.base_prefix
+            strange = {each for each in events if not each[1].startswith(imported)} - own
+            self.assertEmpty(strange)
+
+        run()
+
+    @parameterized.parameters(picture, solid)
+    def test_written_files(self, make):
+        self.check_written(
+            make, hypothesis.settings(max_examples=5 * FAST, derandomize=True, **COMMON)
+        )
+
+    @parameterized.parameters(picture, solid)
+    @pytest.mark.slow
+    def test_many_written_files(self, make):
+        settings = hypothesis.settings(max_examples=SLOW, **COMMON)
+        self.check_written(make, lambda test: hypothesis.seed(self.seed())(settings(test)))
+
+    def seed(self):
+        seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
+        print(f'FUZZ_SEED={seed}', flush=True)
+        return seed
+
+    @parameterized.parameters(
+        *((POSTSCRIPT, suffix) for suffix in terrain.custom.IMAGES),
+        (b'mtllib a.mtl\nusemtl a\nv -1 -1 0\nv 1 -1 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n', '.obj'),
+    )
+    def test_nothing_starts_ghostscript(self, content, suffix):
+        """Pillow recognises formats by their content, and starts another program for PostScript."""
+        folder = pathlib.Path(self.enterContext(tempfile.TemporaryDirectory()))
+        (folder / 'a.png').write_bytes(POSTSCRIPT)
+        (folder / 'a.mtl').write_text('newmtl a\nmap_Kd a.png\n')
+        (folder / f'hill{suffix}').write_bytes(content)
+        with Audit() as events:
+            try:
+                surface(folder / f'hill{suffix}')
+            except ValueError as error:
+                self.assertIn(f'hill{suffix}: cannot be read as', str(error))
+        mine = [name for event, name in events if event != 'open' or str(folder) in name]
+        self.assertLen(mine, 1)  # the file itself
+
     @parameterized.parameters(*FORMATS)
     def test_changed_files(self, name):
         self.check(name, hypothesis.settings(max_examples=FAST, derandomize=True, **COMMON))
@@ -259,10 +481,8 @@ class FuzzTest(parameterized.TestCase):
     @parameterized.parameters(*FORMATS)
     @pytest.mark.slow
     def test_many_changed_files(self, name):
-        seed = int(os.environ.get('FUZZ_SEED', random.SystemRandom().randrange(2**32)))
-        print(f'FUZZ_SEED={seed}', flush=True)
         settings = hypothesis.settings(max_examples=SLOW, **COMMON)
-        self.check(name, lambda test: hypothesis.seed(seed)(settings(test)))
+        self.check(name, lambda test: hypothesis.seed(self.seed())(settings(test)))
 
 
 if __name__ == '__main__':

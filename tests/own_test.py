@@ -568,7 +568,7 @@ class TerrainTest(Folder):
         ('no_mesh', lambda f: terrain.from_mesh(f / 'broken.obj'), 'not a mesh'),
         ('plane_mesh', lambda f: terrain.from_mesh(f / 'plane.obj'), 'not a mesh: .*without three coordinates'),
         ('far', lambda f: terrain.from_mesh(f / 'away.stl', scale=1e7), r'reaches 9.5e\+07 m; expected no more than 1e\+06'),
-        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'not a picture that can be read'),
+        ('no_image', lambda f: terrain.from_image(f / 'broken.png', 1), 'broken.png: cannot be read as PNG'),
         ('range', lambda f: terrain.from_image(f / 'broken.png', 1, 2, 2), 'expected two heights'),
         ('large', lambda _: terrain.to_mesh(terrain.SpatialGround(terrain.load('plane'), 0), 0, 1e4), 'most 500 m'),
         ('written', lambda f: terrain.save_mesh(None, f / 'ground.fbx'), 'expected .obj or .glb'),

@@ -20,6 +20,7 @@ import hashlib
 import inspect
 import math
 import os
+import pathlib
 from collections.abc import Callable
 from typing import Any
 
@@ -32,11 +33,14 @@ from trl_suite.terrain.parameters import Terrain
 from trl_suite.terrain.planar.generators import GENERATORS, register_line
 from trl_suite.terrain.spatial.generators import GENERATORS3D, register3d
 from trl_suite.terrain.spatial.layout import GRID, Layout
-from trl_suite.util.files import existing
+from trl_suite.util import errors
+from trl_suite.util.files import check_size, existing
 from trl_suite.util.libraries import library
 
 FARTHEST = 1e6  # m; of a vertex of a mesh
-IMAGES = ('.png', '.tif', '.tiff', '.bmp', '.jpg', '.jpeg')
+IMAGES = {  # with the names of their formats in Pillow
+    '.png': 'PNG', '.tif': 'TIFF', '.tiff': 'TIFF', '.bmp': 'BMP', '.jpg': 'JPEG', '.jpeg': 'JPEG',
+}  # fmt: skip
 LARGEST = 1e7  # largest number of vertices of an array, and of pixels of a picture
 
 HeightFunction = Callable[..., npt.ArrayLike]
@@ -165,7 +169,7 @@ def from_heights(
     Raises:
       ValueError: heights of another shape, too many, or not finite; a spacing that is not positive.
     """
-    heights = np.array(heights, float)
+    heights = errors.floats(f'{name}: heights', heights)
     if heights.ndim not in (1, 2) or min(heights.shape) < 2 or heights.size > LARGEST:
         raise ValueError(
             f'{name}: heights have shape {heights.shape}; expected (k,) or (k, m), 2 or more along '
@@ -173,7 +177,7 @@ def from_heights(
         )
     if not np.isfinite(heights).all():
         raise ValueError(f'{name}: heights must be finite; the one at {_where(heights)} is not')
-    if not 0 < spacing < math.inf:
+    if not (errors.is_number(spacing) and 0 < spacing < math.inf):
         raise ValueError(f'{name}: spacing is {spacing}; expected a positive number of metres')
     corner = -(np.array(heights.shape) // 2) if first is None else np.atleast_1d(first)
     if corner.shape != (heights.ndim,):
@@ -246,8 +250,8 @@ def from_image(
     The image is a map: x points to its right, y up, and the origin is the pixel in its middle.
 
     Args:
-      path: .png, of 8 or 16 bits per pixel, or another format that Pillow reads; of colour images
-        the mean of red, green and blue is used, and of animated ones the first frame.
+      path: .png, .tif, .bmp or .jpg, of 8 or 16 bits per pixel, in the format of its suffix; of
+        colour images the mean of red, green and blue is used, and of animated ones the first frame.
       spacing: between pixels, m.
       low: height of black, m.
       high: height of white, m.
@@ -257,26 +261,12 @@ def from_image(
     Raises:
       ValueError: the file is not an image, low or high is invalid, or as `from_heights`.
       FileNotFoundError: there is no such file; the message has similar names.
-      ImportError: imageio is not installed.
+      ImportError: Pillow is not installed.
     """
-    file = existing(path, IMAGES)
-    if not (math.isfinite(low) and math.isfinite(high)) or low == high:
+    file = existing(path, tuple(IMAGES))
+    if not np.isfinite(errors.floats(f'{file}: low and high', [low, high])).all() or low == high:
         raise ValueError(f'{file}: black is {low} m and white {high} m; expected two heights')
-    imageio = library('imageio.v3', 'trl_suite[video]')
-    try:
-        # Without reading pixels; an animated picture has several frames, which index 0 excludes.
-        shape = imageio.improps(file, plugin='pillow', index=0).shape
-    except Exception as error:  # of the reader's own kinds
-        raise ValueError(f'{file}: not a picture that can be read ({error})') from None
-    if len(shape) < 2 or math.prod(shape[:2]) > LARGEST:
-        raise ValueError(
-            f'{file}: the picture has {" x ".join(map(str, shape[:2]))} pixels; expected no more than '
-            f'{LARGEST:g} in all'
-        )
-    try:
-        pixels = np.asarray(imageio.imread(file, plugin='pillow', index=0))
-    except Exception as error:
-        raise ValueError(f'{file}: not a picture that can be read ({error})') from None
+    pixels = _pixels(file)
     if not np.issubdtype(pixels.dtype, np.integer) and pixels.dtype != bool:
         raise ValueError(f'{file}: pixels are {pixels.dtype}; expected whole numbers')
     full = 1 if pixels.dtype == bool else np.iinfo(pixels.dtype).max
@@ -286,6 +276,27 @@ def from_image(
     return from_heights(
         low + (high - low) * grey, spacing, file.stem, line=line, start_span=start_span
     )
+
+
+def _pixels(file: pathlib.Path) -> np.ndarray:
+    """Reads a picture, (h, w) or (h, w, channels), of a checked size."""
+    check_size(file)
+    image, kind = library('PIL.Image', 'trl_suite[video]'), IMAGES[file.suffix.lower()]
+    try:
+        # Other formats, which Pillow would recognise by their content, may start other programs.
+        with image.open(file, formats=(kind,)) as picture:
+            if min(picture.size) < 2 or math.prod(picture.size) > LARGEST:
+                raise ValueError(
+                    f'{picture.height} x {picture.width} pixels; expected 2 or more along each axis and '
+                    f'no more than {LARGEST:g} in all'
+                )
+            if picture.mode == 'P':
+                return np.asarray(picture.convert(picture.palette.mode))
+            # Some versions of Pillow widen the 16 bits of a .png.
+            widened = kind == 'PNG' and picture.mode == 'I'
+            return np.asarray(picture.convert('I;16') if widened else picture)
+    except Exception as error:  # of the reader's own kinds
+        raise ValueError(f'{file}: cannot be read as {kind} ({error})') from None
 
 
 def from_mesh(
@@ -322,7 +333,7 @@ def from_mesh(
     if up not in ('y', 'z'):
         raise ValueError(f"{file}: up is {up!r}; expected 'y' or 'z'")
     for name, number in (('spacing', spacing), ('scale', scale)):
-        if not 0 < number < math.inf:
+        if not (errors.is_number(number) and 0 < number < math.inf):
             raise ValueError(f'{file}: {name} is {number}; expected a positive number')
     triangles = mesh.read_triangles(file) * scale
     if up == 'y':
@@ -350,7 +361,10 @@ def from_mesh(
             f'expected 2 or more along each axis and no more than {LARGEST:g} in all'
         )
     x, y = (spacing * (first[i] + np.arange(count[i])) for i in (0, 1))
-    heights = mesh.heights_over(triangles, x, y)
+    try:
+        heights = mesh.heights_over(triangles, x, y)
+    except ValueError as error:
+        raise ValueError(f'{file}: {error}') from None
     heights[np.isinf(heights)] = low[2]
     corner = int(first[0]), int(first[1])
     return from_heights(heights, spacing, file.stem, first=corner, line=line, start_span=start_span)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import itertools
+import json
+import logging
 import os
-from typing import TYPE_CHECKING
+import pathlib
+import re
+import urllib.parse
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +19,9 @@ from trl_suite.terrain.planar.generators import SPACING
 from trl_suite.terrain.planar.ground import PlanarGround
 from trl_suite.terrain.spatial.ground import SpatialGround
 from trl_suite.terrain.spatial.layout import GRID, Boxes
+from trl_suite.util import errors
 from trl_suite.util.compiled import compiled_loop
-from trl_suite.util.files import check_path, check_size, replacing
+from trl_suite.util.files import LARGEST, check_path, read_bytes, replacing
 from trl_suite.util.libraries import library
 
 if TYPE_CHECKING:
@@ -22,10 +30,19 @@ if TYPE_CHECKING:
 WRITTEN = ('.obj', '.glb', '.stl')
 READ = ('.obj', '.glb', '.gltf', '.stl', '.ply')
 Y_UP = ('.glb', '.gltf')  # formats whose y axis points up
-MOST_BYTES = 10**9  # of a file that is read
+MOST_PARTS = 5000  # separate meshes and nodes of a file; trimesh is slow for many
+MOST_HEIGHTS = 10**10  # that are computed; of overlapping triangles each has its own
 WIDTH = 2.0  # m; of the band that represents planar ground
 DEPTH = 2.0  # m; of boxes on ground without a level
 LARGEST_SIDE = 500.0  # m; of the exported piece
+
+# Numbers of an element of a glTF accessor.
+_NUMBERS = {
+    'SCALAR': 1, 'VEC2': 2, 'VEC3': 3, 'VEC4': 4, 'MAT2': 4, 'MAT3': 9, 'MAT4': 16,
+}  # fmt: skip
+_PART = LARGEST // MOST_PARTS  # numbers that count for a part, or for each node above a node
+# Without a handler, Python would print trimesh's warnings, which have strings of the file in them.
+logging.getLogger('trimesh').addHandler(logging.NullHandler())
 
 _Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -50,7 +67,10 @@ def to_mesh(
       ImportError: trimesh is not installed.
     """
     trimesh = library('trimesh', 'trimesh')
-    corners = np.broadcast_to(low, 2).astype(float), np.broadcast_to(high, 2).astype(float)
+    corners = [
+        np.broadcast_to(errors.floats(name, each), 2)
+        for name, each in (('low', low), ('high', high))
+    ]
     size = corners[1] - corners[0]
     if not ((size > 0) & (size <= LARGEST_SIDE)).all():
         raise ValueError(
@@ -149,18 +169,30 @@ def _box(box: Boxes, level: float | None, low: np.ndarray, high: np.ndarray) -> 
     ], 1), np.asarray(unit.faces)  # fmt: skip
 
 
-def read_triangles(file: os.PathLike[str]) -> np.ndarray:
+def read_triangles(file: pathlib.Path) -> np.ndarray:
     """Returns the corners of a mesh file's triangles, (t, 3, 3), in its own units.
+
+    Materials and textures are not read, nor any other file, except buffers of a .gltf in its folder.
 
     Raises:
       ValueError: the file is too large, or not a mesh.
       ImportError: trimesh is not installed.
     """
     trimesh = library('trimesh', 'trimesh')
-    check_size(file, MOST_BYTES)
+    content, kind = read_bytes(file), file.suffix.lower()[1:]
     try:
+        if kind == 'obj':
+            content = _triangles_only(content)
+        elif kind == 'stl' and content.lower().count(b'endsolid') > MOST_PARTS:
+            raise ValueError(f'expected at most {MOST_PARTS} solids')
+        elif kind == 'gltf':
+            _check_gltf(content)
+        elif kind == 'glb':  # begins with five numbers; the fourth is the length of its JSON
+            _check_gltf(content[20 : 20 + int.from_bytes(content[12:16], 'little')])
         # Unprocessed: merging equal corners takes most of the time, and changes no height.
-        mesh = trimesh.load_scene(file, process=False).to_mesh()
+        mesh = trimesh.load_scene(
+            io.BytesIO(content), kind, _Buffers(file.parent), process=False, skip_materials=True
+        ).to_mesh()
         triangles = np.asarray(mesh.triangles, float)
     except Exception as error:  # the reader raises types of its own
         raise ValueError(f'{file}: cannot be read as a mesh ({error})') from None
@@ -171,12 +203,65 @@ def read_triangles(file: os.PathLike[str]) -> np.ndarray:
     return triangles
 
 
+def _triangles_only(content: bytes) -> bytes:
+    """Returns the vertices and faces of an .obj, without groups, materials and texture coordinates."""
+    text = content.replace(b'\r\n', b'\n').replace(b'\\\n', b'')
+    return re.sub(rb'/\S*', b'', b'\n'.join(re.findall(rb'^[vf][ \t].*', text, re.MULTILINE)))
+
+
+class _Buffers:
+    """The buffers of a .gltf by name, which are files in the same folder."""
+
+    def __init__(self, folder: pathlib.Path) -> None:
+        self._folder, self._read = folder, dict[str, bytes]()
+
+    def __getitem__(self, uri: str) -> bytes:
+        name = urllib.parse.unquote(uri)
+        if pathlib.PurePath(name).name != name:
+            raise ValueError(f'the buffer {uri!r} is not in the folder of the file')
+        if name not in self._read:
+            left = LARGEST - sum(map(len, self._read.values()))
+            self._read[name] = read_bytes(self._folder / name, left)
+        return self._read[name]
+
+
+def _check_gltf(content: bytes) -> None:
+    """Refuses a glTF scene that is large though its file is small: parts of it may share bytes."""
+    tree: dict[str, Any] = json.loads(content.decode())
+    nodes = tree.get('nodes', ())
+    sizes = [_NUMBERS[each['type']] * abs(each['count']) for each in tree.get('accessors', ())]
+
+    def size(part: dict[str, Any]) -> int:
+        accessors = {**part['attributes'], 'indices': part.get('indices')}
+        return _PART + sum(sizes[i] for i in accessors.values() if i is not None)
+
+    meshes = [sum(map(size, mesh['primitives'])) for mesh in tree.get('meshes', ())]
+    total = sum(abs(view['byteLength']) // 4 for view in tree.get('bufferViews', ()))
+    total += sum(sizes) + sum(meshes)
+    level = [i for scene in tree.get('scenes', ()) for i in scene.get('nodes', ())]
+    depth = 0
+    while level and total <= LARGEST:
+        depth += 1
+        used = [nodes[i] for i in level]
+        total += sum(meshes[node['mesh']] for node in used if 'mesh' in node)
+        children = [node.get('children', ()) for node in used]
+        total += _PART * (depth * len(level) + sum(map(len, children)))
+        level = [*itertools.chain(*children)] if total <= LARGEST else []
+    if not total <= LARGEST:
+        raise ValueError(
+            f'expected at most {LARGEST:.3g} numbers in all, and {MOST_PARTS} meshes and nodes'
+        )
+
+
 def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns the highest points of triangles over a grid, (k, m) m; -inf where there are none.
 
     Args:
       triangles: corners, (t, 3, 3) m.
       x, y: ascending, (k,) and (m,) m.
+
+    Raises:
+      ValueError: triangles overlap so much that it would take minutes.
     """
     # Ray casting by trimesh would need another library, and take three times as long.
     heights = np.full((len(x), len(y)), -np.inf)
@@ -184,6 +269,11 @@ def heights_over(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
     bounds = [np.searchsorted(x, low[0]), np.searchsorted(x, high[0])]
     bounds += [np.searchsorted(y, low[1]), np.searchsorted(y, high[1])]
     spans = np.stack(bounds, 1)
+    count = (spans[:, 1] - spans[:, 0]) @ (spans[:, 3] - spans[:, 2])
+    if count > MOST_HEIGHTS:
+        raise ValueError(
+            f'the triangles cover {count:.3g} points in all; expected at most {MOST_HEIGHTS:.3g}'
+        )
     _raise_heights(np.ascontiguousarray(triangles), spans, x, y, heights)
     return heights
 

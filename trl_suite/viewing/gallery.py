@@ -385,7 +385,10 @@ def _source(path: pathlib.Path) -> str:
     """Returns the digest that `save` stored in a file, '' if there is none."""
     from PIL import Image
 
-    with contextlib.suppress(OSError), Image.open(path) as image:
+    with (
+        contextlib.suppress(OSError),
+        Image.open(path, formats=('PNG', 'JPEG', 'WEBP')) as image,
+    ):
         kept = image.info.get('comment') or image.info.get('xmp', '')
         return kept.decode() if isinstance(kept, bytes) else kept
     return ''
