@@ -19,6 +19,35 @@ BOXED = ('blocks3d', 'pillars3d', 'path3d', 'path3d_wide', 'ramp3d', 'stairs3d')
 MOVING = ('conveyor3d', 'conveyor3d_wide', 'dynamic_obstacles3d')
 
 
+_TWO = terrain.boxes([(0, 0), (3, 1)], 1, 0.2)
+BOXES = {
+    'boxes': _TWO,
+    'belts': terrain.Belts(_TWO, np.ones((2, 2))),
+    'movers': terrain.Movers(*np.ones((3, 2, 2)), *np.ones((4, 2))),
+}
+FIELDS = {
+    'boxes': _TWO._fields, 'belts': (*_TWO._fields, 'velocity'), 'movers': BOXES['movers']._fields,
+}  # fmt: skip
+SPOILT = {  # of each array of boxes: the change, and the message
+    'longer': (lambda array: np.repeat(array, 10**5, 0), 'has shape .*; expected .2'),
+    'shared': (lambda array: array[0] * np.ones(1), 'has shape .*; expected .2'),
+    'flat': (lambda array: array.reshape(1, -1), 'has shape'),
+    'a number': (lambda array: array.flat[0], 'is of type float64; expected an array'),
+    'a list': (lambda array: array.tolist(), 'is of type list; expected an array'),
+    'words': (lambda array: array.astype(str), 'is of type <U.*; expected an array'),
+    'complex': (lambda array: array.astype(complex), 'is of type complex128'),
+    'NaN': (lambda array: np.full_like(array, np.nan), 'is not finite'),
+}
+LEVEL = np.zeros((2, 2)), np.zeros(2)  # places and headings
+
+
+def replaced(part, field, change):
+    """Returns boxes, belts or moving boxes with one array changed."""
+    if field not in part._fields:  # of the boxes of belts
+        return part._replace(boxes=replaced(part.boxes, field, change))
+    return part._replace(**{field: change(getattr(part, field))})
+
+
 def make(source, seed=0, **options):
     return terrain.SpatialGround(terrain.load(source), seed, **options)
 
@@ -713,6 +742,12 @@ class RegisterTest(parameterized.TestCase):
         (lambda: np.zeros(3), 'must return a Layout'),
         (lambda: terrain.Layout(level=None), 'a level, a grid or boxes'),
         (lambda: terrain.Layout(level=math.nan), 'level is not finite'),
+        (lambda: terrain.Layout(level='low'), 'level is of type str; expected a number or None'),
+        (lambda: terrain.Layout(span=math.inf), 'span is not finite'),
+        (lambda: terrain.Layout(goal_room=None), 'goal_room is of type NoneType'),
+        (lambda: terrain.Layout(grid=np.zeros((2, 2))), 'grid is of type ndarray; expected a Grid'),
+        (lambda: terrain.Layout(boxes=[]), 'boxes is of type list; expected Boxes or a function'),
+        (lambda: terrain.Layout(belts=BOXES['boxes']), 'belts is of type Boxes; expected Belts'),
         (lambda: terrain.Layout(place='top'), 'place'),
         (lambda: terrain.Layout(place='trail'), 'no trail'),
         (lambda: terrain.Layout(boxes=terrain.boxes([(0, math.inf)], 1, 1)), 'boxes.position'),
@@ -724,12 +759,13 @@ class RegisterTest(parameterized.TestCase):
             make({'Type': 'mine3d'})
 
     @parameterized.parameters(
-        ({'grid': lambda i, j: np.zeros(3)}, r'heights of shape .* \(3,\)'),
+        ({'grid': lambda i, j: np.zeros(3)}, r"'mine3d'.* heights of shape .* \(3,\)"),
+        ({'grid': lambda i, j: np.zeros((len(i), len(j)), complex)}, 'an array of complex128'),
         (
             {'grid': lambda i, j: np.full((len(i), len(j)), np.nan)},
             'returned nan at x = .* m, y = ',
         ),
-        ({'boxes': lambda low, high: None}, 'finite Boxes'),
+        ({'boxes': lambda low, high: None}, "'mine3d'.* must return finite Boxes: .* NoneType"),
         ({'boxes': lambda low, high: terrain.boxes([(0, 0)], 1, math.nan)}, 'finite Boxes'),
     )
     def test_invalid_functions_are_rejected(self, parts, message):
@@ -737,6 +773,36 @@ class RegisterTest(parameterized.TestCase):
         ground = make({'Type': 'mine3d'})
         with self.assertRaisesRegex(ValueError, message):
             ground.height(0, 0)
+
+    @parameterized.product(part=('boxes', 'belts', 'movers', 'function'), spoil=tuple(SPOILT))
+    def test_arrays_that_do_not_fit_are_rejected(self, part, spoil):
+        change, message = SPOILT[spoil]
+        kind = 'boxes' if part == 'function' else part
+        for field in FIELDS[kind]:
+            spoilt = replaced(BOXES[kind], field, change)
+
+            @terrain.register3d('mine3d', replace=True)
+            def mine(parameters, rng, spoilt=spoilt):
+                if part == 'function':
+                    return terrain.Layout(boxes=lambda low, high: spoilt)
+                return terrain.Layout(**{kind: spoilt})
+
+            with (
+                self.subTest(field),
+                self.assertRaisesRegex(ValueError, rf"'mine3d'.* {kind}\.\w+ {message}"),
+            ):
+                make({'Type': 'mine3d'}).height(0, 0)
+
+    @parameterized.parameters('position', 'half_size', 'yaw', 'top')
+    def test_boxes_that_do_not_fit_cannot_be_queried(self, field):
+        boxes = replaced(BOXES['boxes'], field, lambda array: np.repeat(array, 10**5, 0))
+        with self.assertRaisesRegex(ValueError, r'boxes\.\w+ has shape .*; expected \('):
+            boxes.touching((-1, -1), (1, 1))
+
+    def test_more_moving_boxes_than_there_are(self):
+        ground = make('dynamic_obstacles3d')
+        with self.assertRaisesRegex(ValueError, r'boxes\.half_size has shape'):
+            ground.goal(np.random.default_rng(0), (0, 0), movers=np.zeros((10**6, 2)))
 
     def test_varying_kinds_of_parts_are_rejected(self):
         @terrain.register3d('moody3d')

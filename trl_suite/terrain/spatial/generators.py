@@ -18,6 +18,7 @@ of queries. `features.py` has the original's terrain types. `register3d` adds a 
 
 from __future__ import annotations
 
+import dataclasses
 import types
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -80,4 +81,4 @@ def draw3d(type_name: str, parameters: Parameters, rng: np.random.Generator) -> 
         fault = layout.fault()
     if fault:
         raise ValueError(f'generator of terrain type {type_name!r}: {fault}')
-    return layout
+    return dataclasses.replace(layout, generator=type_name)

@@ -7,8 +7,10 @@ there. A generator returns a `Layout`, in which unbounded parts are functions.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -19,6 +21,7 @@ from trl_suite.util.compiled import compiled
 GRID = 0.2  # m between the vertices of a height grid; vertex i is at i * GRID
 TURN_DISTANCE = 5.0  # m; moving boxes reverse only at a larger distance from the character
 PLACES = ('start', 'clear', 'trail')
+_PAIRS = ('position', 'half_size', 'velocity', 'start', 'end')  # arrays (k, 2); all others are (k,)
 
 
 class Boxes(NamedTuple):
@@ -41,9 +44,15 @@ class Boxes(NamedTuple):
         return np.stack([cosine * length + sine * width, sine * length + cosine * width], 1)
 
     def touching(self, low: npt.ArrayLike, high: npt.ArrayLike) -> np.ndarray:
-        """Which boxes touch a rectangle, (k,) bool; rotated ones by their bounding rectangle."""
+        """Which boxes touch a rectangle, (k,) bool; rotated ones by their bounding rectangle.
+
+        Raises:
+          ValueError: arrays of different lengths.
+        """
         found = np.empty(len(self.top), bool)
         position, half_size, yaw = (np.ascontiguousarray(part, float) for part in self[:3])
+        if not position.shape == half_size.shape == (*found.shape, 2) or yaw.shape != found.shape:
+            raise ValueError(_misfit('boxes', self._asdict()))
         _touching(
             position, half_size, yaw, *np.broadcast_to(low, 2), *np.broadcast_to(high, 2), found
         )
@@ -165,6 +174,28 @@ class Grid(NamedTuple):
         return self.heights[np.ix_(i, j)]
 
 
+def _misfit(name: str, arrays: Mapping[str, Any]) -> str:
+    """Returns which of the arrays of k boxes is not of k finite numbers or pairs; empty if none.
+
+    Compiled functions read these arrays, and do not check indices.
+    """
+    count = None
+    for field, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in 'fiu':
+            kind = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+            return f'{name}.{field} is of type {kind}; expected an array of numbers'
+        if count is None:
+            count = len(array) if array.ndim else 0
+        shape = (count, 2) if field in _PAIRS else (count,)
+        if array.shape != shape:
+            return (
+                f'{name}.{field} has shape {array.shape}; expected {shape}, one entry for each box'
+            )
+        if not np.isfinite(array).all():
+            return f'{name}.{field} is not finite'
+    return ''
+
+
 GridFunction = Callable[[np.ndarray, np.ndarray], np.ndarray]
 BoxFunction = Callable[[np.ndarray, np.ndarray], Boxes]
 
@@ -188,6 +219,7 @@ class Layout:
         character), 'clear' (anywhere that is clear of boxes and belts), or 'trail'.
       span: for 'clear', half side of the square of start places and goals, m.
       goal_room: for 'clear', half side of the square around a goal that must be clear, m.
+      generator: terrain type, for messages; set when a ground is drawn.
     """
 
     level: float | None = 0.0
@@ -199,6 +231,7 @@ class Layout:
     place: str = 'start'
     span: float = 12.0
     goal_room: float = 1.0
+    generator: str = ''
 
     def boxes_in(self, low: np.ndarray, high: np.ndarray) -> Boxes:
         """The boxes that touch a rectangle.
@@ -209,9 +242,15 @@ class Layout:
         if isinstance(self.boxes, Boxes):
             return self.boxes.select(self.boxes.touching(low, high))
         found = self.boxes(low, high)
-        if not isinstance(found, Boxes) or not all(np.isfinite(part).all() for part in found):
-            raise ValueError('the function for boxes of a Layout must return finite Boxes')
+        fault = f'it returned {type(found).__name__}'
+        if not isinstance(found, Boxes) or (fault := _misfit('boxes', found._asdict())):
+            raise ValueError(f'{self._owner("boxes")} must return finite Boxes: {fault}')
         return found
+
+    def _owner(self, part: str) -> str:
+        return (
+            f'generator of terrain type {self.generator!r}: the function for {part} of its Layout'
+        )
 
     def is_clear(self, low: tuple[float, float], high: tuple[float, float]) -> bool:
         """Whether no box touches a rectangle."""
@@ -228,21 +267,27 @@ class Layout:
         """
         assert self.grid is not None
         heights = np.asarray(self.grid(i, j))
-        if heights.shape != (len(i), len(j)):
+        if heights.shape != (len(i), len(j)) or heights.dtype.kind not in 'fiu':
             raise ValueError(
-                f'the function for a grid of a Layout must return heights of shape '
-                f'{(len(i), len(j))}; it returned an array of shape {heights.shape}'
+                f'{self._owner("a grid")} must return heights of shape {(len(i), len(j))}; it returned '
+                f'an array of {heights.dtype} of shape {heights.shape}'
             )
         if not np.isfinite(heights).all():
             a, b = np.argwhere(~np.isfinite(heights))[0]
             raise ValueError(
-                f'the function for a grid of a Layout returned {heights[a, b]} at x = {GRID * i[a]:g} m, '
+                f'{self._owner("a grid")} returned {heights[a, b]} at x = {GRID * i[a]:g} m, '
                 f'y = {GRID * j[b]:g} m; expected finite heights'
             )
         return heights
 
     def fault(self) -> str:
         """Returns why the layout is invalid, for the author of a generator; empty if it is valid."""
+        for name, kind, expected in _PARTS:
+            part = getattr(self, name)
+            if not isinstance(part, kind):
+                return f'{name} is of type {type(part).__name__}; expected {expected}'
+            if isinstance(part, Real) and not math.isfinite(part):
+                return f'{name} is not finite'
         if self.place not in PLACES:
             return f'place must be one of {", ".join(PLACES)}, not {self.place!r}'
         if self.place == 'trail' and self.trail is None:
@@ -251,13 +296,23 @@ class Layout:
             return 'there must be a level, a grid or boxes'
         if self.movers is not None and self.level is None:
             return 'moving boxes need a level to stand on'
-        finite: list[tuple[str, Any]] = [('level', 0.0 if self.level is None else self.level)]
-        if isinstance(self.grid, Grid):
-            finite.append(('grid', self.grid.heights))
+        if isinstance(self.grid, Grid) and not np.isfinite(self.grid.heights).all():
+            return 'grid is not finite'
+        arrays = {} if self.movers is None else {'movers': self.movers._asdict()}
         if isinstance(self.boxes, Boxes):
-            finite += [(f'boxes.{name}', part) for name, part in self.boxes._asdict().items()]
+            arrays['boxes'] = self.boxes._asdict()
         if self.belts is not None:
-            finite.append(('belts.velocity', self.belts.velocity))
-        if self.movers is not None:
-            finite += [(f'movers.{name}', part) for name, part in self.movers._asdict().items()]
-        return next((f'{n} is not finite' for n, part in finite if not np.isfinite(part).all()), '')
+            arrays['belts'] = {**self.belts.boxes._asdict(), 'velocity': self.belts.velocity}
+        return next(filter(None, itertools.starmap(_misfit, arrays.items())), '')
+
+
+# Fields of a layout: type, and the type in words.
+_PARTS: tuple[tuple[str, Any, str], ...] = (
+    ('level', Real | None, 'a number or None'),
+    ('grid', Callable | None, 'a Grid, a function or None'),
+    ('boxes', Boxes | Callable, 'Boxes or a function'),
+    ('belts', Belts | None, 'Belts or None'),
+    ('movers', Movers | None, 'Movers or None'),
+    ('span', Real, 'a number'),
+    ('goal_room', Real, 'a number'),
+)
