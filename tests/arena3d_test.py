@@ -444,6 +444,14 @@ class DynamicsTest(parameterized.TestCase):
                 stage.put((x, 0, stage.height(x, 0)[0] + 0.05))
                 self.assertTrue(touches(), (source, x))
 
+    def test_positions_of_other_shapes_are_rejected(self):
+        arena = Stage('dynamic_obstacles3d', (5, 6, 7), batch=True).arena
+        for xy, env_ids in (
+            (np.zeros((1, 2)), None), (np.zeros((3, 1)), None), (np.zeros((1, 2)), np.arange(3)),
+        ):  # fmt: skip
+            with self.assertRaisesRegex(ValueError, r'xy has shape .*; expected \(3, 2\)'):
+                arena.follow(xy, env_ids)
+
     def test_moving_boxes_touch_neither_ground_nor_each_other(self):
         stage = Stage('dynamic_obstacles3d', (5,))
         stage.run(1.0)

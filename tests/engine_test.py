@@ -134,6 +134,20 @@ class StepTest(parameterized.TestCase):
         np.testing.assert_array_equal(world.xpos[1, world.body_ids(['belt'])], [[3.0, 0.0, 1.0]])
         self.assertEqual(world.xpos[0, 1, 0], 0.0)
 
+    @parameterized.named_parameters(
+        ('step', lambda world, env_ids: world.step(1, env_ids)),
+        ('forward', lambda world, env_ids: world.forward(env_ids)),
+        ('reset', lambda world, env_ids: world.reset(env_ids)),
+        ('set_state', lambda world, env_ids: world.set_state(env_ids[-1], world.get_state(0))),
+    )
+    def test_simulations_that_do_not_exist(self, call):
+        world = BatchWorld(model(), 2, 1)
+        for env_ids in ([2], [0, 10**9], [-3]):
+            with self.assertRaises(IndexError):
+                call(world, np.array(env_ids))
+        world.qpos[1] = 0.5
+        call(world, np.array([-1]))  # the last one
+
     def test_reset(self):
         world = BatchWorld(model(), 2, 1)
         start = [world.get_state(i) for i in range(2)]

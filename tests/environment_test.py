@@ -393,6 +393,20 @@ def every_environment(id_):
     return EveryEnvironment
 
 
+class PlainComposerTest(parameterized.TestCase):
+    """A plain composer.Environment does not check actions; tasks do."""
+
+    @parameterized.product(
+        id_=('PD_Biped2D_Flat_Terrain-v0', 'FSM_Hopper2D_Terrain_Gaps-v0', 'PD_Biped3D_HLC_Soccer-v0'),
+        size=(0, 1, 10**6),
+    )  # fmt: skip
+    def test_actions_of_other_shapes_are_rejected(self, id_, size):
+        environment = composer.Environment(suite.build_task(suite.find(id_)), random_state=0)
+        environment.reset()
+        with self.assertRaisesRegex(ValueError, rf'action has shape \({size},\); expected'):
+            environment.step(np.zeros(size))
+
+
 class GoldenTest(absltest.TestCase):
     def test_all_environments_are_stored(self):
         self.assertCountEqual(STORED, suite.ALL_IDS)

@@ -16,7 +16,7 @@ from trl_suite.arenas.scene import FRICTION, PARKED, SOLIMP, SOLREF
 from trl_suite.engine import World, bounds
 from trl_suite.terrain import Boxes, SpatialGround, Surroundings, Terrain, capacity
 from trl_suite.terrain.spatial.ground import Random
-from trl_suite.terrain.spatial.surroundings import ALL, EnvIds
+from trl_suite.terrain.spatial.surroundings import ALL, EnvIds, positions
 from trl_suite.terrain.spatial.windows import HALF, VERTICES, SpatialWindows, keep_moving
 from trl_suite.util.compiled import compiled, compiled_loop, packed
 
@@ -182,17 +182,20 @@ class SpatialArena(composer.Arena):
         Args:
           xy: positions of their roots, m, (n, 2), or of the given simulations only, (m, 2).
           env_ids: sorted numbers of simulations; None for all.
+
+        Raises:
+          ValueError: positions of another shape.
         """
+        env_ids = self._world.all_ids if env_ids is None else self._world.all_ids[env_ids]
+        xy = positions(xy, len(env_ids))
         changed = self.surroundings.follow(xy, env_ids)
         for env_id in changed:
             self._realise(env_id)
         if len(self._dof):
-            env_ids = self._world.all_ids if env_ids is None else env_ids
             sped = np.zeros(len(env_ids), bool)
             _keep_moving(
-                env_ids, np.ascontiguousarray(xy, float), self._world.qpos, self._world.qvel,
-                self.surroundings.arrays, sped,
-            )  # fmt: skip
+                env_ids, xy, self._world.qpos, self._world.qvel, self.surroundings.arrays, sped
+            )
             changed = sorted({*changed, *env_ids[sped].tolist()})
         if changed:  # existing contacts refer to boxes that have moved
             self._world.forward(np.array(changed))

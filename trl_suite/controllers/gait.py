@@ -169,15 +169,23 @@ class Gait:
 
     def begin(self, env_ids: np.ndarray) -> None:
         """Resets state machines to the start of their first cycle, with the default parameters."""
-        gaits.begin_all(env_ids, self.parameters.action_offset, self._pack)
+        gaits.begin_all(self.world.all_ids[env_ids], self.parameters.action_offset, self._pack)
 
     def apply(self, env_ids: np.ndarray, vectors: np.ndarray) -> None:
-        """Begins cycles with parameters (m, P)."""
-        gaits.apply_all(env_ids, np.ascontiguousarray(vectors, float), self._pack)
+        """Begins cycles with parameters (m, P).
+
+        Raises:
+          ValueError: parameters of another shape.
+        """
+        env_ids, vectors = self.world.all_ids[env_ids], np.ascontiguousarray(vectors, float)
+        expected = len(env_ids), len(self.parameters.names)
+        if vectors.shape != expected:
+            raise ValueError(f'vectors have shape {vectors.shape}; expected {expected}')
+        gaits.apply_all(env_ids, vectors, self._pack)
 
     def torques(self, env_ids: np.ndarray) -> np.ndarray:
         """Returns the torques of the next control step, within limits, (m, J) N m."""
-        gaits.act_all(env_ids, self._pack)
+        gaits.act_all(self.world.all_ids[env_ids], self._pack)
         return self.rules.scratch.torque[env_ids]
 
     def advance(self, env_ids: np.ndarray) -> np.ndarray:
@@ -185,6 +193,7 @@ class Gait:
 
         A machine whose cycle has ended stays in its last state until `apply`.
         """
+        env_ids = self.world.all_ids[env_ids]
         ended = np.empty(len(env_ids), bool)
         gaits.advance_all(env_ids, self._pack, ended)
         return ended

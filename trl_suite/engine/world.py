@@ -137,19 +137,21 @@ class World:
         self.pack = packed(self.engine)
         return made.state
 
-    # Methods for tasks; env_ids are sorted numbers of simulations, without repeats.
+    # Methods for tasks; env_ids are sorted numbers of simulations, without repeats. Those that do not
+    # exist raise an IndexError.
 
     def step(self, nstep: int, env_ids: np.ndarray | None = None) -> None:
         """Advances some or all simulations by `nstep` physics steps; velocities are then current."""
-        native.step_all(self.all_ids if env_ids is None else env_ids, nstep, self.pack)
+        env_ids = self.all_ids if env_ids is None else self.all_ids[env_ids]
+        native.step_all(env_ids, nstep, self.pack)
 
     def forward(self, env_ids: np.ndarray) -> None:
         """Recomputes all quantities that depend on the state, after the state was written."""
-        native.forward_all(env_ids, self.pack)
+        native.forward_all(self.all_ids[env_ids], self.pack)
 
     def reset(self, env_ids: np.ndarray) -> None:
         """Resets simulations to the model's initial state and clears their warnings."""
-        native.reset_all(env_ids, self.pack)
+        native.reset_all(self.all_ids[env_ids], self.pack)
 
     def set_const(self, env_id: int) -> None:
         """Applies changes to the static geoms of a simulation.
@@ -180,7 +182,7 @@ class World:
         data.warning.number[:] = 0
         self.engine.time[env_id] = data.time
         mujoco.mj_forward(model, data)
-        native.read_all(np.array([env_id]), self.pack)
+        native.read_all(self.all_ids[[env_id]], self.pack)
 
     def any_diverged(self) -> bool:
         """Returns whether `diverged` is true for any simulation."""

@@ -277,7 +277,7 @@ class Task(composer.Task):
             # A plain composer.Environment leaves actuator velocities of zero after a reset.
             self.world.forward(self.world.all_ids)
             self._begun = False
-        self.apply_action(np.asarray(action, dtype=float)[None], self.world.all_ids)
+        self.apply_action(self.action_map.checked(action)[None], self.world.all_ids)
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self.finish_step(self.world.all_ids)

@@ -182,7 +182,8 @@ class Surroundings:
 
         Within 5 m of the character they continue straight on, even beyond the end of their path.
         """
-        _turn_all(self._numbers[env_ids], np.ascontiguousarray(xy, float), self.arrays)
+        env_ids = self._numbers[env_ids]
+        _turn_all(env_ids, positions(xy, len(env_ids)), self.arrays)
 
     def centres(self, env_ids: EnvIds = ALL) -> np.ndarray:
         """Centres of the moving boxes, m, (simulations, M, 2)."""
@@ -229,7 +230,7 @@ class Surroundings:
           Heights in m, (simulations, 1024).
         """
         out = np.empty((len(xy), SAMPLES**2)) if out is None else out
-        self._maps(_height_maps, xy, heading, env_ids, out)
+        self._maps(_height_maps, 1, xy, heading, env_ids, out)
         return out
 
     def velocity_map(
@@ -248,7 +249,7 @@ class Surroundings:
           height map, then components to the right of it.
         """
         out = np.empty((len(xy), 2 * SAMPLES**2)) if out is None else out
-        self._maps(_velocity_maps, xy, heading, env_ids, out)
+        self._maps(_velocity_maps, 2, xy, heading, env_ids, out)
         return out
 
     def _points(
@@ -271,6 +272,7 @@ class Surroundings:
     def _maps(
         self,
         query: Callable[..., None],
+        maps: int,
         xy: npt.ArrayLike,
         heading: npt.ArrayLike,
         env_ids: EnvIds,
@@ -280,10 +282,11 @@ class Surroundings:
         env_ids = self._numbers[env_ids]
         xy, heading = np.ascontiguousarray(xy, float), np.ascontiguousarray(heading, float)
         count = len(env_ids)
-        if xy.shape != (count, 2) or heading.shape != (count,) or len(out) != count:
+        expected = (count, 2), (count,), (count, maps * SAMPLES**2)
+        if (xy.shape, heading.shape, out.shape) != expected:
             raise ValueError(
                 f'xy, heading and out have shapes {xy.shape}, {heading.shape} and {out.shape}; '
-                f'expected ({count}, 2), ({count},) and ({count}, k)'
+                f'expected {expected[0]}, {expected[1]} and {expected[2]}'
             )
         query(env_ids, xy, heading, self.arrays, out)
 
@@ -330,6 +333,18 @@ class Surroundings:
             boxes = boxes.select(nearest)
         self.boxes[env_id] = boxes = boxes.select(np.argsort(boxes.position[:, 0], kind='stable'))
         index.fill(env_id, boxes, layout.belts, arrays)
+
+
+def positions(xy: npt.ArrayLike, count: int) -> np.ndarray:
+    """Returns horizontal positions of characters for compiled functions, (count, 2).
+
+    Raises:
+      ValueError: they have another shape.
+    """
+    xy = np.ascontiguousarray(xy, float)
+    if xy.shape != (count, 2):
+        raise ValueError(f'xy has shape {xy.shape}; expected {(count, 2)}')
+    return xy
 
 
 @compiled
